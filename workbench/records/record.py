@@ -1,0 +1,221 @@
+"""A record: named, placed, uniformly sampled signals, going in and coming out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import control
+import numpy as np
+
+from workbench.structure.modes import frozen
+
+QUANTITIES = {
+    "displacement": "m",
+    "slope": "rad",
+    "velocity": "m/s",
+    "angular velocity": "rad/s",
+    "acceleration": "m/s^2",
+    "force": "N",
+    "moment": "N m",
+    "voltage": "V",
+    "": "",
+}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One signal of a record.
+
+    Attributes:
+        name: unique among the inputs, and among the outputs, of a record.
+        quantity: what is measured, one of `QUANTITIES` or a word of the user's.
+        unit: as written on the axis; taken from the quantity where left empty.
+        at: place along the structure, m; None where unknown or meaningless.
+        noise_std: standard deviation of the sensor's white noise, in `unit`; None where unknown.
+    """
+
+    name: str
+    quantity: str = ""
+    unit: str = ""
+    at: float | None = None
+    noise_std: float | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise ValueError("a channel needs a name")
+        if self.noise_std is not None and not self.noise_std >= 0:
+            raise ValueError(f"channel {self.name!r}: noise_std must be 0 or more; got {self.noise_std}")
+        object.__setattr__(self, "unit", self.unit or QUANTITIES.get(self.quantity, ""))
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """Sampled signals with time last, as in python-control.
+
+    Attributes:
+        sample_time: seconds between samples.
+        outputs: (n_outputs, n_samples) measured signals.
+        output_channels: one `Channel` a row of `outputs`.
+        inputs: (n_inputs, n_samples) signals that went in, held over each sample interval; may have no rows.
+        input_channels: one `Channel` a row of `inputs`.
+        start_time: time of the first sample, s.
+        name: how messages and plots call it.
+
+    Raises:
+        ValueError: shapes that do not fit, repeated names, empty or non-finite signals (channel and sample named).
+    """
+
+    sample_time: float
+    outputs: np.ndarray
+    output_channels: tuple[Channel, ...]
+    inputs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    input_channels: tuple[Channel, ...] = ()
+    start_time: float = 0.0
+    name: str = "record"
+
+    def __post_init__(self) -> None:
+        outputs = frozen(np.atleast_2d(self.outputs))
+        inputs = np.asarray(self.inputs, float)
+        inputs = frozen(np.zeros((0, outputs.shape[1])) if inputs.size == 0 else np.atleast_2d(inputs))
+        object.__setattr__(self, "outputs", outputs)
+        object.__setattr__(self, "inputs", inputs)
+        object.__setattr__(self, "output_channels", tuple(self.output_channels))
+        object.__setattr__(self, "input_channels", tuple(self.input_channels))
+        if not (np.isfinite(self.sample_time) and self.sample_time > 0):
+            raise ValueError(f"record {self.name!r}: the sample time must be positive; got {self.sample_time}")
+        if outputs.shape[1] == 0:
+            raise ValueError(f"record {self.name!r} is empty: it holds no samples")
+        if inputs.shape[1] != outputs.shape[1]:
+            raise ValueError(
+                f"record {self.name!r}: inputs and outputs must have as many samples, time last; got"
+                f" {inputs.shape[1]} and {outputs.shape[1]}"
+            )
+        for kind, values, channels in (
+            ("input", inputs, self.input_channels),
+            ("output", outputs, self.output_channels),
+        ):
+            if values.shape[0] != len(channels):
+                raise ValueError(
+                    f"record {self.name!r}: {kind}s must have shape ({len(channels)} channels, n_samples);"
+                    f" got {values.shape}. Is time the last axis?"
+                )
+            names = [c.name for c in channels]
+            if len(set(names)) != len(names):
+                raise ValueError(f"record {self.name!r}: {kind} names must differ; got {names}")
+            for channel, row in zip(channels, values, strict=True):
+                bad = ~np.isfinite(row)
+                if bad.any():
+                    raise ValueError(
+                        f"record {self.name!r}, channel {channel.name!r}: sample {int(np.argmax(bad))} is"
+                        f" {row[bad][0]}; repair or cut it out before use"
+                    )
+
+    @property
+    def n_samples(self) -> int:
+        return self.outputs.shape[1]
+
+    @property
+    def n_outputs(self) -> int:
+        return self.outputs.shape[0]
+
+    @property
+    def n_inputs(self) -> int:
+        return self.inputs.shape[0]
+
+    @property
+    def time(self) -> np.ndarray:
+        """Sample instants (n_samples,), s."""
+        return self.start_time + self.sample_time * np.arange(self.n_samples)
+
+    @property
+    def sample_rate_hz(self) -> float:
+        return 1.0 / self.sample_time
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Places of the outputs (n_outputs,), m; nan where unknown."""
+        return np.array([np.nan if c.at is None else c.at for c in self.output_channels])
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.output_channels)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        return tuple(c.name for c in self.input_channels)
+
+    def between(self, start: float | None = None, stop: float | None = None) -> "Record":
+        """The samples with start <= time <= stop (s); the time axis is kept."""
+        time = self.time
+        slack = 1e-9 * self.sample_time
+        keep = (time >= (time[0] if start is None else start) - slack) & (
+            time <= (time[-1] if stop is None else stop) + slack
+        )
+        if not keep.any():
+            raise ValueError(f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: nothing in {start}..{stop}")
+        return Record(
+            sample_time=self.sample_time,
+            outputs=self.outputs[:, keep],
+            output_channels=self.output_channels,
+            inputs=self.inputs[:, keep],
+            input_channels=self.input_channels,
+            start_time=float(time[keep][0]),
+            name=self.name,
+        )
+
+    def only(self, outputs: Sequence[str]) -> "Record":
+        """The record with only the named outputs, in that order."""
+        missing = [name for name in outputs if name not in self.output_names]
+        if missing:
+            raise ValueError(f"record {self.name!r} has no output {missing[0]!r}; it has {', '.join(self.output_names)}")
+        rows = [self.output_names.index(name) for name in outputs]
+        return Record(
+            sample_time=self.sample_time,
+            outputs=self.outputs[rows],
+            output_channels=tuple(self.output_channels[r] for r in rows),
+            inputs=self.inputs,
+            input_channels=self.input_channels,
+            start_time=self.start_time,
+            name=self.name,
+        )
+
+    def to_control(self) -> control.TimeResponseData:
+        """The same signals as python-control's `TimeResponseData`."""
+        return control.TimeResponseData(
+            self.time,
+            self.outputs,
+            inputs=self.inputs if self.n_inputs else None,
+            issiso=False,
+            output_labels=list(self.output_names),
+            input_labels=list(self.input_names) or None,
+            title=self.name,
+        )
+
+    @classmethod
+    def from_control(cls, response: control.TimeResponseData, *, name: str = "record") -> "Record":
+        """A record from python-control's `TimeResponseData` (one trace, uniform time).
+
+        Raises:
+            ValueError: several traces, or times that are not uniform.
+        """
+        steps = np.diff(response.time)
+        if steps.size == 0 or np.ptp(steps) > 1e-6 * abs(steps.mean()):
+            raise ValueError(f"response {name!r} is not uniformly sampled; resample it first")
+        outputs = np.asarray(response.y)
+        inputs = None if response.u is None else np.asarray(response.u)
+        if outputs.ndim == 3:
+            if outputs.shape[1] != 1:
+                raise ValueError(f"response {name!r} holds {outputs.shape[1]} traces; take one of them")
+            outputs = outputs[:, 0]
+            inputs = None if inputs is None else inputs[:, 0]
+        labels = response.output_labels or [f"y[{i}]" for i in range(outputs.shape[0])]
+        inputs = np.zeros((0, outputs.shape[1])) if inputs is None else inputs
+        input_labels = response.input_labels or [f"u[{i}]" for i in range(inputs.shape[0])]
+        return cls(
+            sample_time=float(steps.mean()),
+            outputs=outputs,
+            output_channels=tuple(Channel(label) for label in labels),
+            inputs=inputs,
+            input_channels=tuple(Channel(label) for label in input_labels),
+            start_time=float(response.time[0]),
+            name=name,
+        )

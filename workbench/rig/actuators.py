@@ -1,0 +1,46 @@
+"""Actuators: where a command becomes a force or a moment, and what it loses on the way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """A point force or moment commanded through an actuator: gain, dead zone, saturation, delay, lag, in that order.
+
+    Attributes:
+        name: of the input.
+        at: place along the structure, m.
+        kind: "force" (N) or "moment" (N m).
+        gain: force per command.
+        dead_zone: command (after the gain) below which nothing happens; sign(u) max(|u| - width, 0).
+        limit: the force cannot exceed ± this.
+        delay: s.
+        time_constant: of a first-order lag, s.
+        direct: a measured force applied without an actuator, such as a hammer; changes of the drive leave it alone.
+    """
+
+    name: str
+    at: float
+    kind: str = "force"
+    gain: float = 1.0
+    dead_zone: float = 0.0
+    limit: float = np.inf
+    delay: float = 0.0
+    time_constant: float = 0.0
+    direct: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("force", "moment"):
+            raise ValueError(f"actuator {self.name}: kind is force or moment; got {self.kind!r}")
+        for quantity in ("dead_zone", "delay", "time_constant"):
+            if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
+                raise ValueError(f"actuator {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
+        if not self.limit > 0:
+            raise ValueError(f"actuator {self.name}: limit must be positive; got {self.limit}")
+
+    @property
+    def linear(self) -> bool:
+        """Whether the force is a linear function of the command (a delay is not a finite state)."""
+        return self.dead_zone == 0 and np.isinf(self.limit) and self.delay == 0

@@ -1,0 +1,57 @@
+"""Sensors: what they measure, where, and what they lose on the way."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# quantity: (derivative along x, derivative in time)
+MEASURED = {
+    "displacement": (0, 0),
+    "slope": (1, 0),
+    "velocity": (0, 1),
+    "angular velocity": (1, 1),
+    "acceleration": (0, 2),
+}
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A sensor at a point: lag, gain, bias and drift, noise, clipping, rounding, in that order.
+
+    Attributes:
+        name: of the output.
+        at: place along the structure, m.
+        quantity: "displacement", "slope", "velocity", "angular velocity" or "acceleration".
+        noise_std: standard deviation of its white noise.
+        gain: reading per truth.
+        bias: constant offset.
+        drift: offset gained over a record, from 0 at its first sample.
+        time_constant: of a first-order lag, s.
+        limit: readings stop at ± this.
+        step: readings are multiples of this; 0 for none.
+    """
+
+    name: str
+    at: float
+    quantity: str = "displacement"
+    noise_std: float = 0.0
+    gain: float = 1.0
+    bias: float = 0.0
+    drift: float = 0.0
+    time_constant: float = 0.0
+    limit: float = np.inf
+    step: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.quantity not in MEASURED:
+            raise ValueError(f"sensor {self.name}: quantity is one of {', '.join(MEASURED)}; got {self.quantity!r}")
+        for quantity in ("noise_std", "time_constant", "step"):
+            if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
+                raise ValueError(f"sensor {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
+        if not self.limit > 0:
+            raise ValueError(f"sensor {self.name}: limit must be positive; got {self.limit}")
+
+    @property
+    def linear(self) -> bool:
+        """Whether a reading is a linear function of the truth (a time constant adds a state)."""
+        return self.bias == 0 and self.drift == 0 and np.isinf(self.limit) and self.step == 0

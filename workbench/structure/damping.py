@@ -1,0 +1,45 @@
+"""How a structure loses energy: the coefficients c_rs of (2.10)-(2.11)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.structure.profile import ProfileLike
+
+
+@dataclass(frozen=True, eq=False)
+class ModalDamping:
+    """One damping ratio for every mode, or one a mode, lowest first (the last one serves all modes above)."""
+
+    zeta: ArrayLike = 0.0
+
+    def matrix(self, omega: np.ndarray) -> np.ndarray:
+        """c_rs = 2 ζ_r ω_r δ_rs, (n_modes, n_modes)."""
+        zeta = np.atleast_1d(np.asarray(self.zeta, float))
+        if not np.isfinite(zeta).all() or (zeta < 0).any():
+            raise ValueError(f"damping ratios must be finite and not negative; got {self.zeta}")
+        padded = np.r_[zeta, np.full(max(omega.size - zeta.size, 0), zeta[-1])][: omega.size]
+        return np.diag(2.0 * padded * omega)
+
+
+@dataclass(frozen=True)
+class ProportionalDamping:
+    """C = g1 L + g2 M (2.13): c_r = g1 ω_r² + g2, g1 in s and g2 in 1/s."""
+
+    g1: float = 0.0
+    g2: float = 0.0
+
+    def matrix(self, omega: np.ndarray) -> np.ndarray:
+        """c_rs = (g1 ω_r² + g2) δ_rs, (n_modes, n_modes)."""
+        return np.diag(self.g1 * omega**2 + self.g2)
+
+
+@dataclass(frozen=True, eq=False)
+class ViscousDamping:
+    """A viscous coefficient per length, N s/m², along x: c_rs = ∫ c φ_r φ_s dx (2.11), in general not diagonal."""
+
+    coefficient_per_length: ProfileLike
+
+
+Damping = ModalDamping | ProportionalDamping | ViscousDamping

@@ -1,0 +1,245 @@
+"""Bars and beams: profiles, ends and attachments, and the modes they have."""
+
+import warnings
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.linalg import LinAlgError, eigh
+
+from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
+from workbench.structure.modes import Modes
+from workbench.structure.polynomials import Segments
+from workbench.structure.profile import Profile, ProfileLike, as_profile
+from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring, as_end
+
+HIGHEST_DEGREE = 48
+MOST_FUNCTIONS = 2400
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Member:
+    length: float
+    mass_per_length: ProfileLike
+    left: str | End
+    right: str | End
+    attachments: tuple[Attachment, ...] = ()
+    damping: Damping = field(default_factory=ModalDamping)
+
+    def _prepare(self, allowed_ends: tuple[str, ...], stiffness: str) -> None:
+        if not (np.isfinite(self.length) and self.length > 0):
+            raise ValueError(f"the length of a structure must be positive; got {self.length}")
+        object.__setattr__(self, "left", as_end(self.left, allowed=allowed_ends))
+        object.__setattr__(self, "right", as_end(self.right, allowed=allowed_ends))
+        object.__setattr__(self, "attachments", tuple(self.attachments))
+        for name in ("mass_per_length", stiffness):
+            profile = as_profile(getattr(self, name))
+            object.__setattr__(self, name, profile)
+            self._check_positive(name, profile)
+        for part in self.attachments:
+            if not 0 <= part.at <= self.length:
+                raise ValueError(f"{part} stands outside the structure, which runs from 0 to {self.length:g}")
+            if isinstance(part, PointMass) and (part.mass < 0 or part.rotary_inertia < 0):
+                raise ValueError(f"{part}: a negative mass is not a structure; leave it out or lower mass_per_length")
+
+    def _check_positive(self, name: str, profile: Profile) -> None:
+        nodes = self._nodes(profile.breaks)
+        inside = (nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.002, 0.998, 101)).ravel()
+        values = profile(inside)
+        if not np.isfinite(values).all() or (values <= 0).any():
+            i = int(np.argmax(~(values > 0)))
+            raise ValueError(
+                f"{name} must be positive inside the structure; it is {values[i]:g} at x = {inside[i]:g}"
+                " (it may vanish at an end)"
+            )
+
+    def _nodes(self, breaks: tuple[float, ...]) -> np.ndarray:
+        slack = 1e-9 * self.length
+        inside = sorted(b for b in breaks if slack < b < self.length - slack)
+        nodes = [0.0]
+        for b in [*inside, self.length]:
+            if b - nodes[-1] > slack:
+                nodes.append(b)
+        return np.array(nodes)
+
+    def _segments(self, n_modes: int, stiffness: Profile, continuity: int, extra: int) -> Segments:
+        """Segments that can carry n_modes half waves, with `extra` more degrees than the bare count."""
+        points = tuple(part.at for part in self.attachments)
+        nodes = self._nodes((*self.mass_per_length.breaks, *stiffness.breaks, *points))
+        degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / self.length)) + 12 + extra
+        pieces = int(np.ceil(degree / HIGHEST_DEGREE))
+        if pieces > 1:
+            nodes = np.unique(np.concatenate([np.linspace(a, b, pieces + 1) for a, b in zip(nodes, nodes[1:])]))
+            degree = int(np.ceil(1.7 * n_modes / pieces)) + 12 + extra // pieces
+        return Segments(nodes, min(degree, HIGHEST_DEGREE), continuity)
+
+    def _solve(self, n_modes: int, stiffness: Profile, continuity: int, tension: float, tolerance: float) -> Modes:
+        if n_modes < 1:
+            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+        extra = 0
+        while True:
+            segments = self._segments(n_modes, stiffness, continuity, extra)
+            omega, coefficients, essential = self._eigenpairs(segments, n_modes, stiffness, tension)
+            if segments.unresolved(coefficients) < tolerance:
+                break
+            extra = 10 + 2 * extra
+            if segments.n_functions > MOST_FUNCTIONS:
+                warnings.warn(
+                    "the modes did not settle to the tolerance: is there a jump in a profile given as a function?"
+                    " Name its place with Profile(function, breaks=(x,)).",
+                    stacklevel=3,
+                )
+                break
+
+        def shapes(x: np.ndarray, derivative: int) -> np.ndarray:
+            return segments.evaluation(x, derivative) @ coefficients
+
+        return Modes(
+            omega=omega,
+            damping=self._damping_matrix(omega, segments, coefficients),
+            shapes=shapes,
+            length=self.length,
+            essential=essential,
+        )
+
+    def _eigenpairs(self, segments: Segments, n_modes: int, stiffness: Profile, tension: float):
+        order = segments.continuity + 1
+        mass = segments.assemble(self.mass_per_length, 0)
+        rigidity = segments.assemble(stiffness, order)
+        if tension:
+            rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
+        held, essential = [], []
+        last = segments.nodes.size - 1
+        for node, at, end in ((0, 0.0, self.left), (last, self.length, self.right)):
+            for derivative, spring in enumerate((end.translation, end.rotation)[:order]):
+                index = order * node + derivative
+                if spring == HELD:
+                    held.append(index)
+                    essential.append((at, derivative))
+                else:
+                    rigidity[index, index] += spring
+        for part in self.attachments:
+            target, values = {
+                PointMass: (mass, lambda p: (p.mass, p.rotary_inertia)),
+                PointSpring: (rigidity, lambda p: (p.stiffness, p.rotational_stiffness)),
+                PointDamper: (None, None),
+            }[type(part)]
+            if target is None:
+                continue
+            for derivative, value in enumerate(values(part)):
+                if value:
+                    row = segments.evaluation(part.at, derivative)
+                    target += value * row.T @ row
+        free = np.setdiff1d(np.arange(segments.n_functions), held)
+        if n_modes > free.size:
+            raise ValueError(f"{n_modes} modes asked of {free.size} functions")
+        mass, rigidity = mass[np.ix_(free, free)], rigidity[np.ix_(free, free)]
+        # The inverse problem M v = ν (K + σ M) v: its largest eigenvalues are the lowest modes, so round-off is
+        # relative to them and not to the highest frequency the basis can carry. σ keeps K + σ M definite where the
+        # ends leave rigid-body modes.
+        middle = np.linspace(0.05, 0.95, 19) * self.length
+        shift = np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle)) * (np.pi / self.length) ** (2 * order)
+        try:
+            nu, vectors = eigh(mass, rigidity + shift * mass, subset_by_index=[free.size - n_modes, free.size - 1])
+        except LinAlgError as error:
+            if tension < 0:
+                raise ValueError(
+                    f"a tension of {tension:g} compresses the beam beyond buckling; lower its magnitude"
+                ) from error
+            raise ValueError("a negative stiffness makes the structure unstable; check springs and profiles") from error
+        nu, vectors = nu[::-1], vectors[:, ::-1]
+        eigenvalues = 1.0 / nu - shift
+        if (eigenvalues < -1e-7 * shift).any():
+            raise ValueError(
+                f"the structure is unstable: an eigenvalue ω² of {eigenvalues.min():g}; check compression and springs"
+            )
+        omega = np.sqrt(np.where(eigenvalues < 1e-10 * shift, 0.0, eigenvalues))
+        coefficients = np.zeros((segments.n_functions, n_modes))
+        coefficients[free] = vectors / np.sqrt(np.einsum("ir,ij,jr->r", vectors, mass, vectors, optimize=True))
+        rigid = np.flatnonzero(omega == 0)
+        if rigid.size == 2:
+            slope = segments.evaluation(0.5 * self.length, 1)[0] @ coefficients[:, rigid]
+            c, s = slope[1] / np.hypot(*slope), slope[0] / np.hypot(*slope)
+            coefficients[:, rigid] = coefficients[:, rigid] @ np.array([[c, s], [-s, c]])
+        coefficients *= self._signs(segments, coefficients)
+        return omega, coefficients, tuple(essential)
+
+    def _signs(self, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
+        """+1 or -1 a mode, so that the first derivative that does not vanish at the left end is positive."""
+        signs = np.zeros(coefficients.shape[1])
+        inside = np.linspace(0.0, self.length, 41)
+        for derivative in range(segments.continuity + 2):
+            values = segments.evaluation(inside, derivative) @ coefficients
+            start = values[0] / np.maximum(np.abs(values).max(axis=0), 1e-300)
+            signs = np.where((signs == 0) & (np.abs(start) > 1e-6), np.sign(start), signs)
+        return np.where(signs == 0, 1.0, signs)
+
+    def _damping_matrix(self, omega: np.ndarray, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
+        if isinstance(self.damping, ViscousDamping):
+            profile = as_profile(self.damping.coefficient_per_length)
+            matrix = coefficients.T @ segments.assemble(profile, 0) @ coefficients
+        else:
+            matrix = self.damping.matrix(omega)
+        for part in self.attachments:
+            if isinstance(part, PointDamper):
+                for derivative, value in enumerate((part.coefficient, part.rotational_coefficient)):
+                    if value:
+                        row = segments.evaluation(part.at, derivative) @ coefficients
+                        matrix = matrix + value * row.T @ row
+        return matrix
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Bar(_Member):
+    """A bar in axial vibration: -(EA u')' = ω² m u (4.26).
+
+    Attributes:
+        length: m.
+        mass_per_length: kg/m; a number, a function of x, points (x, values), or a `Profile`.
+        axial_stiffness: EA in N, likewise. Either may vanish at an end.
+        left, right: "fixed", "free" or an `End(translation)`.
+        attachments: `PointMass`, `PointSpring`, `PointDamper`.
+        damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
+
+    Raises:
+        ValueError: a profile that is not positive, an end of unknown name, an attachment outside.
+    """
+
+    axial_stiffness: ProfileLike
+
+    def __post_init__(self) -> None:
+        self._prepare(("fixed", "free"), "axial_stiffness")
+
+    def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
+        """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""
+        return self._solve(n_modes, self.axial_stiffness, 0, 0.0, tolerance)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Beam(_Member):
+    """An Euler-Bernoulli beam in bending: (EI w'')'' - T w'' = ω² m w.
+
+    Attributes:
+        length: m.
+        mass_per_length: kg/m; a number, a function of x, points (x, values), or a `Profile`.
+        bending_stiffness: EI in N m², likewise. Either may vanish at an end.
+        left, right: "hinged", "clamped", "free", "sliding" or an `End(translation, rotation)`.
+        attachments: `PointMass`, `PointSpring`, `PointDamper`.
+        damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
+        tension: axial load in N, positive in tension.
+
+    Raises:
+        ValueError: a profile that is not positive, an end of unknown name, an attachment outside, buckling.
+    """
+
+    bending_stiffness: ProfileLike
+    tension: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._prepare(("hinged", "clamped", "free", "sliding"), "bending_stiffness")
+
+    def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
+        """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""
+        return self._solve(n_modes, self.bending_stiffness, 1, self.tension, tolerance)
+
+
+Structure = Bar | Beam

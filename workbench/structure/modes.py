@@ -1,0 +1,187 @@
+"""Modes: what a structure's own computation and its measurement agree to speak of."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+Shapes = Callable[[np.ndarray, int], np.ndarray]
+
+
+def frozen(array: ArrayLike, dtype=float) -> np.ndarray:
+    """A read-only copy, as the fields of every frozen type hold it."""
+    copy = np.array(array, dtype=dtype)
+    copy.flags.writeable = False
+    return copy
+
+
+@dataclass(frozen=True, eq=False)
+class Modes:
+    """Mass-normalised modes, known everywhere along the structure: ∫ m φ_r φ_s dx = δ_rs (2.5).
+
+    Each modal coordinate obeys q_r'' + Σ_s c_rs q_s' + ω_r² q_r = f_r (2.10).
+
+    Attributes:
+        omega: (n_modes,) undamped natural frequencies, rad/s, not decreasing; 0 for a rigid-body mode.
+        damping: (n_modes, n_modes) coefficients c_rs of (2.11), 1/s; diagonal 2 ζ_r ω_r for modal damping. A vector
+            (n_modes,) is taken as the damping ratios ζ_r.
+        shapes: callable (x (n_points,), derivative) -> (n_points, n_modes).
+        length: extent of the structure, m; positions are in [0, length].
+        essential: ((x, derivative), ...) where the supports hold the shape or its slope at zero.
+        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), where the modes were identified; None where computed.
+
+    Raises:
+        ValueError: negative or non-finite frequencies, mismatched shapes.
+    """
+
+    omega: np.ndarray
+    damping: np.ndarray
+    shapes: Shapes = field(repr=False)
+    length: float
+    essential: tuple[tuple[float, int], ...] = ()
+    covariance: np.ndarray | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        omega = frozen(self.omega)
+        damping = np.array(self.damping, float)
+        if omega.ndim != 1 or omega.size == 0:
+            raise ValueError(f"Modes.omega must have shape (n_modes,) with at least one mode; got {omega.shape}")
+        if not np.isfinite(omega).all() or (omega < 0).any():
+            raise ValueError(f"Modes.omega must be finite and not negative, rad/s; got {omega}")
+        if damping.ndim < 2:
+            damping = np.diag(np.broadcast_to(2.0 * damping * omega, omega.shape))
+        if damping.shape != (omega.size, omega.size) or not np.isfinite(damping).all():
+            raise ValueError(
+                f"Modes.damping must be finite, (n_modes,) ratios or (n_modes, n_modes) c_rs with n_modes ="
+                f" {omega.size}; got shape {damping.shape}"
+            )
+        object.__setattr__(self, "omega", omega)
+        object.__setattr__(self, "damping", frozen(damping))
+        if self.covariance is not None:
+            object.__setattr__(self, "covariance", frozen(self.covariance))
+
+    @property
+    def n_modes(self) -> int:
+        return self.omega.size
+
+    @property
+    def zeta(self) -> np.ndarray:
+        """Damping ratios (n_modes,): c_rr / (2 ω_r), and 0 for a rigid-body mode."""
+        c = np.diag(self.damping)
+        return np.divide(c, 2.0 * self.omega, out=np.zeros_like(c), where=self.omega > 0)
+
+    @property
+    def frequencies_hz(self) -> np.ndarray:
+        """Natural frequencies (n_modes,), Hz."""
+        return self.omega / (2.0 * np.pi)
+
+    @property
+    def proportional(self) -> bool:
+        """Whether damping leaves the modes uncoupled (2.14)."""
+        diagonal = np.diag(self.damping)
+        return bool(np.abs(self.damping - np.diag(diagonal)).max() <= 1e-12 * max(np.abs(diagonal).max(), 1e-300))
+
+    def phi(self, x: ArrayLike, derivative: int = 0) -> np.ndarray:
+        """Mode shapes at x (m), or their derivatives along x: (n_points, n_modes).
+
+        Raises:
+            ValueError: a position outside the structure.
+        """
+        x = np.atleast_1d(np.asarray(x, float))
+        slack = 1e-9 * self.length
+        outside = (x < -slack) | (x > self.length + slack) | ~np.isfinite(x)
+        if outside.any():
+            raise ValueError(f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}")
+        return np.asarray(self.shapes(np.clip(x, 0.0, self.length), derivative), float)
+
+    def select(self, modes: Sequence[int] | slice) -> "Modes":
+        """Only some of the modes, by zero-based index."""
+        index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
+        if index.size == 0 or index.min() < 0 or index.max() >= self.n_modes:
+            raise ValueError(f"modes {list(index)} are not all among the {self.n_modes} modes at hand (from 0)")
+        shapes = self.shapes
+        covariance = self.covariance
+        if covariance is not None:
+            both = np.r_[index, index + self.n_modes]
+            covariance = covariance[np.ix_(both, both)]
+        return Modes(
+            omega=self.omega[index],
+            damping=self.damping[np.ix_(index, index)],
+            shapes=lambda x, derivative: shapes(x, derivative)[:, index],
+            length=self.length,
+            essential=self.essential,
+            covariance=covariance,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SampledModes:
+    """Modes as a measurement gives them: complex, unscaled, known at the sensors only.
+
+    Attributes:
+        omega: (n_modes,) rad/s, increasing.
+        zeta: (n_modes,) damping ratios.
+        shapes: (n_outputs, n_modes) complex, one row a sensor; scale arbitrary.
+        positions: (n_outputs,) places of the sensors, m (nan where unknown).
+    """
+
+    omega: np.ndarray
+    zeta: np.ndarray
+    shapes: np.ndarray
+    positions: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name, dtype in (("omega", float), ("zeta", float), ("shapes", complex), ("positions", float)):
+            object.__setattr__(self, name, frozen(getattr(self, name), dtype))
+        n = self.omega.size
+        if self.zeta.shape != (n,) or self.shapes.shape != (self.positions.size, n):
+            raise ValueError(
+                f"SampledModes with {n} frequencies and {self.positions.size} positions needs zeta ({n},) and shapes"
+                f" ({self.positions.size}, {n}); got {self.zeta.shape} and {self.shapes.shape}"
+            )
+
+    @property
+    def n_modes(self) -> int:
+        return self.omega.size
+
+    @property
+    def frequencies_hz(self) -> np.ndarray:
+        """Natural frequencies (n_modes,), Hz."""
+        return self.omega / (2.0 * np.pi)
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Upper-half-plane poles (n_modes,): -ζω + iω√(1-ζ²), rad/s."""
+        return -self.zeta * self.omega + 1j * self.omega * np.sqrt(np.maximum(1.0 - self.zeta**2, 0.0))
+
+    @property
+    def phase_collinearity(self) -> np.ndarray:
+        """Modal phase collinearity MPC (n_modes,): 1 for a real shape, towards 0 for a travelling one.
+
+        Pappa, Elliott & Schenk, NASA TM-102664 (1990).
+        """
+        x, y = self.shapes.real, self.shapes.imag
+        sxx, syy, sxy = (x * x).sum(0), (y * y).sum(0), (x * y).sum(0)
+        spread = np.hypot(sxx - syy, 2.0 * sxy)
+        return (spread / np.maximum(sxx + syy, 1e-300)) ** 2
+
+
+def mac(first: ArrayLike, second: ArrayLike) -> np.ndarray:
+    """Modal assurance criterion between two sets of shapes at the same places.
+
+    MAC_rs = |φ_r^H ψ_s|² / (φ_r^H φ_r · ψ_s^H ψ_s) (Allemang & Brown 1982).
+
+    Args:
+        first: (n_points, n_first) shapes, real or complex.
+        second: (n_points, n_second).
+
+    Returns:
+        (n_first, n_second), between 0 and 1.
+    """
+    a, b = np.asarray(first), np.asarray(second)
+    a, b = a.reshape(a.shape[0], -1), b.reshape(b.shape[0], -1)
+    if a.shape[0] != b.shape[0]:
+        raise ValueError(f"MAC compares shapes at the same places; got {a.shape[0]} and {b.shape[0]} of them")
+    norms = np.outer((np.abs(a) ** 2).sum(0), (np.abs(b) ** 2).sum(0))
+    return np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300)

@@ -1,0 +1,96 @@
+"""A quantity along the structure: mass per length, stiffness, damping per length."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Real
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+
+@dataclass(frozen=True, eq=False)
+class Profile:
+    """A scalar quantity along x, smooth between its breaks.
+
+    Attributes:
+        function: takes positions (n_points,) in m, returns values (n_points,).
+        breaks: positions in m where the quantity or its slope jumps; quadrature never straddles one.
+    """
+
+    function: Callable[[np.ndarray], np.ndarray]
+    breaks: tuple[float, ...] = ()
+
+    @classmethod
+    def constant(cls, value: float) -> "Profile":
+        """The same value everywhere."""
+        if not np.isfinite(value):
+            raise ValueError(f"a constant profile must be finite; got {value}")
+        return cls(lambda x: np.full(np.shape(x), float(value)))
+
+    @classmethod
+    def points(cls, x: ArrayLike, value: ArrayLike) -> "Profile":
+        """Linear between the points (x_i, value_i); the same x twice in a row is a jump.
+
+        Args:
+            x: (n_points,) positions in m, not decreasing.
+            value: (n_points,) values there.
+
+        Raises:
+            ValueError: unequal lengths, fewer than two points, non-finite numbers, x that goes back.
+        """
+        x, value = np.asarray(x, float), np.asarray(value, float)
+        if x.ndim != 1 or x.shape != value.shape or x.size < 2:
+            raise ValueError(
+                f"a profile needs as many x as value, at least two; got shapes {x.shape} and {value.shape}"
+            )
+        if not (np.isfinite(x).all() and np.isfinite(value).all()):
+            raise ValueError("the points of a profile must be finite numbers")
+        steps = np.diff(x)
+        if (steps < 0).any():
+            i = int(np.argmax(steps < 0))
+            raise ValueError(f"profile points must not go back: x[{i + 1}] = {x[i + 1]} after {x[i]}; sort them")
+        if (steps[1:] + steps[:-1] == 0).any():
+            raise ValueError("more than two profile points stand at the same x; two make a jump")
+        pieces = [i for i in range(x.size - 1) if x[i + 1] > x[i]]
+        starts = x[pieces]
+
+        def piecewise_linear(at: np.ndarray) -> np.ndarray:
+            piece = np.asarray(pieces)[np.clip(np.searchsorted(starts, at, side="right") - 1, 0, None)]
+            share = (at - x[piece]) / (x[piece + 1] - x[piece])
+            return value[piece] + share * (value[piece + 1] - value[piece])
+
+        return cls(piecewise_linear, tuple(np.unique(x)))
+
+    def __call__(self, x: ArrayLike) -> np.ndarray:
+        """The values at positions x, in the shape of x."""
+        x = np.asarray(x, float)
+        values = np.asarray(self.function(np.atleast_1d(x)), float)
+        return np.broadcast_to(values, np.atleast_1d(x).shape).reshape(x.shape)
+
+    def scaled(self, factor: float, start: float | None = None, stop: float | None = None) -> "Profile":
+        """The same quantity times `factor`, everywhere or between `start` and `stop` (m)."""
+        if start is None or stop is None:
+            return Profile(lambda x: factor * self.function(x), self.breaks)
+
+        def changed(x: np.ndarray) -> np.ndarray:
+            return np.where((x > start) & (x < stop), factor, 1.0) * self.function(x)
+
+        return Profile(changed, tuple(sorted({*self.breaks, float(start), float(stop)})))
+
+
+ProfileLike = Profile | Real | Callable[[np.ndarray], np.ndarray] | tuple
+
+
+def as_profile(quantity: ProfileLike) -> Profile:
+    """A `Profile` from a number, a callable of x, a pair (x, values), or a `Profile`."""
+    if isinstance(quantity, Profile):
+        return quantity
+    if isinstance(quantity, Real):
+        return Profile.constant(float(quantity))
+    if callable(quantity):
+        return Profile(quantity)
+    if isinstance(quantity, tuple | list) and len(quantity) == 2:
+        return Profile.points(*quantity)
+    raise TypeError(
+        f"a profile is a number, a function of x, a pair (x, values) or a Profile; got {type(quantity).__name__}"
+    )

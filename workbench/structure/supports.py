@@ -1,0 +1,68 @@
+"""What holds a structure at its ends and what is attached to it in between."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+HELD = np.inf
+
+
+@dataclass(frozen=True)
+class End:
+    """An end of a structure: stiffness against translation (N/m) and rotation (N m/rad); 0 is free, inf is held."""
+
+    translation: float
+    rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("translation", "rotation"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"the {name} stiffness of an end must be 0 or more; got {getattr(self, name)}")
+
+
+NAMED_ENDS = {
+    "hinged": End(HELD, 0.0),
+    "clamped": End(HELD, HELD),
+    "free": End(0.0, 0.0),
+    "sliding": End(0.0, HELD),
+    "fixed": End(HELD, 0.0),
+}
+
+
+def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
+    """An `End` from its name or itself; the error lists the names that this kind of structure knows."""
+    if isinstance(end, End):
+        return end
+    if end not in allowed:
+        raise ValueError(f"an end is one of {', '.join(allowed)} or an End(translation, rotation); got {end!r}")
+    return NAMED_ENDS[end]
+
+
+@dataclass(frozen=True)
+class PointMass:
+    """A rigid body attached at a point: mass (kg) and rotary inertia (kg m²) about that point."""
+
+    at: float
+    mass: float
+    rotary_inertia: float = 0.0
+
+
+@dataclass(frozen=True)
+class PointSpring:
+    """A linear spring from a point to ground: against translation (N/m) and rotation (N m/rad)."""
+
+    at: float
+    stiffness: float
+    rotational_stiffness: float = 0.0
+
+
+@dataclass(frozen=True)
+class PointDamper:
+    """A viscous damper from a point to ground: against translation (N s/m) and rotation (N m s/rad)."""
+
+    at: float
+    coefficient: float
+    rotational_coefficient: float = 0.0
+
+
+Attachment = PointMass | PointSpring | PointDamper
