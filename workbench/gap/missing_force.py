@@ -1,0 +1,187 @@
+"""The missing force: what force at a point, of any form, would make the simulation agree with the test?
+
+The residual of the nominal model obeys the model's own equations, driven by whatever the model leaves out. A Kalman
+filter with an unknown force at x (a first-order random process) gives the likelihood of that place without a guess
+of the law, and its smoother gives the force, and the motion there, to look at.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.linalg import cho_factor, cho_solve, expm
+
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.modes import Modes
+
+
+@dataclass(frozen=True, eq=False)
+class SampledModel:
+    """The modal equations over one sample interval, with held modal forces.
+
+    Attributes:
+        transition: (2n, 2n) of the state (q, q').
+        growth: (2n, n) response of the state to modal forces held over the interval.
+        output: (n_sensors, 2n) and feedthrough (n_sensors, n) of modal forces.
+        noise_variance: (n_sensors,).
+    """
+
+    transition: np.ndarray
+    growth: np.ndarray
+    output: np.ndarray
+    feedthrough: np.ndarray
+    noise_variance: np.ndarray
+
+
+def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
+    """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,)."""
+    n = modes.n_modes
+    stiffness = np.diag(modes.omega**2)
+    a = np.zeros((3 * n, 3 * n))
+    a[:n, n : 2 * n] = np.eye(n)
+    a[n : 2 * n, :n] = -stiffness
+    a[n : 2 * n, n : 2 * n] = -modes.damping
+    a[n : 2 * n, 2 * n :] = np.eye(n)
+    step = expm(a * sample_time)
+    output = np.zeros((len(sensors), 2 * n))
+    feedthrough = np.zeros((len(sensors), n))
+    for j, sensor in enumerate(sensors):
+        derivative, order = MEASURED[sensor.quantity]
+        shape = sensor.gain * modes.phi(sensor.at, derivative)[0]
+        if order < 2:
+            output[j, order * n : (order + 1) * n] = shape
+        else:
+            output[j] = np.r_[-shape @ stiffness, -shape @ modes.damping]
+            feedthrough[j] = shape
+    return SampledModel(step[: 2 * n, : 2 * n], step[: 2 * n, 2 * n :], output, feedthrough, noise**2)
+
+
+@dataclass(frozen=True, eq=False)
+class ForceFilter:
+    """A steady Kalman filter of the state (q, q', g_1..g_m) with m unknown forces.
+
+    Attributes:
+        a, h: transition and output of the augmented state.
+        covariance: (n_states, n_states) of the predicted state.
+        gain: (n_states, n_sensors), predictor form.
+        innovation: (n_sensors, n_sensors) covariance S.
+        n_forces: m.
+    """
+
+    a: np.ndarray
+    h: np.ndarray
+    covariance: np.ndarray
+    gain: np.ndarray
+    innovation: np.ndarray
+    n_forces: int
+
+
+def force_filter(
+    model: SampledModel, patterns: np.ndarray, variances: np.ndarray, memory: float
+) -> ForceFilter:
+    """The filter for forces along `patterns` (n_modes, n_forces) with the given process variances.
+
+    memory is the correlation of a force from one sample to the next: 0 for white, near 1 for a random walk.
+    """
+    n_state, m = model.transition.shape[0], patterns.shape[1]
+    a = np.zeros((n_state + m, n_state + m))
+    a[:n_state, :n_state] = model.transition
+    a[:n_state, n_state:] = model.growth @ patterns
+    a[n_state:, n_state:] = memory * np.eye(m)
+    h = np.hstack([model.output, model.feedthrough @ patterns])
+    q = np.zeros_like(a)
+    q[n_state:, n_state:] = np.diag(variances)
+    covariance = steady_covariance(a, h, q, model.noise_variance)
+    s = h @ covariance @ h.T + np.diag(model.noise_variance)
+    gain = np.linalg.solve(s, h @ covariance @ a.T).T
+    return ForceFilter(a, h, covariance, gain, s, m)
+
+
+def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
+    """Steady prediction covariance of the Kalman filter, by structure-preserving doubling.
+
+    Chu, Fan, Lin & Wang, Int. J. Control 77 (2004) 767. A filter needs about fifteen doublings.
+    """
+    ak, gk, hk = a.T.copy(), h.T @ (h / noise_variance[:, None]), q.copy()
+    eye = np.eye(a.shape[0])
+    for _ in range(40):
+        inverse = np.linalg.inv(eye + gk @ hk)
+        forward = ak @ inverse
+        change = ak.T @ hk @ inverse @ ak
+        gk = gk + forward @ gk @ ak.T
+        ak = forward @ ak
+        hk = hk + change
+        if np.abs(change).max() <= 1e-10 * np.abs(hk).max():
+            break
+    return 0.5 * (hk + hk.T)
+
+
+@njit(cache=True, nogil=True)
+def _innovations(a, h, gain, residual, out):
+    n, m = a.shape[0], h.shape[0]
+    x, new = np.zeros(n), np.zeros(n)
+    for k in range(residual.shape[1]):
+        for j in range(m):
+            total = residual[j, k]
+            for i in range(n):
+                total -= h[j, i] * x[i]
+            out[j, k] = total
+        for i in range(n):
+            total = 0.0
+            for s in range(n):
+                total += a[i, s] * x[s]
+            for j in range(m):
+                total += gain[i, j] * out[j, k]
+            new[i] = total
+        x, new = new, x
+
+
+def innovations(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+    """One-step prediction errors (n_sensors, n_samples) of a residual, from rest."""
+    out = np.empty_like(residual)
+    _innovations(filter_.a, filter_.h, filter_.gain, np.ascontiguousarray(residual), out)
+    return out
+
+
+def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
+    """Gaussian log-likelihood of residual records under the filter, constants left out."""
+    factor = cho_factor(filter_.innovation, lower=True)
+    log_det = 2.0 * np.log(np.diag(factor[0])).sum()
+    total = 0.0
+    for residual in residuals:
+        e = innovations(filter_, residual)
+        total -= 0.5 * (np.sum(e * cho_solve(factor, e)) + e.shape[1] * log_det)
+    return total
+
+
+def whiten(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+    """Innovations of unit covariance (n_sensors, n_samples)."""
+    return np.linalg.solve(np.linalg.cholesky(filter_.innovation), innovations(filter_, residual))
+
+
+def smoothed_states(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+    """Smoothed augmented states (2n + m, n_samples): the error of the motion, and the missing forces.
+
+    Bryson-Frazier form: a backward pass of the adjoint, so that no covariance is inverted.
+    """
+    e = innovations(filter_, residual)
+    weighted = filter_.h.T @ np.linalg.solve(filter_.innovation, e)
+    closed = filter_.a - filter_.gain @ filter_.h
+    predicted = np.empty((filter_.a.shape[0], residual.shape[1]))
+    adjoint = np.empty_like(predicted)
+    _passes(filter_.a, filter_.gain, closed, e, weighted, predicted, adjoint)
+    return predicted + filter_.covariance @ adjoint
+
+
+@njit(cache=True, nogil=True)
+def _passes(a, gain, closed, e, weighted, predicted, adjoint):
+    n, n_samples = predicted.shape
+    x = np.zeros(n)
+    for k in range(n_samples):
+        predicted[:, k] = x
+        x = a @ x + gain @ np.ascontiguousarray(e[:, k])
+    transposed = np.ascontiguousarray(closed.T)
+    r = np.zeros(n)
+    for k in range(n_samples - 1, -1, -1):
+        r = transposed @ r + weighted[:, k]
+        adjoint[:, k] = r

@@ -1,0 +1,157 @@
+"""Exact propagation of a linear rig: held inputs, delays, lags and sinusoids in closed form, pole by pole."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from workbench.structure.modes import Modes
+
+
+@dataclass(frozen=True, eq=False)
+class ModalPoles:
+    """The modal equations in the coordinates of their poles: s' = λ s + W p, q = Re(Q s), q' = Re(Q Λ s).
+
+    Attributes:
+        poles: (n_poles,) complex λ, one of each conjugate pair.
+        weights: (n_poles, n_modes) W, how the modal forces p drive each pole.
+        shapes: (n_modes, n_poles) Q, a conjugate pair counted in it.
+    """
+
+    poles: np.ndarray
+    weights: np.ndarray
+    shapes: np.ndarray
+
+
+def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
+    """Poles of q'' + C q' + Ω² q = p, coupled or not.
+
+    A rigid-body mode without damping has a double pole at zero, which has no diagonal form: its frequency is taken as
+    a millionth of the lowest elastic one, an error below 1e-8 over ten of its periods.
+    """
+    elastic = omega[omega > 0]
+    tiny = 1e-6 * (elastic.min() if elastic.size else 1.0)
+    omega = np.maximum(omega, tiny)
+    diagonal = np.diag(damping)
+    if np.abs(damping - np.diag(diagonal)).max() == 0 and (diagonal < 2 * omega).all():
+        poles = -0.5 * diagonal + 1j * np.sqrt(omega**2 - 0.25 * diagonal**2)
+        return ModalPoles(poles, np.diag(1.0 / (2j * poles.imag)), 2.0 * np.eye(omega.size))
+    n = omega.size
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), -damping]])
+    values, vectors = np.linalg.eig(a)
+    inverse = np.linalg.inv(vectors)
+    keep = values.imag >= 0
+    twice = np.where(values.imag > 0, 2.0, 1.0)
+    return ModalPoles(values[keep], inverse[keep][:, n:], (vectors[:n] * twice)[:, keep])
+
+
+@njit(cache=True, nogil=True)
+def _recursion(decay, drive, out):
+    """out[i, k + 1] = decay[i] out[i, k] + drive[i, k], out[:, 0] given."""
+    for i in range(drive.shape[0]):
+        s = out[i, 0]
+        d = decay[i]
+        for k in range(drive.shape[1] - 1):
+            s = d * s + drive[i, k]
+            out[i, k + 1] = s
+
+
+def held_response(
+    system: ModalPoles,
+    forces: np.ndarray,
+    participation: np.ndarray,
+    sample_time: float,
+    *,
+    delay: float = 0.0,
+    time_constant: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pole coordinates under inputs held over each sample, delayed and lagged as a drive does it.
+
+    Args:
+        system: the poles.
+        forces: (n_inputs, n_samples) values held from t_k to t_k+1.
+        participation: (n_modes, n_inputs) modal forces per unit input.
+        sample_time: s.
+        delay: s, common to these inputs, before the lag.
+        time_constant: of the first-order lag, s.
+
+    Returns:
+        s (n_poles, n_samples), and the forces that act at the sample instants (n_inputs, n_samples).
+    """
+    poles, weights = system.poles, system.weights @ participation
+    n_samples = forces.shape[1]
+    shift, rest = divmod(delay, sample_time)
+    shift = int(shift)
+    older = _shifted(forces, shift + 1)
+    newer = _shifted(forces, shift)
+    response = np.zeros((poles.size, n_samples), complex)
+    decay = np.exp(poles * sample_time)
+    if time_constant == 0:
+        whole, late = _growth(poles, sample_time), _growth(poles, sample_time - rest)
+        drive = late[:, None] * (weights @ newer)
+        if rest > 0:
+            drive += (whole - late)[:, None] * (weights @ older)
+        _recursion(decay, drive, response)
+        return response, newer if rest == 0 else older
+    rate = 1.0 / time_constant
+    acting = np.zeros_like(forces)
+    fade = np.exp(-rate * (sample_time - rest))
+    command_drive = (1.0 - fade) * newer + fade * (1.0 - np.exp(-rate * rest)) * older
+    _recursion(np.full(forces.shape[0], np.exp(-rate * sample_time)), command_drive, acting)
+    # over [0, rest) the command is `older`, then `newer`; in each the force decays exponentially towards it
+    second = sample_time - rest
+    middle = older + (acting - older) * np.exp(-rate * rest)
+    drive = np.exp(poles * second)[:, None] * (
+        _growth(poles, rest)[:, None] * (weights @ older)
+        + _faded_growth(poles, rate, rest)[:, None] * (weights @ (acting - older))
+    )
+    drive += _growth(poles, second)[:, None] * (weights @ newer)
+    drive += _faded_growth(poles, rate, second)[:, None] * (weights @ (middle - newer))
+    _recursion(decay, drive, response)
+    return response, acting
+
+
+def sinusoid_response(
+    system: ModalPoles, participation: np.ndarray, omega: float, phasor: complex, time: np.ndarray
+) -> np.ndarray:
+    """Pole coordinates (n_poles, n_samples) under the modal force participation · Im(phasor e^{iωt}), from rest."""
+    poles, weights = system.poles[:, None], (system.weights @ participation)[:, None]
+    response = np.zeros((poles.size, time.size), complex)
+    for sign, amplitude in ((1.0, phasor / 2j), (-1.0, -np.conj(phasor) / 2j)):
+        response += amplitude * (np.exp(1j * sign * omega * time) - np.exp(poles * time)) / (1j * sign * omega - poles)
+    return weights * response
+
+
+def modal_motion(system: ModalPoles, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Modal displacements and velocities (n_modes, n_samples) from pole coordinates."""
+    shapes = system.shapes
+    rates = shapes * system.poles
+    return _real_product(shapes, response), _real_product(rates, response)
+
+
+def system_of(modes: Modes) -> ModalPoles:
+    """`modal_poles` of a set of modes."""
+    return modal_poles(modes.omega, modes.damping)
+
+
+def _real_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a.real @ np.ascontiguousarray(b.real) - (a.imag @ np.ascontiguousarray(b.imag) if np.iscomplexobj(a) else 0)
+
+
+def _growth(poles: np.ndarray, span: float) -> np.ndarray:
+    """∫_0^span e^{λ t} dt."""
+    return np.expm1(poles * span) / poles
+
+
+def _faded_growth(poles: np.ndarray, rate: float, span: float) -> np.ndarray:
+    """∫_0^span e^{λ (span - t)} e^{-rate t} dt."""
+    return np.exp(-rate * span) * np.expm1((poles + rate) * span) / (poles + rate)
+
+
+def _shifted(values: np.ndarray, samples: int) -> np.ndarray:
+    if samples == 0:
+        return values
+    shifted = np.zeros_like(values)
+    if samples < values.shape[1]:
+        shifted[:, samples:] = values[:, : values.shape[1] - samples]
+    return shifted

@@ -1,0 +1,38 @@
+"""A rig: what stands in the laboratory."""
+
+from dataclasses import dataclass
+
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import Element
+from workbench.rig.sensors import Sensor
+from workbench.structure.member import Structure
+from workbench.structure.modes import Modes
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Modes, what drives them, what measures them, and what touches them.
+
+    Attributes:
+        modes: of the structure; as many as the rig shows.
+        actuators: one an input, in the order of the inputs.
+        sensors: one an output, in the order of the outputs.
+        elements: forces at points or all along, linear or not.
+        stiffness_rate: the stiffness is 1 + rate t times itself, 1/s; t from the start of a record.
+        structure: the member behind the modes, where it is known; changes of structure are solved anew on it.
+    """
+
+    modes: Modes
+    actuators: tuple[Actuator, ...]
+    sensors: tuple[Sensor, ...]
+    elements: tuple[Element, ...] = ()
+    stiffness_rate: float = 0.0
+    structure: Structure | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("actuators", "sensors", "elements"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name, parts in (("actuators", self.actuators), ("sensors", self.sensors)):
+            names = [part.name for part in parts]
+            if len(set(names)) != len(names):
+                raise ValueError(f"the {name} of a rig must have different names; got {names}")

@@ -1,0 +1,296 @@
+"""Simulation of a rig from rest: exact where it is linear, stepped with exact modes where it is not."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numba import njit
+
+from workbench.records.record import Channel, Record
+from workbench.rig import stepping
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import (
+    AirDrag,
+    BoucWen,
+    Clearance,
+    CoulombFriction,
+    CubicSpring,
+    LinearDamper,
+    LinearSpring,
+    MidplaneStretching,
+    OneSidedStop,
+    PeriodicForce,
+    UserLaw,
+)
+from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+
+LAWS = {
+    LinearSpring: (stepping.LINEAR_SPRING, lambda e: (e.stiffness,)),
+    LinearDamper: (stepping.LINEAR_DAMPER, lambda e: (e.coefficient,)),
+    CubicSpring: (stepping.CUBIC, lambda e: (e.stiffness,)),
+    Clearance: (stepping.CLEARANCE, lambda e: (e.stiffness, e.gap)),
+    OneSidedStop: (stepping.ONE_SIDED, lambda e: (e.stiffness, e.gap)),
+    CoulombFriction: (stepping.FRICTION, lambda e: (e.force, e.smoothing_speed)),
+    BoucWen: (stepping.BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
+    UserLaw: (stepping.USER, lambda e: e.parameters),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Modal motion of a rig at the sample instants.
+
+    Attributes:
+        displacement, velocity, acceleration: (n_modes, n_samples) of the modal coordinates.
+    """
+
+    displacement: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+
+
+def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, name: str = "simulated") -> Record:
+    """The record that the rig gives from rest under inputs held over each sample interval, without noise.
+
+    Args:
+        inputs: (n_actuators, n_samples) commands.
+        sample_time: s.
+        substeps: of each sample interval, where the rig is not linear.
+        name: of the record.
+
+    Raises:
+        ValueError: inputs that do not fit the actuators.
+    """
+    inputs = np.atleast_2d(np.asarray(inputs, float))
+    if inputs.shape[0] != len(rig.actuators):
+        raise ValueError(
+            f"inputs must have shape ({len(rig.actuators)} actuators, n_samples); got {inputs.shape}. Is time last?"
+        )
+    motion = move(rig, inputs, sample_time=sample_time, substeps=substeps)
+    return Record(
+        sample_time=sample_time,
+        outputs=read(rig, motion, sample_time=sample_time),
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
+        inputs=inputs,
+        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
+        name=name,
+    )
+
+
+def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8) -> Motion:
+    """Modal motion from rest; see `simulate`."""
+    stepped = [e for e in rig.elements if not isinstance(e, PeriodicForce)]
+    if not stepped and rig.stiffness_rate == 0:
+        return _move_exactly(rig, inputs, sample_time)
+    return _move_in_steps(rig, inputs, sample_time, substeps)
+
+
+def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
+    """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
+    outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
+    for order, quantity in enumerate((motion.displacement, motion.velocity, motion.acceleration)):
+        rows = [j for j, s in enumerate(rig.sensors) if MEASURED[s.quantity][1] == order]
+        for derivative in (0, 1):
+            here = [j for j in rows if MEASURED[rig.sensors[j].quantity][0] == derivative]
+            if here:
+                places = [rig.sensors[j].at for j in here]
+                outputs[here] = rig.modes.phi(places, derivative) @ quantity
+    for j, sensor in enumerate(rig.sensors):
+        outputs[j] = sensor_reading(sensor, outputs[j], sample_time)
+    return outputs
+
+
+def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.ndarray:
+    """A sensor's mean reading (n_samples,) of the truth: lag, gain, bias and drift, clipping, rounding."""
+    y = truth
+    if sensor.time_constant > 0:
+        y = _lagged(y, sensor.time_constant, sample_time)
+    if sensor.gain != 1:
+        y = sensor.gain * y
+    if sensor.bias or sensor.drift:
+        y = y + sensor.bias + sensor.drift * np.linspace(0.0, 1.0, y.size)
+    if np.isfinite(sensor.limit):
+        y = np.clip(y, -sensor.limit, sensor.limit)
+    if sensor.step > 0:
+        y = _mean_rounded(y, sensor.step, sensor.noise_std)
+    return y
+
+
+def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
+    """The force that an actuator heads for, before its delay and lag: gain, dead zone, saturation."""
+    force = command if actuator.gain == 1 else actuator.gain * command
+    if actuator.dead_zone > 0:
+        force = np.sign(force) * np.maximum(np.abs(force) - actuator.dead_zone, 0.0)
+    if np.isfinite(actuator.limit):
+        force = np.clip(force, -actuator.limit, actuator.limit)
+    return force
+
+
+def _participation(rig: Rig) -> np.ndarray:
+    """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
+    columns = [rig.modes.phi(a.at, 1 if a.kind == "moment" else 0)[0] for a in rig.actuators]
+    return np.array(columns).reshape(-1, rig.modes.n_modes).T
+
+
+def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
+    modes, participation = rig.modes, _participation(rig)
+    system = modal_poles(modes.omega, modes.damping)
+    n_samples = inputs.shape[1]
+    response = np.zeros((system.poles.size, n_samples), complex)
+    acting = np.zeros((modes.n_modes, n_samples))
+    for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
+        group = [j for j, a in enumerate(rig.actuators) if (a.delay, a.time_constant) == (delay, lag)]
+        forces = np.array([actuator_force(rig.actuators[j], inputs[j]) for j in group])
+        share, at_samples = held_response(
+            system, forces, participation[:, group], sample_time, delay=delay, time_constant=lag
+        )
+        response += share
+        acting += participation[:, group] @ at_samples
+    time = sample_time * np.arange(n_samples)
+    for element in rig.elements:
+        shape = modes.phi(element.at)[0]
+        omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
+        response += sinusoid_response(system, shape, omega, phasor, time)
+        acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
+    q, v = modal_motion(system, response)
+    return Motion(q, v, acting - modes.omega[:, None] ** 2 * q - modes.damping @ v)
+
+
+def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
+    modes = rig.modes
+    diagonal = np.diag(modes.damping).copy()
+    coupling = modes.damping - np.diag(diagonal)
+    if np.abs(coupling).max() == 0:
+        coupling = np.zeros((0, 0))
+    n_samples = inputs.shape[1]
+    forces, at_samples = _forces_on_substeps(rig, inputs, sample_time, substeps)
+    participation = _participation(rig)
+    for element in rig.elements:
+        if isinstance(element, PeriodicForce):
+            mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
+            forces, at_samples = np.vstack([forces, mean]), np.vstack([at_samples, now])
+            participation = np.column_stack([participation, modes.phi(element.at)[0]])
+    points = [e for e in rig.elements if type(e) in LAWS]
+    parameters = np.zeros((len(points), 3))
+    for row, element in zip(parameters, points, strict=True):
+        values = LAWS[type(element)][1](element)
+        row[: len(values)] = values
+    stretch = sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching))
+    drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
+    drag_shapes, drag_weights = _along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
+    q, v, f = (np.zeros((modes.n_modes, n_samples)) for _ in range(3))
+    _stepper(tuple(e.law for e in points if isinstance(e, UserLaw)))(
+        modes.omega,
+        diagonal,
+        coupling,
+        sample_time,
+        substeps,
+        rig.stiffness_rate,
+        forces,
+        participation,
+        stretch,
+        _stretching(rig) if stretch else np.zeros((0, 0)),
+        drag_shapes,
+        drag * drag_weights,
+        np.array([LAWS[type(e)][0] for e in points], dtype=np.int64),
+        modes.phi([e.at for e in points]) if points else np.zeros((0, modes.n_modes)),
+        parameters,
+        q,
+        v,
+        f,
+    )
+    scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(n_samples)
+    stiffness = modes.omega[:, None] ** 2 * q * scale
+    return Motion(q, v, participation @ at_samples + f - stiffness - modes.damping @ v)
+
+
+@cache
+def _stepper(laws: tuple[Callable, ...]):
+    if not laws:
+        return stepping.step_record
+    if len(set(laws)) > 1:
+        raise ValueError("a rig carries one law of the user's own at a time; got several")
+    return stepping.make_stepper(njit(laws[0]))
+
+
+def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
+    """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
+    points, weights = np.polynomial.legendre.leggauss(max(2 * rig.modes.n_modes + 12, 24))
+    length = rig.modes.length
+    return rig.modes.phi(0.5 * length * (points + 1.0), derivative), 0.5 * length * weights
+
+
+def _stretching(rig: Rig) -> np.ndarray:
+    """∫ φ_r' φ_s' dx, (n_modes, n_modes)."""
+    slopes, weights = _along(rig, 1)
+    return slopes.T @ (weights[:, None] * slopes)
+
+
+def _forces_on_substeps(
+    rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean force of each actuator over each substep, and the force at each sample instant."""
+    fine = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
+    now = np.empty_like(inputs)
+    for j, actuator in enumerate(rig.actuators):
+        held = np.repeat(actuator_force(actuator, inputs[j]), substeps)
+        fine[j], at_start = _delayed_and_lagged(held, actuator, sample_time / substeps)
+        now[j] = at_start[::substeps]
+    return fine, now
+
+
+def _delayed_and_lagged(held: np.ndarray, actuator: Actuator, h: float) -> tuple[np.ndarray, np.ndarray]:
+    shift, rest = divmod(actuator.delay, h)
+    padded = np.r_[np.zeros(int(shift) + 1), held][: held.size + 1]
+    older, newer = padded[:-1], padded[1:]
+    if int(shift) + 1 > held.size:
+        older = newer = np.zeros_like(held)
+    share = rest / h
+    command = share * older + (1.0 - share) * newer
+    start = newer if rest == 0 else older
+    if actuator.time_constant == 0:
+        return command, start
+    from scipy.signal import lfilter
+
+    fade = np.exp(-h / actuator.time_constant)
+    acting = np.r_[0.0, lfilter([1.0 - fade], [1.0, -fade], command)[:-1]]
+    mean = command + (acting - command) * (1.0 - fade) * actuator.time_constant / h
+    return mean, acting
+
+
+def _sinusoid_on_substeps(
+    element: PeriodicForce, n_samples: int, sample_time: float, substeps: int
+) -> tuple[np.ndarray, np.ndarray]:
+    omega, h = 2 * np.pi * element.frequency_hz, sample_time / substeps
+    edges = omega * h * np.arange(n_samples * substeps + 1) + element.phase
+    mean = element.amplitude * np.sinc(omega * h / (2 * np.pi)) * np.sin(0.5 * (edges[:-1] + edges[1:]))
+    return mean, element.amplitude * np.sin(edges[:-1:substeps])
+
+
+def _lagged(truth: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
+    """A first-order lag of a signal that is linear between samples, settled at its first value."""
+    from scipy.signal import lfilter
+
+    ratio = sample_time / time_constant
+    fade = np.exp(-ratio)
+    new = 1.0 - (1.0 - fade) / ratio
+    old = (1.0 - fade) / ratio - fade
+    filtered, _ = lfilter([new, old], [1.0, -fade], truth, zi=[(1.0 - new) * truth[0]])
+    return filtered
+
+
+def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:
+    """The mean of a rounded noisy reading, by the Fourier series of the rounding error."""
+    spread = noise_std / step
+    if spread < 0.05:
+        return step * np.round(y / step)
+    error = np.zeros_like(y)
+    for m in range(1, 12):
+        weight = np.exp(-2.0 * (np.pi * m * spread) ** 2)
+        if weight < 1e-12:
+            break
+        error += (-1.0) ** m / (np.pi * m) * weight * np.sin(2.0 * np.pi * m * y / step)
+    return y + step * error
