@@ -105,5 +105,13 @@ class PeriodicForce:
     phase: float
 
 
+@dataclass(frozen=True)
+class RandomForce:
+    """An unmeasured force at x, white from sample to sample: rms in N. No prediction can hold it, only its statistics."""
+
+    at: float
+    rms: float
+
+
 PointElement = LinearSpring | LinearDamper | CubicSpring | Clearance | OneSidedStop | CoulombFriction | BoucWen | UserLaw
-Element = PointElement | AirDrag | MidplaneStretching | PeriodicForce
+Element = PointElement | AirDrag | MidplaneStretching | PeriodicForce | RandomForce

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 from numba import njit
+from scipy.signal import lfilter
 
 from workbench.records.record import Channel, Record
 from workbench.rig import stepping
@@ -21,6 +22,7 @@ from workbench.rig.elements import (
     MidplaneStretching,
     OneSidedStop,
     PeriodicForce,
+    RandomForce,
     UserLaw,
 )
 from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response
@@ -82,7 +84,7 @@ def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int 
 
 def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8) -> Motion:
     """Modal motion from rest; see `simulate`."""
-    stepped = [e for e in rig.elements if not isinstance(e, PeriodicForce)]
+    stepped = [e for e in rig.elements if not isinstance(e, PeriodicForce | RandomForce)]
     if not stepped and rig.stiffness_rate == 0:
         return _move_exactly(rig, inputs, sample_time)
     return _move_in_steps(rig, inputs, sample_time, substeps)
@@ -151,6 +153,8 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
         acting += participation[:, group] @ at_samples
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
+        if isinstance(element, RandomForce):
+            continue
         shape = modes.phi(element.at)[0]
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
         response += sinusoid_response(system, shape, omega, phasor, time)
@@ -253,8 +257,6 @@ def _delayed_and_lagged(held: np.ndarray, actuator: Actuator, h: float) -> tuple
     start = newer if rest == 0 else older
     if actuator.time_constant == 0:
         return command, start
-    from scipy.signal import lfilter
-
     fade = np.exp(-h / actuator.time_constant)
     acting = np.r_[0.0, lfilter([1.0 - fade], [1.0, -fade], command)[:-1]]
     mean = command + (acting - command) * (1.0 - fade) * actuator.time_constant / h
@@ -272,8 +274,6 @@ def _sinusoid_on_substeps(
 
 def _lagged(truth: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
     """A first-order lag of a signal that is linear between samples, settled at its first value."""
-    from scipy.signal import lfilter
-
     ratio = sample_time / time_constant
     fade = np.exp(-ratio)
     new = 1.0 - (1.0 - fade) / ratio

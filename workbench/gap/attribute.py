@@ -1,0 +1,325 @@
+"""Which effects: every kind of the catalogue tried alone, then in pairs, until the residual is noise."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.gap.disturbance import RandomForceFit, fit_random_force
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.ports import clipped_level, rounding_step
+from workbench.gap.evidence import Evidence
+from workbench.gap.fit import HOPELESS, Fit, cost_of, fit
+from workbench.gap.prediction import FitData
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+
+SLACK = 0.03
+INTEGRATION_SHARE = 2e-6
+SURE = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Attribution:
+    """What the search found on the fit records.
+
+    Attributes:
+        outcome: "none", "explained", "part" or "unknown".
+        best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one.
+        random: statistics of a random disturbance, where the set holds one.
+        rivals: other sets, best first, with their probabilities against the best.
+        nominal_cost: mean square of the nominal residual in noise units.
+        singles: every kind's best fit alone, best first.
+        evidence: of the nominal rig.
+        data: what was fitted, noise of rounded sensors included.
+        doubtful: channels that look clipped or dead, by name, with the reason.
+    """
+
+    outcome: str
+    best: Fit
+    random: RandomForceFit | None
+    rivals: tuple[tuple[Fit, float], ...]
+    nominal_cost: float
+    singles: tuple[Fit, ...]
+    evidence: Evidence
+    data: FitData
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    rig: Rig
+    data: FitData
+    quick: FitData
+    catalogue: tuple[Kind, ...]
+    report: Callable[[str, float], None]
+    pool: ThreadPoolExecutor
+    nominal: np.ndarray  # (n_records, n_outputs) mean squares
+
+    def explains(self, candidate: Fit) -> bool:
+        """Whether what is left is noise, in every record, up to the error of integration."""
+        left = candidate.cost_by_channel.mean(axis=1)
+        per_record = self.data.records[0].outputs.size
+        slack = SLACK + 5.0 * np.sqrt(2.0 / per_record) + INTEGRATION_SHARE * self.nominal.mean(axis=1)
+        overall = SLACK + INTEGRATION_SHARE * self.nominal.mean()
+        return bool((left < 1.0 + slack).all() and left.mean() < 1.0 + overall)
+
+    def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
+        """Whether the gain in likelihood pays for `extra` more numbers."""
+        n = self.data.n_values
+        return n * (than - candidate.cost) > SURE + extra * np.log(n)
+
+
+def attribute(
+    rig: Rig,
+    records: Sequence[Record],
+    *,
+    catalogue: tuple[Kind, ...] = CATALOGUE,
+    report: Callable[[str, float], None] = lambda text, share: None,
+    workers: int = 2,
+) -> Attribution:
+    """Find the effects that turn the residual of a rig on its fit records into noise.
+
+    Each kind is tried alone from many starts; if none alone leaves only noise, the best few are each joined by a
+    second. A set counts as an explanation only when every record is left at its noise floor; else the outcome is
+    "part" or "unknown".
+
+    Args:
+        rig: nominal.
+        records: to fit; validation records have no business here.
+        catalogue: kinds of effects to try.
+        report: told (what, share done) as the search proceeds.
+        workers: threads.
+    """
+    noise = np.array([sensor.noise_std for sensor in rig.sensors])
+    if not (noise > 0).all():
+        name = rig.sensors[int(np.argmin(noise))].name
+        raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
+    plain = FitData(tuple(records), noise)
+    seen, data = _plain_to_see(rig, plain)
+    with ThreadPoolExecutor(workers) as pool:
+        return _search(rig, seen, data, catalogue, report, pool)
+
+
+def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
+    """Rounding and clipping show in the readings themselves; rounding then adds its own noise to the channel's."""
+    evidence = Evidence.of(rig, data)
+    kinds = {kind.name: kind for kind in CATALOGUE}
+    seen, noise = [], data.noise.copy()
+    for j, sensor in enumerate(rig.sensors):
+        step = rounding_step(evidence, sensor.name)
+        if step is not None and step**2 / 12.0 > 0.02 * sensor.noise_std**2:
+            seen.append(Effect(kinds["sensor_quantisation"], sensor.name, {"step": step}, {"step": 0.0}))
+            noise[j] = np.hypot(noise[j], step / np.sqrt(12.0))
+        elif step is None:
+            level = clipped_level(evidence, sensor.name)
+            if level is not None:
+                seen.append(Effect(kinds["sensor_clipping"], sensor.name, {"limit": level}, {"limit": 0.0}))
+    return tuple(seen), FitData(data.records, noise, data.substeps)
+
+
+def _search(rig, seen, data, catalogue, report, pool) -> Attribution:
+    base = apply_all(rig, seen)
+    nominal = data.by_channel(data.residual(rig))
+    start = Fit(seen, cost_of(base, (), data), data.by_channel(data.residual(base)), 0, "read off the records")
+    search = _Search(base, data, _quick(data, start), catalogue, report, pool, nominal)
+    report("looking for the missing force", 0.02)
+    evidence = Evidence.of(base, data)
+    singles = _extend(search, (), evidence, 0.05, 0.45, finalists=8)
+    found = _decide(search, start, singles)
+    if found is None:
+        pairs = _pairs(search, singles)
+        found = _decide_pairs(search, start, singles, pairs)
+    outcome, best, random, rivals = found
+    if seen:
+        best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
+        outcome = "explained" if outcome == "none" else outcome
+    report("done", 1.0)
+    return Attribution(
+        outcome=outcome,
+        best=best,
+        random=random,
+        rivals=rivals,
+        nominal_cost=float(nominal.mean()),
+        singles=tuple(singles),
+        evidence=Evidence.of(rig, data) if seen else evidence,
+        data=data,
+    )
+
+
+def _quick(data: FitData, start: Fit) -> FitData:
+    """The two records that say most: the largest residual against the noise, and against the signal."""
+    by_record = start.cost_by_channel.mean(axis=1)
+    scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.records])
+    order = [int(np.argmax(by_record)), *np.argsort(-(by_record - 1.0) / scale)]
+    chosen = list(dict.fromkeys(int(i) for i in order))[:2]
+    return data.only(tuple(data.records[i].name for i in chosen))
+
+
+# --- one more effect
+
+
+def _extend(search: _Search, given: tuple[Effect, ...], evidence: Evidence, begin, end, *, finalists: int) -> list[Fit]:
+    """Fits of the given effects with one more, for every kind and target; the best `finalists` on all records."""
+    rig = apply_all(search.rig, given)
+    left = search.data.by_channel(search.data.residual(rig))
+    tasks = [
+        (kind, target)
+        for kind in search.catalogue
+        if kind is not RANDOM_DISTURBANCE and kind.name not in ("sensor_quantisation", "sensor_clipping")
+        for target in _worthwhile(kind, rig, left)
+        if not _repeats(kind, target, given)
+    ]
+    _ = evidence.at_peaks
+    quick_fits: list[Fit] = []
+    for i, candidate in enumerate(search.pool.map(lambda task: _quick_fit(search, given, rig, evidence, *task), tasks)):
+        search.report(tasks[i][0].words, begin + (end - begin) * 0.7 * (i + 1) / len(tasks))
+        if candidate is not None:
+            quick_fits.append(candidate)
+    quick_fits.sort(key=lambda f: f.cost)
+    best_by_kind: dict[tuple, Fit] = {}
+    for candidate in quick_fits:
+        best_by_kind.setdefault(candidate.key, candidate)
+    chosen = [f for f in best_by_kind.values() if f.cost < HOPELESS]
+    close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
+    chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
+    full = list(search.pool.map(lambda f: fit(search.rig, f.effects, search.data), chosen))
+    search.report("all records", end)
+    return sorted(full, key=lambda f: f.cost)
+
+
+def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> Iterable:
+    """Targets of a kind; a fault of one sensor is only looked for where that sensor disagrees."""
+    targets = kind.targets(rig)
+    if kind.path != "sensor":
+        return targets
+    by_sensor = left.max(axis=0)
+    names = [s.name for s in rig.sensors]
+    worst = {names[j] for j in np.argsort(-by_sensor)[:3]}
+    return [t for t in targets if t == "all" or t in worst or by_sensor[names.index(t)] > 0.2 * by_sensor.max()]
+
+
+def _repeats(kind: Kind, target, given: Sequence[Effect]) -> bool:
+    """The same figure of the same thing twice says nothing new."""
+    for effect in given:
+        if effect.kind is kind and (kind.path in ("actuator", "sensor") or "at" not in effect.values):
+            if target == effect.target or "all" in (target, effect.target) or kind.name == "truncated_modes":
+                return True
+    return False
+
+
+def _quick_fit(search: _Search, given, rig: Rig, evidence: Evidence, kind: Kind, target) -> Fit | None:
+    """The best of a kind's starts, improved a little on the quick records, jointly with the given effects."""
+    starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+    if not starts:
+        return None
+    costs = [cost_of(rig, (effect,), search.quick) for effect in starts]
+    order = np.argsort(costs)
+    if costs[order[0]] >= HOPELESS:
+        return None
+    best: Fit | None = None
+    for i in order[:2]:
+        alone = fit(rig, (starts[i],), search.quick, iterations=5) if given else None
+        effect = alone.effects[0] if alone is not None else starts[i]
+        candidate = fit(search.rig, (*given, effect), search.quick, iterations=4 if given else 7)
+        if best is None or candidate.cost < best.cost:
+            best = candidate
+    return best
+
+
+# --- decisions
+
+
+def _finished(search: _Search, candidate: Fit) -> Fit:
+    """The same set on all records with finer substeps, to the end."""
+    return fit(search.rig, candidate.effects, search.data.finer(8), iterations=12, tolerance=1e-7)
+
+
+def _ranked(search: _Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:
+    """The set of least description length, and the others with their probabilities.
+
+    The likelihood of tens of thousands of values is over-confident of small misfits, so its logarithm counts half.
+    """
+    n = search.data.n_values
+    score = np.array([n * f.cost + f.n_parameters * np.log(n) for f in fits])
+    order = np.argsort(score)
+    weights = np.exp(-0.25 * (score[order] - score[order[0]]))
+    weights /= weights.sum()
+    rivals = tuple((fits[i], float(w)) for i, w in zip(order[1:], weights[1:], strict=True))
+    return fits[order[0]], rivals[:6]
+
+
+def _decide(search: _Search, start: Fit, singles: list[Fit]):
+    """None, or an outcome that needs no second effect."""
+    good = [f for f in singles if search.surely_better(f, start.cost, f.n_parameters)]
+    if search.explains(start) and not good:
+        return "none", start, None, ()
+    finished = [_finished(search, f) for f in good[:4]]
+    explaining = [f for f in finished if search.explains(f)]
+    if explaining:
+        best, rivals = _ranked(search, explaining)
+        others = tuple((f, w) for f, w in rivals)
+        return "explained", best, None, others
+    if search.explains(start):
+        return "none", start, None, ()
+    random = _random(search, start)
+    if random is not None and random[1].holds:
+        return "explained", random[0], random[1], ()
+    return None
+
+
+def _random(search: _Search, given: Fit) -> tuple[Fit, RandomForceFit] | None:
+    """The given effects and a random disturbance."""
+    rig = apply_all(search.rig, [e for e in given.effects if e.kind.name != "sensor_quantisation"])
+    evidence = Evidence.of(rig, search.data, 20)
+    found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.force_rms)
+    effect = Effect(
+        RANDOM_DISTURBANCE,
+        None,
+        {"at": found.at, "rms": found.rms},
+        {"at": found.at_std, "rms": found.rms_std},
+    )
+    combined = Fit(
+        (*given.effects, effect), found.cost, given.cost_by_channel, given.n_parameters + 2, "maximum likelihood"
+    )
+    return combined, found
+
+
+def _pairs(search: _Search, singles: list[Fit]) -> list[Fit]:
+    """The best few single effects, each with a second one."""
+    firsts, seen_kinds = [], {}
+    for candidate in singles:
+        kind = candidate.effects[-1].kind
+        seen_kinds[kind.name] = seen_kinds.get(kind.name, 0) + 1
+        if seen_kinds[kind.name] <= 2 and len(firsts) < 5:
+            firsts.append(candidate)
+    pairs: list[Fit] = []
+    for i, first in enumerate(firsts):
+        rig = apply_all(search.rig, first.effects)
+        evidence = Evidence.of(rig, search.data, 20)
+        begin = 0.5 + 0.45 * i / len(firsts)
+        pairs += _extend(search, first.effects, evidence, begin, begin + 0.45 / len(firsts), finalists=3)
+        pairs.sort(key=lambda f: f.cost)
+        if search.explains(_finished(search, pairs[0])):
+            break
+    return pairs
+
+
+def _decide_pairs(search: _Search, start: Fit, singles: list[Fit], pairs: list[Fit]):
+    distinct: dict[tuple, Fit] = {}
+    for candidate in pairs:
+        distinct.setdefault(candidate.key, candidate)
+    finished = sorted((_finished(search, f) for f in list(distinct.values())[:4]), key=lambda f: f.cost)
+    explaining = [f for f in finished if search.explains(f)]
+    if explaining:
+        best, rivals = _ranked(search, explaining)
+        return "explained", best, None, rivals
+    for first in singles[:3]:
+        random = _random(search, first)
+        if random is not None and random[1].holds:
+            return "explained", random[0], random[1], ()
+    best, rivals = _ranked(search, finished or singles[:1])
+    closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
+    return ("part" if closed > 0.5 else "unknown"), best, None, rivals

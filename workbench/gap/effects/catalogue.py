@@ -1,0 +1,33 @@
+"""The catalogue: every kind of effect that a diagnosis tries.
+
+A kind of your own is one more `Kind`; hand `(*CATALOGUE, mine)` to the diagnosis. For a law f(w, v) at a point:
+
+    from workbench.rig.elements import UserLaw
+
+    def law(w, v, p):
+        return -p[0] * w * abs(w)
+
+    mine = Kind(
+        name="quadratic_spring", path="structure", nonlinear=True,
+        parameters=lambda rig, _: (place_parameter(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)),
+        apply=lambda rig, _, v: with_element(rig, UserLaw(v["at"], law, (v["stiffness"],))),
+        starts=lambda evidence, _: [{"at": p.at, "stiffness": k} for p in evidence.at_peaks for k in (0.1, 1.0, 10.0)],
+    )
+"""
+
+from workbench.gap.effects import environment, nonlinear, ports, structural
+from workbench.gap.effects.effect import Kind
+
+CATALOGUE: tuple[Kind, ...] = (*structural.KINDS, *nonlinear.KINDS, *ports.KINDS, *environment.KINDS)
+
+
+def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
+    """The kind of that name.
+
+    Raises:
+        KeyError: a name that is not in the catalogue.
+    """
+    for kind in catalogue:
+        if kind.name == name:
+            return kind
+    raise KeyError(f"no effect is called {name!r}; the catalogue has {', '.join(k.name for k in catalogue)}")

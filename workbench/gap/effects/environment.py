@@ -1,0 +1,66 @@
+"""Effects of the surroundings: forces that nobody commanded."""
+
+import numpy as np
+
+from workbench.gap.effects.effect import Kind, Parameter
+from workbench.gap.effects.nonlinear import with_element
+from workbench.gap.effects.structural import place_parameter
+from workbench.rig.elements import PeriodicForce, RandomForce
+
+
+def tone(force: np.ndarray, sample_time: float) -> tuple[float, float, float]:
+    """Frequency (Hz), amplitude and phase of the strongest sinusoid in a series, from its first sample on."""
+    n = force.size
+    centred = force - force.mean()
+    spectrum = np.abs(np.fft.rfft(centred * np.hanning(n), 8 * n))
+    spectrum[: 8 * 2] = 0.0
+    frequency = float(np.fft.rfftfreq(8 * n, sample_time)[np.argmax(spectrum)])
+    time = sample_time * np.arange(n)
+    basis = np.column_stack([np.sin(2 * np.pi * frequency * time), np.cos(2 * np.pi * frequency * time)])
+    sine, cosine = np.linalg.lstsq(basis, centred, rcond=None)[0]
+    return frequency, float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
+
+
+def _periodic_starts(evidence, _):
+    records = evidence.data.records
+    shortest = min(record.n_samples for record in records)
+    ends = np.cumsum([0, *(record.n_samples for record in records)])
+    for place in evidence.at_peaks:
+        mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
+        frequency, amplitude, phase = tone(mean, records[0].sample_time)
+        yield {"at": place.at, "frequency": frequency, "amplitude": amplitude, "phase": phase}
+
+
+PERIODIC_DISTURBANCE = Kind(
+    name="periodic_disturbance",
+    path="environment",
+    parameters=lambda rig, _: (
+        place_parameter(rig),
+        Parameter("frequency", "Hz", 1e-6, 1e6, logarithmic=True),
+        Parameter("amplitude", "N", 1e-15, 1e9, logarithmic=True),
+        Parameter("phase", "rad", -20.0, 20.0),
+    ),
+    apply=lambda rig, _, v: with_element(rig, PeriodicForce(v["at"], v["frequency"], v["amplitude"], v["phase"])),
+    starts=_periodic_starts,
+    phrase="a periodic disturbance",
+)
+
+
+def _random_starts(evidence, _):
+    for place in evidence.at_peaks[:2]:
+        yield {"at": place.at, "rms": float(np.sqrt(np.mean(place.force**2)))}
+
+
+RANDOM_DISTURBANCE = Kind(
+    name="random_disturbance",
+    path="environment",
+    parameters=lambda rig, _: (
+        place_parameter(rig),
+        Parameter("rms", "N", 1e-15, 1e9, logarithmic=True),
+    ),
+    apply=lambda rig, _, v: with_element(rig, RandomForce(v["at"], v["rms"])),
+    starts=_random_starts,
+    phrase="a random disturbance",
+)
+
+KINDS = (PERIODIC_DISTURBANCE, RANDOM_DISTURBANCE)

@@ -1,0 +1,330 @@
+"""Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.gap.effects.effect import Kind, Parameter
+from workbench.rig.rig import Rig
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.modes import Modes
+from workbench.structure.modification import attach
+from workbench.structure.supports import HELD, End, PointDamper, PointMass, PointSpring
+
+RESOLUTION = 1e-8
+
+
+def place_parameter(rig: Rig) -> Parameter:
+    """A position along the structure, as a parameter."""
+    length = rig.modes.length
+    return Parameter("at", "m", 0.0, length, scale=0.01 * length)
+
+
+def known_places(rig: Rig) -> np.ndarray | None:
+    """The only places where the shapes are known, for a rig of plain modal data."""
+    return getattr(rig.modes.shapes, "places", None)
+
+
+def resolved(rig: Rig, structure) -> Rig:
+    """The rig with a changed structure and the modes it then has."""
+    return replace(rig, structure=structure, modes=structure.modes(rig.modes.n_modes, tolerance=RESOLUTION))
+
+
+def _with_attachment(rig: Rig, part) -> Rig:
+    if rig.structure is None:
+        return replace(rig, modes=attach(rig.modes, (part,)))
+    return resolved(rig, replace(rig.structure, attachments=(*rig.structure.attachments, part)))
+
+
+def stiffness_name(structure) -> str:
+    """The name of the stiffness profile of a bar or beam."""
+    return "bending_stiffness" if isinstance(structure, Beam) else "axial_stiffness"
+
+
+# --- modulus_error
+
+
+def _modulus(rig: Rig, _, values) -> Rig:
+    factor = values["factor"]
+    if rig.structure is None or rig.structure.attachments or getattr(rig.structure, "tension", 0.0):
+        if rig.structure is None:
+            return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
+        name = stiffness_name(rig.structure)
+        return resolved(rig, replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)}))
+    name = stiffness_name(rig.structure)
+    structure = replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)})
+    if any(0 < s < HELD for end in (structure.left, structure.right) for s in (end.translation, end.rotation)):
+        return resolved(rig, structure)
+    return replace(rig, structure=structure, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
+
+
+def _scaled_modes(modes: Modes, factor: float) -> Modes:
+    """Frequencies times a factor, damping ratios and shapes as they are."""
+    return replace(modes, omega=modes.omega * factor, damping=modes.damping * factor)
+
+
+def _modulus_starts(evidence, _):
+    return [{"factor": f} for f in np.exp(np.linspace(-0.6, 0.6, 41)) if abs(f - 1) > 1e-3] + [
+        {"factor": f} for f in (0.995, 1.005)
+    ]
+
+
+MODULUS_ERROR = Kind(
+    name="modulus_error",
+    path="structure",
+    parameters=lambda rig, _: (Parameter("factor", "", 0.2, 5.0, logarithmic=True),),
+    apply=_modulus,
+    starts=_modulus_starts,
+    phrase="an overall stiffness error",
+)
+
+
+# --- what hangs on the structure at a point
+
+
+def _regressed(place, series: str) -> float:
+    """The coefficient k of force = -k series, by least squares."""
+    x = getattr(place, series)
+    return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))
+
+
+def _point_starts(name: str, series: str, typical):
+    def starts(evidence, _) -> Iterable[dict[str, float]]:
+        size = typical(evidence.rig)
+        for place in evidence.at_peaks:
+            k = _regressed(place, series)
+            for share in (0.4, 1.0, 2.0):
+                if k > 0:
+                    yield {"at": place.at, name: share * k}
+        for x in evidence.places[::6]:
+            for share in (0.03, 0.3):
+                yield {"at": float(x), name: share * size}
+
+    return starts
+
+
+def _total_mass(rig: Rig) -> float:
+    if rig.structure is None:
+        return 1.0 / float(np.mean(rig.modes.phi(known_places(rig))[:, 0] ** 2))
+    x = (np.arange(50) + 0.5) / 50 * rig.structure.length
+    return float(np.mean(rig.structure.mass_per_length(x)) * rig.structure.length)
+
+
+def _typical_stiffness(rig: Rig) -> float:
+    elastic = rig.modes.omega[rig.modes.omega > 0]
+    return _total_mass(rig) * float(elastic.min()) ** 2
+
+
+def _typical_damping(rig: Rig) -> float:
+    return _total_mass(rig) * float(rig.modes.omega[rig.modes.omega > 0].min())
+
+
+def _positive(name: str, unit: str, typical):
+    def parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+        size = typical(rig)
+        return (place_parameter(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True))
+
+    return parameters
+
+
+POINT_MASS = Kind(
+    name="point_mass",
+    path="structure",
+    parameters=_positive("mass", "kg", _total_mass),
+    apply=lambda rig, _, v: _with_attachment(rig, PointMass(v["at"], v["mass"])),
+    starts=_point_starts("mass", "acceleration", _total_mass),
+    phrase="an added mass",
+)
+
+GROUND_SPRING = Kind(
+    name="ground_spring",
+    path="structure",
+    parameters=_positive("stiffness", "N/m", _typical_stiffness),
+    apply=lambda rig, _, v: _with_attachment(rig, PointSpring(v["at"], v["stiffness"])),
+    starts=_point_starts("stiffness", "displacement", _typical_stiffness),
+    phrase="a spring to ground",
+)
+
+POINT_DAMPER = Kind(
+    name="point_damper",
+    path="structure",
+    parameters=_positive("coefficient", "N s/m", _typical_damping),
+    apply=lambda rig, _, v: _with_attachment(rig, PointDamper(v["at"], v["coefficient"])),
+    starts=_point_starts("coefficient", "velocity", _typical_damping),
+    phrase="a viscous damper to ground",
+)
+
+
+# --- local_stiffness_loss
+
+
+def _softened(rig: Rig, _, values) -> Rig:
+    name, length = stiffness_name(rig.structure), rig.structure.length
+    start = max(values["at"] - 0.5 * values["width"], 0.0)
+    stop = min(values["at"] + 0.5 * values["width"], length)
+    profile = getattr(rig.structure, name).scaled(1.0 - values["loss"], start, stop)
+    return resolved(rig, replace(rig.structure, **{name: profile}))
+
+
+def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+    length = rig.modes.length
+    return (
+        place_parameter(rig),
+        Parameter("width", "m", 0.005 * length, 0.2 * length, scale=0.02 * length),
+        Parameter("loss", "", 1e-4, 0.95, scale=0.1),
+    )
+
+
+def _loss_starts(evidence, _):
+    length = evidence.length
+    for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
+        for loss in (0.15, 0.45):
+            yield {"at": x * length, "width": 0.1 * length, "loss": loss}
+
+
+LOCAL_STIFFNESS_LOSS = Kind(
+    name="local_stiffness_loss",
+    path="structure",
+    parameters=_loss_parameters,
+    apply=_softened,
+    starts=_loss_starts,
+    targets=lambda rig: (None,) if rig.structure is not None else (),
+    phrase="a local loss of stiffness",
+)
+
+
+# --- support_rotation
+
+
+def _ends(rig: Rig) -> tuple:
+    if not isinstance(rig.structure, Beam):
+        return ()
+    ends = (("left", rig.structure.left), ("right", rig.structure.right))
+    return tuple(name for name, end in ends if end.translation == HELD and end.rotation in (0.0, HELD))
+
+
+def _rotated(rig: Rig, end: str, values) -> Rig:
+    support = End(HELD, values["rotational_stiffness"])
+    return resolved(rig, replace(rig.structure, **{end: support}))
+
+
+def _end_stiffness(rig: Rig) -> float:
+    return float(rig.structure.bending_stiffness(0.5 * rig.structure.length)) / rig.structure.length
+
+
+SUPPORT_ROTATION = Kind(
+    name="support_rotation",
+    path="structure",
+    parameters=lambda rig, _: (
+        Parameter("rotational_stiffness", "N m/rad", 1e-4 * _end_stiffness(rig), 1e5 * _end_stiffness(rig), True),
+    ),
+    apply=_rotated,
+    starts=lambda evidence, _: [
+        {"rotational_stiffness": _end_stiffness(evidence.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
+    ],
+    targets=_ends,
+    phrase="a support that is neither hinged nor clamped",
+)
+
+
+# --- axial_load
+
+
+def _buckling(rig: Rig) -> float:
+    structure = rig.structure
+    x = (np.arange(40) + 0.5) / 40 * structure.length
+    held = sum(end.rotation == HELD for end in (structure.left, structure.right))
+    return float(np.min(structure.bending_stiffness(x))) * (np.pi / structure.length) ** 2 * (1.0 + held)
+
+
+AXIAL_LOAD = Kind(
+    name="axial_load",
+    path="structure",
+    parameters=lambda rig, _: (
+        Parameter("tension", "N", -4.0 * _buckling(rig), 200.0 * _buckling(rig), scale=0.05 * _buckling(rig)),
+    ),
+    apply=lambda rig, _, v: resolved(rig, replace(rig.structure, tension=rig.structure.tension + v["tension"])),
+    starts=lambda evidence, _: [
+        {"tension": share * _buckling(evidence.rig)}
+        for share in (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0)
+    ],
+    targets=lambda rig: (None,) if isinstance(rig.structure, Beam) else (),
+    phrase="an axial load",
+)
+
+
+# --- truncated_modes: no number to fit, one start a count
+
+
+def _truncated(rig: Rig, count, _) -> Rig:
+    return replace(rig, modes=rig.structure.modes(count, tolerance=RESOLUTION))
+
+
+TRUNCATED_MODES = Kind(
+    name="truncated_modes",
+    path="structure",
+    parameters=lambda rig, _: (),
+    apply=_truncated,
+    starts=lambda evidence, _: [{}],
+    targets=lambda rig: tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)) if rig.structure else (),
+    phrase="modes left out of the model",
+)
+
+
+# --- modal_damping
+
+
+def _damped(rig: Rig, _, values) -> Rig:
+    factor = values["factor"]
+    structure = rig.structure
+    if structure is None or not isinstance(structure.damping, ModalDamping):
+        return replace(rig, modes=replace(rig.modes, damping=rig.modes.damping * factor))
+    changed = replace(structure, damping=ModalDamping(np.asarray(structure.damping.zeta) * factor))
+    if any(isinstance(part, PointDamper) for part in structure.attachments):
+        return resolved(rig, changed)
+    return replace(rig, structure=changed, modes=replace(rig.modes, damping=rig.modes.damping * factor))
+
+
+MODAL_DAMPING = Kind(
+    name="modal_damping",
+    path="structure",
+    parameters=lambda rig, _: (Parameter("factor", "", 1e-3, 100.0, logarithmic=True),),
+    apply=_damped,
+    starts=lambda evidence, _: [{"factor": f} for f in (0.2, 0.4, 0.6, 0.8, 0.9, 1.1, 1.25, 1.6, 2.2, 3.0, 5.0, 8.0)],
+    phrase="a damping error common to all modes",
+)
+
+
+# --- stiffness_drift
+
+
+def _duration(evidence) -> float:
+    return max(record.n_samples * record.sample_time for record in evidence.data.records)
+
+
+STIFFNESS_DRIFT = Kind(
+    name="stiffness_drift",
+    path="structure",
+    parameters=lambda rig, _: (Parameter("rate", "1/s", -1.0, 10.0, scale=1e-4),),
+    apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
+    starts=lambda evidence, _: [
+        {"rate": share / _duration(evidence)}
+        for share in (-0.6, -0.4, -0.27, -0.18, -0.12, -0.08, -0.05, -0.02, 0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)
+    ],
+    phrase="a stiffness that drifts in time",
+)
+
+KINDS = (
+    MODULUS_ERROR,
+    POINT_MASS,
+    LOCAL_STIFFNESS_LOSS,
+    SUPPORT_ROTATION,
+    AXIAL_LOAD,
+    GROUND_SPRING,
+    TRUNCATED_MODES,
+    MODAL_DAMPING,
+    POINT_DAMPER,
+    STIFFNESS_DRIFT,
+)

@@ -1,0 +1,172 @@
+"""Fit of a set of effects to the fit records: nonlinear least squares of the simulation error."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, Parameter, apply_all
+from workbench.gap.prediction import FitData
+from workbench.rig.rig import Rig
+
+HOPELESS = 1e300
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A set of effects with fitted numbers.
+
+    Attributes:
+        effects: with values and standard deviations.
+        cost: what was minimised per measured value: 1 at the noise floor.
+        cost_by_channel: (n_records, n_outputs) of the same, without the share of a random disturbance's statistics.
+        n_parameters: numbers fitted.
+        status: why the fit stopped.
+    """
+
+    effects: tuple[Effect, ...]
+    cost: float
+    cost_by_channel: np.ndarray
+    n_parameters: int
+    status: str
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(effect.label for effect in self.effects)
+
+    @property
+    def key(self) -> tuple:
+        """What tells this set from another, numbers apart."""
+        return tuple(sorted(self.labels))
+
+
+def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
+    """Cost per measured value; `HOPELESS` where the rig cannot be (a buckled beam, say)."""
+    try:
+        residual = data.residual(apply_all(rig, effects))
+    except (ValueError, np.linalg.LinAlgError):
+        return HOPELESS
+    cost = float(residual @ residual) / residual.size
+    return cost if np.isfinite(cost) else HOPELESS
+
+
+class _Problem:
+    """The residual as a function of the free coordinates of all parameters of all effects."""
+
+    def __init__(self, rig: Rig, effects: Sequence[Effect], data: FitData):
+        self.rig, self.data, self.effects = rig, data, tuple(effects)
+        self.parameters: list[tuple[int, Parameter]] = []
+        base = rig
+        for i, effect in enumerate(self.effects):
+            self.parameters += [(i, p) for p in effect.parameters(base)]
+        self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
+        floor = [1e-2 if p.logarithmic or p.name == "at" else 1e-3 * abs(z) + 1e-9 for (_, p), z in zip(
+            self.parameters, self.start, strict=True)]
+        self.steps = np.array(floor)
+
+    def at(self, free: np.ndarray) -> tuple[Effect, ...]:
+        values = [dict(effect.values) for effect in self.effects]
+        for (i, parameter), z in zip(self.parameters, free, strict=True):
+            values[i][parameter.name] = parameter.from_free(z)
+        return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
+
+    def residual(self, free: np.ndarray) -> np.ndarray | None:
+        try:
+            residual = self.data.residual(apply_all(self.rig, self.at(free)))
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        return residual if np.isfinite(residual @ residual) else None
+
+    def jacobian(self, free: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        columns = []
+        for j, (_, parameter) in enumerate(self.parameters):
+            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name == "at" else self.steps[j]
+            moved = free.copy()
+            moved[j] += step
+            if parameter.to_free(parameter.high) < moved[j]:
+                moved[j] = free[j] - step
+            beside = self.residual(moved)
+            columns.append(np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j]))
+        return np.array(columns).T
+
+
+def fit(
+    rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int = 25, tolerance: float = 1e-5
+) -> Fit:
+    """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
+
+    Args:
+        rig: nominal.
+        effects: with start values.
+        data: fit records.
+        iterations: at most.
+        tolerance: relative decrease of the cost at which to stop.
+    """
+    problem = _Problem(rig, effects, data)
+    free = problem.start.copy()
+    residual = problem.residual(free)
+    if residual is None:
+        shape = (len(data.records), data.noise.size)
+        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), free.size, "no rig at the start")
+    cost = residual @ residual
+    damping, status = 1e-3, "most iterations done"
+    normal = np.zeros((free.size, free.size))
+    idle = 0
+    for _ in range(iterations if free.size else 0):
+        jacobian = problem.jacobian(free, residual)
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
+        improved = False
+        for _ in range(7):
+            step = -np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
+            step = np.clip(step, -_LONGEST * _reach(problem), _LONGEST * _reach(problem))
+            trial = problem.residual(free + step)
+            if trial is not None and trial @ trial < cost:
+                improved = True
+                break
+            damping *= 6.0
+        if not improved:
+            status = "no step lowers the cost"
+            break
+        decrease = 1.0 - (trial @ trial) / cost
+        free, residual, cost = free + step, trial, trial @ trial
+        damping = max(damping / 8.0, 1e-9)
+        idle = idle + 1 if decrease < tolerance else 0
+        if idle >= 1:
+            status = "settled"
+            break
+    return _result(problem, free, residual, normal, status)
+
+
+_LONGEST = 1.0
+
+
+def _reach(problem: _Problem) -> np.ndarray:
+    """Longest step of each free coordinate: a factor e, a tenth of the length, or its own size."""
+    return np.array(
+        [
+            1.0 if p.logarithmic else 10.0 if p.name == "at" else 3.0 * abs(z) + 10.0
+            for (_, p), z in zip(problem.parameters, problem.start, strict=True)
+        ]
+    )
+
+
+def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, status: str) -> Fit:
+    cost = float(residual @ residual) / residual.size
+    deviations = np.zeros(free.size)
+    if free.size and np.trace(normal) > 0:
+        scaled = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal / np.outer(scaled, scaled), rcond=1e-12)
+        deviations = np.sqrt(np.maximum(np.diag(inverse), 0.0)) / scaled * np.sqrt(max(cost, 1.0))
+    effects = problem.at(free)
+    spread: list[dict[str, float]] = [{} for _ in effects]
+    for (i, parameter), deviation in zip(problem.parameters, deviations, strict=True):
+        value = effects[i].values[parameter.name]
+        spread[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    return Fit(
+        effects=tuple(replace(e, deviations=s) for e, s in zip(effects, spread, strict=True)),
+        cost=cost,
+        cost_by_channel=problem.data.by_channel(residual),
+        n_parameters=free.size,
+        status=status,
+    )

@@ -1,0 +1,83 @@
+"""The fit records as a yardstick: how far a rig's prediction stands from them, in units of the noise."""
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+from threading import Lock
+
+import numpy as np
+
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import Motion, move, read
+
+REMEMBERED = 24
+
+
+@dataclass(frozen=True, eq=False)
+class FitData:
+    """Records that a fit may see. Validation records never become part of one.
+
+    Attributes:
+        records: measured, all with the rig's inputs and outputs.
+        noise: (n_outputs,) standard deviation of each sensor's noise, rounding included.
+        substeps: of a sample, for rigs that are not linear.
+    """
+
+    records: tuple[Record, ...]
+    noise: np.ndarray
+    substeps: int = 4
+    _memory: OrderedDict = field(default_factory=OrderedDict, repr=False)
+    _lock: Lock = field(default_factory=Lock, repr=False)
+
+    @property
+    def n_values(self) -> int:
+        """Number of measured values."""
+        return sum(record.outputs.size for record in self.records)
+
+    def only(self, names: tuple[str, ...]) -> "FitData":
+        """The same yardstick on some of the records."""
+        return FitData(tuple(r for r in self.records if r.name in names), self.noise, self.substeps)
+
+    def finer(self, substeps: int) -> "FitData":
+        """The same yardstick with finer substeps."""
+        return FitData(self.records, self.noise, substeps)
+
+    def motions(self, rig: Rig) -> tuple[Motion, ...]:
+        """The rig's motion on each record; the last few are remembered, since a sensor's fault does not change it."""
+        key = (id(rig.modes), rig.actuators, rig.elements, rig.stiffness_rate)
+        with self._lock:
+            if key in self._memory:
+                self._memory.move_to_end(key)
+                return self._memory[key][1]
+        motions = tuple(
+            move(rig, record.inputs, sample_time=record.sample_time, substeps=self.substeps) for record in self.records
+        )
+        with self._lock:
+            self._memory[key] = (rig.modes, motions)
+            while len(self._memory) > REMEMBERED:
+                self._memory.popitem(last=False)
+        return motions
+
+    def predictions(self, rig: Rig) -> tuple[np.ndarray, ...]:
+        """(n_outputs, n_samples) a record."""
+        return tuple(
+            read(rig, motion, sample_time=record.sample_time)
+            for record, motion in zip(self.records, self.motions(rig), strict=True)
+        )
+
+    def residual(self, rig: Rig) -> np.ndarray:
+        """(measured - predicted) / noise, all records joined: (n_values,)."""
+        scaled = [
+            ((record.outputs - prediction) / self.noise[:, None]).ravel()
+            for record, prediction in zip(self.records, self.predictions(rig), strict=True)
+        ]
+        return np.concatenate(scaled)
+
+    def by_channel(self, residual: np.ndarray) -> np.ndarray:
+        """Mean square of a residual by record and channel: (n_records, n_outputs)."""
+        rows, start = [], 0
+        for record in self.records:
+            size = record.outputs.size
+            rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
+            start += size
+        return np.array(rows)
