@@ -9,6 +9,7 @@ import numpy as np
 from workbench.gap.disturbance import RandomForceFit, fit_random_force
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.containment import simpler_forms
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
@@ -35,7 +36,6 @@ class Attribution:
         singles: every kind's best fit alone, best first.
         evidence: of the nominal rig.
         data: what was fitted, noise of rounded sensors included.
-        doubtful: channels that look clipped or dead, by name, with the reason.
     """
 
     outcome: str
@@ -179,15 +179,24 @@ def _extend(search: _Search, given: tuple[Effect, ...], evidence: Evidence, begi
         if candidate is not None:
             quick_fits.append(candidate)
     quick_fits.sort(key=lambda f: f.cost)
-    best_by_kind: dict[tuple, Fit] = {}
-    for candidate in quick_fits:
-        best_by_kind.setdefault(candidate.key, candidate)
-    chosen = [f for f in best_by_kind.values() if f.cost < HOPELESS]
+    chosen = _spread_over_kinds(quick_fits, 3)
     close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
     chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
     full = list(search.pool.map(lambda f: fit(search.rig, f.effects, search.data), chosen))
     search.report("all records", end)
     return sorted(full, key=lambda f: f.cost)
+
+
+def _spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
+    """The fits in their order, at most so many whose last effect is of one kind, none twice."""
+    chosen, counts, keys = [], {}, set()
+    for candidate in fits:
+        name = candidate.effects[-1].kind.name
+        if candidate.cost < HOPELESS and counts.get(name, 0) < most and candidate.key not in keys:
+            chosen.append(candidate)
+            keys.add(candidate.key)
+            counts[name] = counts.get(name, 0) + 1
+    return chosen
 
 
 def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> Iterable:
@@ -237,12 +246,34 @@ def _finished(search: _Search, candidate: Fit) -> Fit:
     return fit(search.rig, candidate.effects, search.data.finer(8), iterations=12, tolerance=1e-7)
 
 
+def _simplest(search: _Search, candidate: Fit) -> Fit:
+    """The set with each effect replaced by one it contains as a limit, where the records cannot tell them apart."""
+    improved = True
+    while improved:
+        improved = False
+        for i, effect in enumerate(candidate.effects):
+            for simpler in simpler_forms(effect, search.rig):
+                effects = (*candidate.effects[:i], simpler, *candidate.effects[i + 1 :])
+                trial = fit(search.rig, effects, search.data.finer(8), iterations=12, tolerance=1e-7)
+                extra = max(candidate.n_parameters - trial.n_parameters, 1)
+                if search.explains(trial) and not search.surely_better(candidate, trial.cost, extra):
+                    candidate, improved = trial, True
+                    break
+            if improved:
+                break
+    return candidate
+
+
 def _ranked(search: _Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:
     """The set of least description length, and the others with their probabilities.
 
     The likelihood of tens of thousands of values is over-confident of small misfits, so its logarithm counts half.
     """
     n = search.data.n_values
+    distinct: dict[tuple, Fit] = {}
+    for candidate in sorted(fits, key=lambda f: f.cost):
+        distinct.setdefault(candidate.key, candidate)
+    fits = list(distinct.values())
     score = np.array([n * f.cost + f.n_parameters * np.log(n) for f in fits])
     order = np.argsort(score)
     weights = np.exp(-0.25 * (score[order] - score[order[0]]))
@@ -259,9 +290,8 @@ def _decide(search: _Search, start: Fit, singles: list[Fit]):
     finished = [_finished(search, f) for f in good[:4]]
     explaining = [f for f in finished if search.explains(f)]
     if explaining:
-        best, rivals = _ranked(search, explaining)
-        others = tuple((f, w) for f, w in rivals)
-        return "explained", best, None, others
+        best, rivals = _ranked(search, [_simplest(search, f) for f in explaining])
+        return "explained", best, None, rivals
     if search.explains(start):
         return "none", start, None, ()
     random = _random(search, start)
@@ -289,12 +319,7 @@ def _random(search: _Search, given: Fit) -> tuple[Fit, RandomForceFit] | None:
 
 def _pairs(search: _Search, singles: list[Fit]) -> list[Fit]:
     """The best few single effects, each with a second one."""
-    firsts, seen_kinds = [], {}
-    for candidate in singles:
-        kind = candidate.effects[-1].kind
-        seen_kinds[kind.name] = seen_kinds.get(kind.name, 0) + 1
-        if seen_kinds[kind.name] <= 2 and len(firsts) < 5:
-            firsts.append(candidate)
+    firsts = _spread_over_kinds(singles, 2)[:5]
     pairs: list[Fit] = []
     for i, first in enumerate(firsts):
         rig = apply_all(search.rig, first.effects)
@@ -314,7 +339,7 @@ def _decide_pairs(search: _Search, start: Fit, singles: list[Fit], pairs: list[F
     finished = sorted((_finished(search, f) for f in list(distinct.values())[:4]), key=lambda f: f.cost)
     explaining = [f for f in finished if search.explains(f)]
     if explaining:
-        best, rivals = _ranked(search, explaining)
+        best, rivals = _ranked(search, [_simplest(search, f) for f in explaining])
         return "explained", best, None, rivals
     for first in singles[:3]:
         random = _random(search, first)

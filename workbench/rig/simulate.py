@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numba import njit
 from scipy.signal import lfilter
 
 from workbench.records.record import Channel, Record
@@ -133,8 +132,12 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
 
 def _participation(rig: Rig) -> np.ndarray:
     """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
-    columns = [rig.modes.phi(a.at, 1 if a.kind == "moment" else 0)[0] for a in rig.actuators]
-    return np.array(columns).reshape(-1, rig.modes.n_modes).T
+    shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
+    for derivative, kind in enumerate(("force", "moment")):
+        group = [j for j, a in enumerate(rig.actuators) if a.kind == kind]
+        if group:
+            shapes[:, group] = rig.modes.phi([rig.actuators[j].at for j in group], derivative).T
+    return shapes
 
 
 def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
@@ -217,7 +220,7 @@ def _stepper(laws: tuple[Callable, ...]):
         return stepping.step_record
     if len(set(laws)) > 1:
         raise ValueError("a rig carries one law of the user's own at a time; got several")
-    return stepping.make_stepper(njit(laws[0]))
+    return stepping.make_stepper(laws[0])
 
 
 def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:

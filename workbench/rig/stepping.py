@@ -6,6 +6,7 @@ the end of the substep (Newton, safeguarded by bisection), so stiff contacts and
 """
 
 import math
+from types import FunctionType
 
 import numpy as np
 from numba import njit
@@ -14,7 +15,8 @@ LINEAR_SPRING, LINEAR_DAMPER, CUBIC, CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, U
 
 
 @njit(cache=True, nogil=True)
-def _no_law(w, v, p):
+def user_law(w, v, p):
+    """Stands for the law of the user's own, until `make_stepper` puts one in its place."""
     return 0.0
 
 
@@ -68,187 +70,189 @@ def _yield_update(z, dw, limit):
     return s * (limit - (limit - z) * math.exp(-left / limit))
 
 
-def make_stepper(user_law):
-    """The compiled stepper; `user_law(w, v, parameters)` serves the elements of kind USER."""
+@njit(cache=True, nogil=True)
+def element_force(kind, p, w, v, z, w_old):
+    if kind == LINEAR_SPRING:
+        return -p[0] * w
+    if kind == LINEAR_DAMPER:
+        return -p[0] * v
+    if kind == CUBIC:
+        return -p[0] * w * w * w
+    if kind == CLEARANCE:
+        if w > p[1]:
+            return -p[0] * (w - p[1])
+        if w < -p[1]:
+            return -p[0] * (w + p[1])
+        return 0.0
+    if kind == ONE_SIDED:
+        return -p[0] * (w - p[1]) if w > p[1] else 0.0
+    if kind == FRICTION:
+        return -p[0] * math.tanh(v / p[1])
+    if kind == BOUC_WEN:
+        return -p[0] * _yield_update(z, w - w_old, p[1])
+    return user_law(w, v, p)
 
-    @njit(cache=user_law is _no_law, nogil=True)
-    def element_force(kind, p, w, v, z, w_old):
-        if kind == LINEAR_SPRING:
-            return -p[0] * w
-        if kind == LINEAR_DAMPER:
-            return -p[0] * v
-        if kind == CUBIC:
-            return -p[0] * w * w * w
-        if kind == CLEARANCE:
-            if w > p[1]:
-                return -p[0] * (w - p[1])
-            if w < -p[1]:
-                return -p[0] * (w + p[1])
-            return 0.0
-        if kind == ONE_SIDED:
-            return -p[0] * (w - p[1]) if w > p[1] else 0.0
-        if kind == FRICTION:
-            return -p[0] * math.tanh(v / p[1])
-        if kind == BOUC_WEN:
-            return -p[0] * _yield_update(z, w - w_old, p[1])
-        return user_law(w, v, p)
 
-    @njit(cache=user_law is _no_law, nogil=True)
-    def solve_element(kind, p, w0, v0, aw, av, z, w_old, start):
-        """The force f with f = law(w0 + aw f, v0 + av f)."""
-        f = start
-        low, high = -math.inf, math.inf
-        for _ in range(40):
-            value = element_force(kind, p, w0 + aw * f, v0 + av * f, z, w_old)
-            g = f - value
-            if abs(g) <= 1e-13 * (abs(f) + abs(value)) + 1e-300:
-                break
-            if g > 0:
-                high = f
+@njit(cache=True, nogil=True)
+def solve_element(kind, p, w0, v0, aw, av, z, w_old, start):
+    """The force f with f = law(w0 + aw f, v0 + av f)."""
+    f = start
+    low, high = -math.inf, math.inf
+    for _ in range(40):
+        value = element_force(kind, p, w0 + aw * f, v0 + av * f, z, w_old)
+        g = f - value
+        if abs(g) <= 1e-13 * (abs(f) + abs(value)) + 1e-300:
+            break
+        if g > 0:
+            high = f
+        else:
+            low = f
+        step = 1e-6 * (abs(f) + abs(g))
+        beside = element_force(kind, p, w0 + aw * (f + step), v0 + av * (f + step), z, w_old)
+        slope = 1.0 - (beside - value) / step
+        f_new = f - g / slope if slope > 0.1 else value
+        if not (low < f_new < high):
+            if low > -math.inf and high < math.inf:
+                f_new = 0.5 * (low + high)
             else:
-                low = f
-            step = 1e-6 * (abs(f) + abs(g))
-            beside = element_force(kind, p, w0 + aw * (f + step), v0 + av * (f + step), z, w_old)
-            slope = 1.0 - (beside - value) / step
-            f_new = f - g / slope if slope > 0.1 else value
-            if not (low < f_new < high):
-                if low > -math.inf and high < math.inf:
-                    f_new = 0.5 * (low + high)
-                else:
-                    f_new = value
-            if f_new == f:
-                break
-            f = f_new
-        return f
+                f_new = value
+        if f_new == f:
+            break
+        f = f_new
+    return f
 
-    @njit(cache=user_law is _no_law, nogil=True)
-    def step_record(
-        omega, c, coupling, dt, n_sub, rate, forces, participation, stretch, stretching, drag_shapes, drag_weights,
-        kinds, shapes, parameters, q_out, v_out, f_out,
-    ):
-        """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest.
 
-        forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
-        stretching (n_modes, n_modes); drag_shapes (n_points, n_modes); shapes (n_elements, n_modes).
-        """
-        n, n_samples, n_elements = omega.size, q_out.shape[1], kinds.size
-        h = dt / n_sub
-        e = np.empty((n, 2, 4))
-        propagators(omega, c, h, e)
-        q, v, base_q, base_v = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-        old, new, spread = np.zeros(n), np.zeros(n), np.zeros(n)
-        spread_old, drive = np.zeros(n), np.zeros(n)
-        point, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
-        aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
-        distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
-        changed = np.empty(n)
-        for k in range(n_samples):
-            if rate != 0.0:
-                scale = math.sqrt(max(1.0 + rate * (k + 0.5) * dt, 1e-6))
-                for r in range(n):
-                    changed[r] = omega[r] * scale
-                propagators(changed, c, h, e)
-            if k == 0 or rate != 0.0:
-                for i in range(n_elements):
-                    for j in range(n_elements):
-                        aw[i, j] = 0.0
-                        av[i, j] = 0.0
-                        for r in range(n):
-                            aw[i, j] += shapes[i, r] * e[r, 0, 3] * shapes[j, r]
-                            av[i, j] += shapes[i, r] * e[r, 1, 3] * shapes[j, r]
+@njit(cache=True, nogil=True)
+def step_record(
+    omega, c, coupling, dt, n_sub, rate, forces, participation, stretch, stretching, drag_shapes, drag_weights,
+    kinds, shapes, parameters, q_out, v_out, f_out,
+):
+    """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest.
+
+    forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
+    stretching (n_modes, n_modes); drag_shapes (n_points, n_modes); shapes (n_elements, n_modes).
+    """
+    n, n_samples, n_elements = omega.size, q_out.shape[1], kinds.size
+    h = dt / n_sub
+    e = np.empty((n, 2, 4))
+    propagators(omega, c, h, e)
+    q, v, base_q, base_v = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    old, new, spread = np.zeros(n), np.zeros(n), np.zeros(n)
+    spread_old, drive = np.zeros(n), np.zeros(n)
+    point, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
+    aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
+    distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
+    changed = np.empty(n)
+    for k in range(n_samples):
+        if rate != 0.0:
+            scale = math.sqrt(max(1.0 + rate * (k + 0.5) * dt, 1e-6))
             for r in range(n):
-                q_out[r, k] = q[r]
-                v_out[r, k] = v[r]
-                f_out[r, k] = old[r]
-            if k == n_samples - 1:
-                break
-            for sub in range(n_sub):
-                for r in range(n):
-                    total = 0.0
-                    for j in range(participation.shape[1]):
-                        total += participation[r, j] * forces[j, k * n_sub + sub]
-                    drive[r] = total
-                    base_q[r] = e[r, 0, 0] * q[r] + e[r, 0, 1] * v[r] + e[r, 0, 2] * old[r]
-                    base_v[r] = e[r, 1, 0] * q[r] + e[r, 1, 1] * v[r] + e[r, 1, 2] * old[r]
-                    base_q[r] += (e[r, 0, 2] + e[r, 0, 3]) * total
-                    base_v[r] += (e[r, 1, 2] + e[r, 1, 3]) * total
-                passes = 2 if distributed else 1
-                for sweep in range(passes):
-                    if n_elements == 1:
-                        w0, v0 = 0.0, 0.0
-                        for r in range(n):
-                            w0 += shapes[0, r] * (base_q[r] + e[r, 0, 3] * spread[r])
-                            v0 += shapes[0, r] * (base_v[r] + e[r, 1, 3] * spread[r])
-                        point[0] = solve_element(
-                            kinds[0], parameters[0], w0, v0, aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
-                        )
-                    else:
-                        for gauss in range(12 if n_elements > 1 else 0):
-                            largest = 0.0
-                            for i in range(n_elements):
-                                w0, v0 = 0.0, 0.0
-                                for r in range(n):
-                                    w0 += shapes[i, r] * (base_q[r] + e[r, 0, 3] * spread[r])
-                                    v0 += shapes[i, r] * (base_v[r] + e[r, 1, 3] * spread[r])
-                                for j in range(n_elements):
-                                    if j != i:
-                                        w0 += aw[i, j] * point[j]
-                                        v0 += av[i, j] * point[j]
-                                f = solve_element(
-                                    kinds[i], parameters[i], w0, v0, aw[i, i], av[i, i], z[i], w_old[i], point[i]
-                                )
-                                largest = max(largest, abs(f - point[i]) / (abs(f) + 1e-30))
-                                point[i] = f
-                            if largest < 1e-10:
-                                break
+                changed[r] = omega[r] * scale
+            propagators(changed, c, h, e)
+        if k == 0 or rate != 0.0:
+            for i in range(n_elements):
+                for j in range(n_elements):
+                    aw[i, j] = 0.0
+                    av[i, j] = 0.0
                     for r in range(n):
-                        total = spread[r]
+                        aw[i, j] += shapes[i, r] * e[r, 0, 3] * shapes[j, r]
+                        av[i, j] += shapes[i, r] * e[r, 1, 3] * shapes[j, r]
+        for r in range(n):
+            q_out[r, k] = q[r]
+            v_out[r, k] = v[r]
+            f_out[r, k] = old[r]
+        if k == n_samples - 1:
+            break
+        for sub in range(n_sub):
+            for r in range(n):
+                total = 0.0
+                for j in range(participation.shape[1]):
+                    total += participation[r, j] * forces[j, k * n_sub + sub]
+                drive[r] = total
+                base_q[r] = e[r, 0, 0] * q[r] + e[r, 0, 1] * v[r] + e[r, 0, 2] * old[r]
+                base_v[r] = e[r, 1, 0] * q[r] + e[r, 1, 1] * v[r] + e[r, 1, 2] * old[r]
+                base_q[r] += (e[r, 0, 2] + e[r, 0, 3]) * total
+                base_v[r] += (e[r, 1, 2] + e[r, 1, 3]) * total
+            passes = 2 if distributed else 1
+            for sweep in range(passes):
+                if n_elements == 1:
+                    w0, v0 = 0.0, 0.0
+                    for r in range(n):
+                        w0 += shapes[0, r] * (base_q[r] + e[r, 0, 3] * spread[r])
+                        v0 += shapes[0, r] * (base_v[r] + e[r, 1, 3] * spread[r])
+                    point[0] = solve_element(
+                        kinds[0], parameters[0], w0, v0, aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
+                    )
+                else:
+                    for gauss in range(12 if n_elements > 1 else 0):
+                        largest = 0.0
                         for i in range(n_elements):
-                            total += shapes[i, r] * point[i]
-                        new[r] = total
-                    if distributed and sweep < passes - 1:
-                        # the forces that depend on the whole shape, from the motion just predicted
-                        for r in range(n):
-                            q[r] = base_q[r] + e[r, 0, 3] * new[r]
-                            v[r] = base_v[r] + e[r, 1, 3] * new[r]
-                            if sweep == 0:
-                                spread_old[r] = 0.0
-                        if stretch != 0.0:
-                            tension = 0.0
+                            w0, v0 = 0.0, 0.0
                             for r in range(n):
-                                changed_r = 0.0
-                                for s in range(n):
-                                    changed_r += stretching[r, s] * q[s]
-                                spread_old[r] = changed_r
-                                tension += q[r] * changed_r
-                            for r in range(n):
-                                spread_old[r] *= -stretch * tension
-                        for g in range(drag_weights.size):
-                            speed = 0.0
-                            for r in range(n):
-                                speed += drag_shapes[g, r] * v[r]
-                            push = -drag_weights[g] * abs(speed) * speed
-                            for r in range(n):
-                                spread_old[r] += drag_shapes[g, r] * push
-                        if coupling.size > 0:
-                            for r in range(n):
-                                for s in range(n):
-                                    spread_old[r] -= coupling[r, s] * v[s]
-                        for r in range(n):
-                            spread[r] = spread_old[r]
+                                w0 += shapes[i, r] * (base_q[r] + e[r, 0, 3] * spread[r])
+                                v0 += shapes[i, r] * (base_v[r] + e[r, 1, 3] * spread[r])
+                            for j in range(n_elements):
+                                if j != i:
+                                    w0 += aw[i, j] * point[j]
+                                    v0 += av[i, j] * point[j]
+                            f = solve_element(
+                                kinds[i], parameters[i], w0, v0, aw[i, i], av[i, i], z[i], w_old[i], point[i]
+                            )
+                            largest = max(largest, abs(f - point[i]) / (abs(f) + 1e-30))
+                            point[i] = f
+                        if largest < 1e-10:
+                            break
                 for r in range(n):
-                    q[r] = base_q[r] + e[r, 0, 3] * new[r]
-                    v[r] = base_v[r] + e[r, 1, 3] * new[r]
-                    old[r] = new[r]
-                for i in range(n_elements):
-                    w = 0.0
+                    total = spread[r]
+                    for i in range(n_elements):
+                        total += shapes[i, r] * point[i]
+                    new[r] = total
+                if distributed and sweep < passes - 1:
+                    # the forces that depend on the whole shape, from the motion just predicted
                     for r in range(n):
-                        w += shapes[i, r] * q[r]
-                    if kinds[i] == BOUC_WEN:
-                        z[i] = _yield_update(z[i], w - w_old[i], parameters[i, 1])
-                    w_old[i] = w
+                        q[r] = base_q[r] + e[r, 0, 3] * new[r]
+                        v[r] = base_v[r] + e[r, 1, 3] * new[r]
+                        if sweep == 0:
+                            spread_old[r] = 0.0
+                    if stretch != 0.0:
+                        tension = 0.0
+                        for r in range(n):
+                            changed_r = 0.0
+                            for s in range(n):
+                                changed_r += stretching[r, s] * q[s]
+                            spread_old[r] = changed_r
+                            tension += q[r] * changed_r
+                        for r in range(n):
+                            spread_old[r] *= -stretch * tension
+                    for g in range(drag_weights.size):
+                        speed = 0.0
+                        for r in range(n):
+                            speed += drag_shapes[g, r] * v[r]
+                        push = -drag_weights[g] * abs(speed) * speed
+                        for r in range(n):
+                            spread_old[r] += drag_shapes[g, r] * push
+                    if coupling.size > 0:
+                        for r in range(n):
+                            for s in range(n):
+                                spread_old[r] -= coupling[r, s] * v[s]
+                    for r in range(n):
+                        spread[r] = spread_old[r]
+            for r in range(n):
+                q[r] = base_q[r] + e[r, 0, 3] * new[r]
+                v[r] = base_v[r] + e[r, 1, 3] * new[r]
+                old[r] = new[r]
+            for i in range(n_elements):
+                w = 0.0
+                for r in range(n):
+                    w += shapes[i, r] * q[r]
+                if kinds[i] == BOUC_WEN:
+                    z[i] = _yield_update(z[i], w - w_old[i], parameters[i, 1])
+                w_old[i] = w
 
-    return step_record
 
-
-step_record = make_stepper(_no_law)
+def make_stepper(law):
+    """`step_record` with force(w, v, parameters) = `law` for the elements of kind USER, compiled for it."""
+    scope = dict(globals(), user_law=njit(nogil=True)(law))
+    for name in ("element_force", "solve_element", "step_record"):
+        scope[name] = njit(nogil=True)(FunctionType(globals()[name].py_func.__code__, scope, name))
+    return scope["step_record"]

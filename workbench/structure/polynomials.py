@@ -7,7 +7,7 @@ accuracy would lose it to the condition number, which grows with the fourth powe
 """
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -92,19 +92,9 @@ class Segments:
         return factors
 
     def evaluation(self, x: ArrayLike, derivative: int = 0) -> np.ndarray:
-        """The matrix (n_points, n_functions) that maps coefficients to values (or derivatives) at x."""
+        """The matrix (n_points, n_functions) that maps coefficients to values (or derivatives) at x, read-only."""
         x = np.atleast_1d(np.asarray(x, float))
-        matrix = np.zeros((x.size, self.n_functions))
-        segment = np.clip(np.searchsorted(self.nodes, x, side="right") - 1, 0, self.n_segments - 1)
-        coefficients = reference_basis(self.degree, self.continuity).T
-        coefficients = legendre.legder(coefficients, derivative) if derivative else coefficients
-        for s in np.unique(segment):
-            here = segment == s
-            h = self.nodes[s + 1] - self.nodes[s]
-            local = 2.0 * (x[here] - self.nodes[s]) / h - 1.0
-            values = legendre.legvander(local, coefficients.shape[0] - 1) @ coefficients
-            matrix[np.ix_(np.flatnonzero(here), self.indices(s))] = values * self.scales(s) * (2.0 / h) ** derivative
-        return matrix
+        return _evaluation(self.nodes.tobytes(), self.degree, self.continuity, x.tobytes(), derivative)
 
     def assemble(self, weight, derivative: int, n_extra: int = 4) -> np.ndarray:
         """Integral of weight(x) times the products of the functions' derivatives: (n_functions, n_functions)."""
@@ -125,3 +115,24 @@ class Segments:
         largest = np.abs(coefficients).max(axis=0)
         tail = [np.abs(coefficients[self.indices(s)[nodal:][-2:]]).max(axis=0) for s in range(self.n_segments)]
         return float((np.max(tail, axis=0) / largest).max())
+
+
+@lru_cache(maxsize=512)
+def _evaluation(nodes: bytes, degree: int, continuity: int, places: bytes, derivative: int) -> np.ndarray:
+    """`Segments.evaluation`, remembered: sensors and actuators are asked for at the same places again and again."""
+    segments = Segments(np.frombuffer(nodes), degree, continuity)
+    x = np.frombuffer(places)
+    matrix = np.zeros((x.size, segments.n_functions))
+    segment = np.clip(np.searchsorted(segments.nodes, x, side="right") - 1, 0, segments.n_segments - 1)
+    coefficients = reference_basis(degree, continuity).T
+    coefficients = legendre.legder(coefficients, derivative) if derivative else coefficients
+    for s in np.unique(segment):
+        here = segment == s
+        h = segments.nodes[s + 1] - segments.nodes[s]
+        local = 2.0 * (x[here] - segments.nodes[s]) / h - 1.0
+        values = legendre.legvander(local, coefficients.shape[0] - 1) @ coefficients
+        matrix[np.ix_(np.flatnonzero(here), segments.indices(s))] = (
+            values * segments.scales(s) * (2.0 / h) ** derivative
+        )
+    matrix.flags.writeable = False
+    return matrix

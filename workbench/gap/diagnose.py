@@ -1,0 +1,80 @@
+"""The diagnosis from end to end: rig and records in, verdict out."""
+
+from collections.abc import Callable, Sequence
+
+from workbench.gap.attribute import attribute
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import Kind, apply_all
+from workbench.gap.locate import locate
+from workbench.gap.shrinkage import measure
+from workbench.gap.verdict import Verdict
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+
+
+def diagnose(
+    rig: Rig,
+    records: Sequence[Record],
+    *,
+    validation: Sequence[Record] = (),
+    catalogue: tuple[Kind, ...] = CATALOGUE,
+    name: str = "case",
+    report: Callable[[str, float], None] = lambda text, share: None,
+) -> Verdict:
+    """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
+
+    The search sees `records` alone; `validation` is opened once, after the last fit, to measure the shrinkage.
+
+    Args:
+        rig: nominal; its sensors carry noise_std.
+        records: with the rig's inputs and outputs, in its order.
+        validation: kept out of every fit.
+        catalogue: kinds of effects to try.
+        name: of the case.
+        report: told (what, share done) as the search proceeds.
+
+    Raises:
+        ValueError: records that do not fit the rig, or sensors without noise_std.
+    """
+    for record in (*records, *validation):
+        _check(rig, record)
+    if not records:
+        raise ValueError("a diagnosis needs at least one record to fit; got none")
+    found = attribute(rig, records, catalogue=catalogue, report=report)
+    corrected = apply_all(rig, found.best.effects)
+    effects = found.best.effects if found.outcome in ("none", "explained") else ()
+    return Verdict(
+        case=name,
+        outcome=found.outcome,
+        effects=found.best.effects,
+        alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in found.rivals),
+        where=locate(found.evidence, effects),
+        shrinkage=measure(rig, corrected, validation),
+        corrected=corrected,
+        nominal=rig,
+        attribution=found,
+        notes=_notes(found),
+    )
+
+
+def _check(rig: Rig, record: Record) -> None:
+    for kind, parts, names in (
+        ("input", rig.actuators, record.input_names),
+        ("output", rig.sensors, record.output_names),
+    ):
+        expected = tuple(part.name for part in parts)
+        if names != expected:
+            raise ValueError(
+                f"record {record.name!r}: its {kind}s are {', '.join(names) or 'none'}; the rig has"
+                f" {', '.join(expected)}, in that order"
+            )
+
+
+def _notes(found) -> tuple[str, ...]:
+    names = {effect.kind.name for effect in found.best.effects}
+    notes = []
+    if "random_disturbance" in names:
+        notes.append("A random disturbance leaves a remainder that no model can predict; its statistics were fitted.")
+    if "sensor_quantisation" in names:
+        notes.append("Rounding leaves a remainder of a step over the root of twelve that no model can predict.")
+    return tuple(notes)

@@ -1,0 +1,24 @@
+"""Which effects contain another as a limit: the simpler one is meant where the records cannot tell them apart."""
+
+from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.nonlinear import BOUC_WEN, CLEARANCE, COULOMB_FRICTION
+from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER, TRUNCATED_MODES
+from workbench.rig.rig import Rig
+
+
+def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """Effects that this one turns into at a bound of its parameters, with values to start a fit from.
+
+    A clearance of no gap and a hysteretic spring that never yields are springs; friction far below its smoothing
+    speed is a viscous damper; a hysteretic spring that always slides is friction; one mode fewer is fewer.
+    """
+    v = effect.values
+    if effect.kind is COULOMB_FRICTION:
+        return (Effect(POINT_DAMPER, None, {"at": v["at"], "coefficient": v["force"] / v["smoothing_speed"]}),)
+    if effect.kind is CLEARANCE:
+        return (Effect(GROUND_SPRING, None, {"at": v["at"], "stiffness": v["stiffness"]}),)
+    if effect.kind is BOUC_WEN:
+        return (Effect(GROUND_SPRING, None, {"at": v["at"], "stiffness": v["stiffness"]}),)
+    if effect.kind is TRUNCATED_MODES and effect.target - 1 > rig.modes.n_modes:
+        return (Effect(TRUNCATED_MODES, effect.target - 1, {}),)
+    return ()

@@ -1,0 +1,172 @@
+"""Where a simulation and a test disagree: by record, mode, band, time, sensor and level, and along which path."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.signal import csd
+
+from workbench.gap.effects.effect import Effect
+from workbench.gap.evidence import Evidence
+from workbench.gap.prediction import FitData
+
+MODE_SHARE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Where:
+    """The gap of the nominal model, taken apart.
+
+    Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation.
+
+    Attributes:
+        path: "actuator", "structure", "sensor", "environment", or "none".
+        modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies.
+        amplitude_dependent: whether the gap changes with level.
+        mode_shares: (n_modes,) share of the gap in the band around each natural frequency.
+        sensor_shares: (n_outputs,).
+        time_shares: (n_records, 8) of each record's gap, by eighths of its length.
+        record_gaps: (n_records,) gap as the case format defines it.
+        input_levels: (n_records,) root mean square of the inputs.
+        linear_share: of the gap's power, what is coherent with the inputs.
+        at, at_std: the likeliest place of a missing force at a point and its standard deviation, m.
+        point_share: share of the gap's log-likelihood that one force at that place accounts for.
+    """
+
+    path: str
+    modes: tuple[int, ...]
+    amplitude_dependent: bool
+    mode_shares: np.ndarray
+    sensor_shares: np.ndarray
+    time_shares: np.ndarray
+    record_names: tuple[str, ...]
+    record_gaps: np.ndarray
+    input_levels: np.ndarray
+    linear_share: float
+    at: float
+    at_std: float
+    point_share: float
+
+
+def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
+    """Take the gap on the fit records apart; the path is that of the effects, where they are known."""
+    data = evidence.data
+    scaled = [r / record.outputs.std(axis=1, keepdims=True) for record, r in zip(
+        data.records, evidence.residuals, strict=True)]
+    floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.records]
+    excess = np.array([(s**2).mean(axis=1) - f for s, f in zip(scaled, floors, strict=True)])
+    by_sensor = np.maximum(excess, 0.0).sum(axis=0)
+    mode_shares = _mode_shares(evidence, scaled)
+    profile = evidence.profile
+    at, at_std, point_share = _place(evidence, profile)
+    levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.records])
+    gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
+    return Where(
+        path=_path(evidence, excess, effects),
+        modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > MODE_SHARE)),
+        amplitude_dependent=_amplitude_dependent(effects, excess, data),
+        mode_shares=mode_shares,
+        sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
+        time_shares=np.array([_by_eighths(s) for s in scaled]),
+        record_names=tuple(record.name for record in data.records),
+        record_gaps=gaps,
+        input_levels=levels,
+        linear_share=_linear_share(data, scaled),
+        at=at,
+        at_std=at_std,
+        point_share=point_share,
+    )
+
+
+def _mode_shares(evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
+    """Share of the residual's power in the band around each natural frequency, bands meeting half way between."""
+    frequencies = evidence.rig.modes.frequencies_hz
+    edges = np.r_[0.0, np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0)), np.inf]
+    power = np.zeros(frequencies.size)
+    for record, s in zip(evidence.data.records, scaled, strict=True):
+        spectrum = (np.abs(np.fft.rfft(s, axis=1)) ** 2).sum(axis=0) / s.shape[1]
+        grid = np.fft.rfftfreq(s.shape[1], record.sample_time)
+        band = np.clip(np.searchsorted(edges, grid, side="right") - 1, 0, frequencies.size - 1)
+        floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).sum()
+        power += np.bincount(band, spectrum - floor, frequencies.size)
+    power = np.maximum(power, 0.0)
+    return power / max(power.sum(), 1e-300)
+
+
+def _by_eighths(scaled: np.ndarray) -> np.ndarray:
+    power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
+    return power / max(power.sum(), 1e-300)
+
+
+def _linear_share(data: FitData, scaled: list[np.ndarray]) -> float:
+    """Multiple coherence of the residual with the inputs, averaged over power."""
+    coherent = total = 0.0
+    for record, s in zip(data.records, scaled, strict=True):
+        active = [row for row in record.inputs if np.any(row)]
+        length = min(256, record.n_samples // 4)
+        if not active or length < 16:
+            continue
+        inputs = np.array(active)
+        options = {"fs": 1.0 / record.sample_time, "nperseg": length}
+        suu = np.array([[csd(a, b, **options)[1] for b in inputs] for a in inputs]).transpose(2, 0, 1)
+        suu = suu + 1e-9 * np.trace(suu, axis1=1, axis2=2).real.max() * np.eye(len(active))
+        segments = 2 * record.n_samples / length - 1
+        for row in s:
+            sur = np.array([csd(a, row, **options)[1] for a in inputs]).T
+            explained = np.einsum("fi,fi->f", sur.conj(), np.linalg.solve(suu, sur[..., None])[..., 0]).real
+            power = csd(row, row, **options)[1].real
+            bias = len(active) / segments * power
+            coherent += np.maximum(explained - bias, 0.0).sum() * (1.0 + len(active) / segments)
+            total += power.sum()
+    return float(min(coherent / max(total, 1e-300), 1.0))
+
+
+def _place(evidence: Evidence, profile: np.ndarray) -> tuple[float, float, float]:
+    """Peak of the likelihood over places, its standard deviation from the curvature, and the share it accounts for."""
+    places, data = evidence.places, evidence.data
+    best = evidence.peaks[0]
+    weights = np.exp(np.maximum(profile - profile.max(), -700.0))
+    spread = float(np.sqrt(np.sum(weights * (places - best) ** 2) / weights.sum()))
+    i = int(np.clip(np.argmax(profile), 1, places.size - 2)) if places.size > 2 else 0
+    if places.size > 2:
+        bend = profile[i - 1] - 2.0 * profile[i] + profile[i + 1]
+        if bend < 0:
+            spread = max(spread * 0.0, float((places[1] - places[0]) / np.sqrt(-bend)))
+    # the likelihood cannot tell more than the grid and the model of the force allow
+    spread = max(spread, 0.1 * float(np.diff(places).mean()) if places.size > 1 else 0.0)
+    n_samples = sum(record.n_samples for record in data.records)
+    chi2 = sum(float(np.sum((r / data.noise[:, None]) ** 2)) for r in evidence.residuals)
+    none = -0.5 * (chi2 + n_samples * np.sum(np.log(data.noise**2)))
+    floor = -0.5 * n_samples * (data.noise.size + np.sum(np.log(data.noise**2)))
+    share = (profile.max() - none) / max(floor - none, 1e-300)
+    return float(best), spread, float(np.clip(share, 0.0, 1.0))
+
+
+def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> str:
+    paths = [effect.kind.path for effect in effects]
+    if paths:
+        return paths[0]
+    power = np.maximum(excess, 0.0).sum(axis=0)
+    if power.sum() <= 0 or evidence.data.by_channel(_joined(evidence)).mean() < 1.03:
+        return "none"
+    if power.max() > 0.97 * power.sum():
+        return "sensor"
+    direct = {a.name for a in evidence.rig.actuators if a.direct}
+    for record, row in zip(evidence.data.records, excess, strict=True):
+        active = {n for n, values in zip(record.input_names, record.inputs, strict=True) if np.any(values)}
+        if active and active <= direct:
+            floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).mean()
+            return "structure" if row.mean() > 0.1 * floor else "actuator"
+    return "structure"
+
+
+def _joined(evidence: Evidence) -> np.ndarray:
+    return np.concatenate([(r / evidence.data.noise[:, None]).ravel() for r in evidence.residuals])
+
+
+def _amplitude_dependent(effects: Sequence[Effect], excess: np.ndarray, data: FitData) -> bool:
+    if effects:
+        return any(effect.kind.nonlinear for effect in effects)
+    gaps = np.sqrt(np.maximum(excess.mean(axis=1), 0.0))
+    floors = np.array([np.sqrt(((data.noise / r.outputs.std(axis=1)) ** 2).mean()) for r in data.records])
+    return bool((gaps + floors).max() > 2.0 * (gaps + floors).min() and gaps.max() > 2.0 * floors.max())

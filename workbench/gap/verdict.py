@@ -1,0 +1,168 @@
+"""The verdict on a gap: where, which, how far, in a sentence and as JSON."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.gap.attribute import Attribution
+from workbench.gap.effects.effect import ALL, Effect
+from workbench.gap.locate import Where
+from workbench.gap.shrinkage import Shrinkage
+from workbench.rig.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What a diagnosis says.
+
+    Attributes:
+        case: its name.
+        outcome: "none" (no gap beyond noise), "explained", "part" (explained in part) or "unknown".
+        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown".
+        alternatives: (label of a rival set, probability), best first.
+        where: the gap taken apart.
+        shrinkage: on validation records; None without any.
+        corrected: the rig with the effects in it.
+        nominal: the rig as it was handed in.
+        attribution: the whole search.
+        notes: what else a reader should know.
+    """
+
+    case: str
+    outcome: str
+    effects: tuple[Effect, ...]
+    alternatives: tuple[tuple[str, float], ...]
+    where: Where
+    shrinkage: Shrinkage | None
+    corrected: Rig
+    nominal: Rig
+    attribution: Attribution
+    notes: tuple[str, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if self.outcome == "none":
+            return "There is no gap beyond the noise of the sensors."
+        words = " and ".join(_described(effect, self.nominal) for effect in self.effects)
+        closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
+        if self.outcome == "explained":
+            text = f"{words} explain{'s' if len(self.effects) == 1 else ''} {closed}the gap"
+            near = [label for label, probability in self.alternatives if probability > 0.01]
+            text += f"; {' and '.join(near)} cannot be excluded." if near else "."
+        else:
+            text = (
+                f"No effect of the catalogue, alone or with another, explains the gap; the nearest, {words},"
+                f" would close {closed or 'part of '}it."
+            )
+        return text[0].upper() + text[1:]
+
+    def to_json(self) -> dict:
+        """The verdict as the case format asks for it, and what stands behind it."""
+        known = self.outcome in ("none", "explained")
+        effects = [effect_json(effect, self.nominal) for effect in self.effects]
+        shrink = self.shrinkage
+        return {
+            "case": self.case,
+            "outcome": self.outcome,
+            "sentence": self.sentence,
+            "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
+            "nearest": [] if known else effects,
+            "alternatives": [{"kind": label, "probability": _rounded(p)} for label, p in self.alternatives],
+            "where": where_json(self.where),
+            "gap": {
+                "before": _rounded_all(shrink.before if shrink else {}),
+                "after": _rounded_all(shrink.after if shrink else {}),
+                "floor": _rounded_all(shrink.floor if shrink else {}),
+            },
+            "shrinkage": {
+                **_rounded_all(shrink.share if shrink else {}),
+                **({"ci95": [_rounded(c) for c in shrink.ci95]} if shrink else {}),
+            },
+            "residual": {
+                "nominal": _rounded(self.attribution.nominal_cost),
+                "corrected": _rounded(self.attribution.best.cost),
+            },
+            "notes": list(self.notes),
+        }
+
+
+def effect_json(effect: Effect, nominal: Rig) -> dict:
+    """One effect: kind, parameters with their standard deviations, place, input or output."""
+    values = {name: value for name, value in effect.values.items() if name != "at"}
+    if effect.kind.name == "truncated_modes":
+        values = {"kept": nominal.modes.n_modes, "needed": int(effect.target)}
+    if "phase" in values:
+        values["phase"] = float((values["phase"] + np.pi) % (2.0 * np.pi) - np.pi)
+    entry: dict = {"kind": effect.kind.name, "parameters": {n: _rounded(v) for n, v in values.items()}}
+    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n != "at"}
+    if deviations:
+        entry["parameters_std"] = deviations
+    if effect.kind.path in ("actuator", "sensor"):
+        entry["input" if effect.kind.path == "actuator" else "output"] = effect.target
+    if effect.kind.name == "support_rotation":
+        entry["at"], entry["at_std"] = (0.0 if effect.target == "left" else nominal.modes.length), 0.0
+    elif "at" in effect.values:
+        entry["at"] = _rounded(effect.values["at"])
+        entry["at_std"] = _rounded(effect.deviations.get("at", 0.0))
+    return entry
+
+
+def where_json(where: Where) -> dict:
+    """Where, as plain numbers."""
+    return {
+        "path": where.path,
+        "modes": list(where.modes),
+        "amplitude_dependent": where.amplitude_dependent,
+        "linear_share": _rounded(where.linear_share),
+        "point": {"at": _rounded(where.at), "at_std": _rounded(where.at_std), "share": _rounded(where.point_share)},
+        "by_mode": [_rounded(s) for s in where.mode_shares],
+        "by_sensor": [_rounded(s) for s in where.sensor_shares],
+        "by_record": {
+            name: {"gap": _rounded(gap), "input_rms": _rounded(level), "by_eighth": [_rounded(s) for s in shares]}
+            for name, gap, level, shares in zip(
+                where.record_names, where.record_gaps, where.input_levels, where.time_shares, strict=True
+            )
+        },
+    }
+
+
+def _described(effect: Effect, nominal: Rig) -> str:
+    """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
+    units = {p.name: p.unit for p in effect.parameters(nominal)}
+    numbers = [
+        f"{name.replace('_', ' ')} {_with_deviation(value, effect.deviations.get(name, 0.0))} {units.get(name, '')}".strip()
+        for name, value in effect.values.items()
+        if name != "at"
+    ]
+    text = effect.kind.words
+    if effect.kind.name == "truncated_modes":
+        text += f" ({effect.target} are needed, {nominal.modes.n_modes} are kept)"
+    elif numbers:
+        text += f" ({', '.join(numbers)})"
+    if effect.kind.path in ("actuator", "sensor"):
+        text += ", all of them" if effect.target == ALL else f", {effect.target}"
+    elif effect.kind.name == "support_rotation":
+        text += f" at the {effect.target} end"
+    if "at" in effect.values:
+        text += f" at x = {_with_deviation(effect.values['at'], effect.deviations.get('at', 0.0))}"
+    return text
+
+
+def _with_deviation(value: float, deviation: float) -> str:
+    if not deviation > 0 or not np.isfinite(deviation):
+        return f"{value:.4g}"
+    if deviation < 5e-4 * abs(value):
+        return f"{value:.4g}"
+    digits = max(0, -int(np.floor(np.log10(deviation))))
+    if digits > 4 or abs(value) >= 1e5:
+        return f"{value:.4g} ± {deviation:.1g}"
+    return f"{value:.{digits}f} ± {deviation:.{digits}f}"
+
+
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.6g}") if np.isfinite(value) else None
+
+
+def _rounded_all(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: _rounded(value) for name, value in values.items()}
