@@ -21,6 +21,8 @@ from workbench.rig.rig import Rig
 SLACK = 0.03
 INTEGRATION_SHARE = 2e-6
 SURE = 30.0
+WORTHWHILE = 0.01  # of the noise power: less is within what two good finite-element models differ by
+TARGETS_A_KIND, JOINED = 2, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +72,10 @@ class _Search:
         """Whether the gain in likelihood pays for `extra` more numbers."""
         n = self.data.n_values
         return n * (than - candidate.cost) > SURE + extra * np.log(n)
+
+    def worthwhile(self, candidate: Fit, than: float) -> bool:
+        """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
+        return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > WORTHWHILE
 
 
 def attribute(
@@ -173,11 +179,16 @@ def _extend(search: _Search, given: tuple[Effect, ...], evidence: Evidence, begi
         if not _repeats(kind, target, given)
     ]
     _ = evidence.at_peaks
+    started = [s for s in search.pool.map(lambda task: _started(search, rig, evidence, *task), tasks) if s]
+    search.report("starts", begin + 0.3 * (end - begin))
+    if given:
+        started = _promising(started, TARGETS_A_KIND)
+        started = list(search.pool.map(lambda s: _alone(search, rig, s), started))
+        started = _promising(started, TARGETS_A_KIND)[:JOINED]
     quick_fits: list[Fit] = []
-    for i, candidate in enumerate(search.pool.map(lambda task: _quick_fit(search, given, rig, evidence, *task), tasks)):
-        search.report(tasks[i][0].words, begin + (end - begin) * 0.7 * (i + 1) / len(tasks))
-        if candidate is not None:
-            quick_fits.append(candidate)
+    for i, candidate in enumerate(search.pool.map(lambda s: _quick_fit(search, given, s), started)):
+        search.report(candidate.effects[-1].kind.words, begin + (end - begin) * (0.3 + 0.5 * (i + 1) / len(started)))
+        quick_fits.append(candidate)
     quick_fits.sort(key=lambda f: f.cost)
     chosen = _spread_over_kinds(quick_fits, 3)
     close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
@@ -219,23 +230,36 @@ def _repeats(kind: Kind, target, given: Sequence[Effect]) -> bool:
     return False
 
 
-def _quick_fit(search: _Search, given, rig: Rig, evidence: Evidence, kind: Kind, target) -> Fit | None:
-    """The best of a kind's starts, improved a little on the quick records, jointly with the given effects."""
+def _started(search: _Search, rig: Rig, evidence: Evidence, kind: Kind, target) -> list[tuple[float, Effect]]:
+    """The two best starts of a kind on the quick records, with their costs."""
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
-    if not starts:
-        return None
     costs = [cost_of(rig, (effect,), search.quick) for effect in starts]
-    order = np.argsort(costs)
-    if costs[order[0]] >= HOPELESS:
-        return None
-    best: Fit | None = None
-    for i in order[:2]:
-        alone = fit(rig, (starts[i],), search.quick, iterations=5) if given else None
-        effect = alone.effects[0] if alone is not None else starts[i]
-        candidate = fit(search.rig, (*given, effect), search.quick, iterations=4 if given else 7)
-        if best is None or candidate.cost < best.cost:
-            best = candidate
-    return best
+    order = [i for i in np.argsort(costs) if costs[i] < HOPELESS]
+    # a lone start is of an effect that is linear in its number: its cost says nothing yet
+    return [(-1.0 if len(starts) == 1 else costs[i], starts[i]) for i in order[:2]]
+
+
+def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[list[tuple[float, Effect]]]:
+    """The tasks in the order of their costs, at most so many targets of a kind."""
+    kept, counts = [], {}
+    for task in sorted(started, key=lambda s: s[0][0]):
+        name = task[0][1].kind.name
+        counts[name] = counts.get(name, 0) + (task[0][0] >= 0)
+        if counts[name] <= most:
+            kept.append(task)
+    return kept
+
+
+def _alone(search: _Search, rig: Rig, started: list[tuple[float, Effect]]) -> list[tuple[float, Effect]]:
+    """The best start, improved a little with the effects found before held fixed."""
+    candidate = fit(rig, (started[0][1],), search.quick, iterations=3)
+    return [(candidate.cost, candidate.effects[0])]
+
+
+def _quick_fit(search: _Search, given: tuple[Effect, ...], started: list[tuple[float, Effect]]) -> Fit:
+    """The best of a kind's starts, improved a little on the quick records, jointly with the given effects."""
+    fits = [fit(search.rig, (*given, effect), search.quick, iterations=4 if given else 7) for _, effect in started]
+    return min(fits, key=lambda f: f.cost)
 
 
 # --- decisions
@@ -284,7 +308,7 @@ def _ranked(search: _Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit,
 
 def _decide(search: _Search, start: Fit, singles: list[Fit]):
     """None, or an outcome that needs no second effect."""
-    good = [f for f in singles if search.surely_better(f, start.cost, f.n_parameters)]
+    good = [f for f in singles if search.worthwhile(f, start.cost)]
     if search.explains(start) and not good:
         return "none", start, None, ()
     finished = [_finished(search, f) for f in good[:4]]

@@ -6,6 +6,7 @@ import numpy as np
 
 from workbench.gap.attribute import Attribution
 from workbench.gap.effects.effect import ALL, Effect
+from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
 from workbench.gap.locate import Where
 from workbench.gap.shrinkage import Shrinkage
 from workbench.rig.rig import Rig
@@ -40,14 +41,25 @@ class Verdict:
     notes: tuple[str, ...] = ()
 
     @property
+    def _told(self) -> tuple[Effect, ...]:
+        """The effects, rounding or clipping of every sensor told once."""
+        told = list(self.effects)
+        for kind, field in ((SENSOR_QUANTISATION, "step"), (SENSOR_CLIPPING, "limit")):
+            same = [e for e in told if e.kind is kind]
+            if len(same) == len(self.nominal.sensors) > 1:
+                told = [e for e in told if e.kind is not kind]
+                told.insert(0, Effect(kind, ALL, {field: float(np.median([e.values[field] for e in same]))}))
+        return tuple(told)
+
+    @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
         if self.outcome == "none":
             return "There is no gap beyond the noise of the sensors."
-        words = " and ".join(_described(effect, self.nominal) for effect in self.effects)
+        words = " and ".join(_described(effect, self.nominal) for effect in self._told)
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if self.outcome == "explained":
-            text = f"{words} explain{'s' if len(self.effects) == 1 else ''} {closed}the gap"
+            text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
             near = [label for label, probability in self.alternatives if probability > 0.01]
             text += f"; {' and '.join(near)} cannot be excluded." if near else "."
         else:
@@ -60,7 +72,7 @@ class Verdict:
     def to_json(self) -> dict:
         """The verdict as the case format asks for it, and what stands behind it."""
         known = self.outcome in ("none", "explained")
-        effects = [effect_json(effect, self.nominal) for effect in self.effects]
+        effects = [effect_json(effect, self.nominal) for effect in self._told]
         shrink = self.shrinkage
         return {
             "case": self.case,

@@ -165,12 +165,14 @@ class _Member:
 
     def _signs(self, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
         """+1 or -1 a mode, so that the first derivative that does not vanish at the left end is positive."""
+        middle = 0.5 * self.length
+        size = 1.0 / np.sqrt(float(self.mass_per_length(middle)) * self.length)
         signs = np.zeros(coefficients.shape[1])
-        inside = np.linspace(0.0, self.length, 41)
         for derivative in range(segments.continuity + 2):
-            values = segments.evaluation(inside, derivative) @ coefficients
-            start = values[0] / np.maximum(np.abs(values).max(axis=0), 1e-300)
+            start = (segments.evaluation(0.0, derivative) @ coefficients)[0] * self.length**derivative / size
             signs = np.where((signs == 0) & (np.abs(start) > 1e-6), np.sign(start), signs)
+            if signs.all():
+                break
         return np.where(signs == 0, 1.0, signs)
 
     def _damping_matrix(self, omega: np.ndarray, segments: Segments, coefficients: np.ndarray) -> np.ndarray:

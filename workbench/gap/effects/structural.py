@@ -13,7 +13,7 @@ from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
 from workbench.structure.supports import HELD, End, PointDamper, PointMass, PointSpring
 
-RESOLUTION = 1e-8
+RESOLUTION = 1e-6
 
 
 def place_parameter(rig: Rig) -> Parameter:
