@@ -1,0 +1,307 @@
+"""A case folder: a nominal model, and records measured on the real structure."""
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Bar, Beam, Structure
+from workbench.structure.modes import Modes
+
+MOST_SAMPLES = 5_000_000
+LEAST_SAMPLES = 16
+
+
+class CaseError(ValueError):
+    """A case folder that is not one, or holds what a diagnosis cannot use."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a user has in hand when a simulation and a test disagree.
+
+    Attributes:
+        name: of the folder.
+        rig: nominal.
+        fit: records that may be fitted.
+        validation: records only for measuring how far the gap shrank.
+    """
+
+    name: str
+    rig: Rig
+    fit: tuple[Record, ...]
+    validation: tuple[Record, ...]
+
+
+class KnownPlaces:
+    """Shapes known only at named inputs and outputs; place i stands at position i.
+
+    Attributes:
+        names: (n_places,) of the inputs, then of the outputs.
+        places: (n_places,) 0, 1, 2, ...
+    """
+
+    def __init__(self, names: tuple[str, ...], values: np.ndarray):
+        self.names, self.values = names, values
+        self.places = np.arange(len(names), dtype=float)
+
+    def __call__(self, x: np.ndarray, derivative: int) -> np.ndarray:
+        if derivative:
+            raise ValueError("plain modal data tell no slopes; describe the structure as a beam or a rod instead")
+        return self.values[np.clip(np.round(x).astype(int), 0, len(self.names) - 1)]
+
+
+def read_case(folder: str | Path) -> Case:
+    """Read a case folder: case.toml and its records.
+
+    Raises:
+        CaseError: naming the file, the key or channel, the value, and what would be right.
+    """
+    folder = Path(folder)
+    path = folder / "case.toml"
+    if not folder.is_dir():
+        raise CaseError(f"{folder} is not a folder; a case is a folder with case.toml and records")
+    if not path.is_file():
+        raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise CaseError(f"{path} cannot be read as TOML: {error}") from error
+    inputs, outputs = _tables(table, "input", path), _tables(table, "output", path)
+    structure = table.get("structure")
+    if not isinstance(structure, dict):
+        raise CaseError(f"{path}: the table [structure] is missing")
+    try:
+        rig = _modal_rig(structure, inputs, outputs) if structure.get("kind") == "modal" else _member_rig(
+            structure, inputs, outputs)
+    except CaseError as error:
+        raise CaseError(f"{path}: {error}") from error
+    except (ValueError, TypeError, ArithmeticError) as error:
+        raise CaseError(f"{path}: {error}") from error
+    records = [(_read_record(folder, entry, rig, path), _use(entry, path)) for entry in _tables(table, "record", path)]
+    fit = tuple(record for record, use in records if use == "fit")
+    if not fit:
+        raise CaseError(f'{path}: no record has use = "fit"; a diagnosis needs at least one')
+    return Case(
+        name=folder.resolve().name,
+        rig=rig,
+        fit=fit,
+        validation=tuple(record for record, use in records if use == "validate"),
+    )
+
+
+# --- tables
+
+
+def _tables(table: dict, key: str, path: Path) -> list[dict]:
+    entries = table.get(key)
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise CaseError(f"{path}: at least one [[{key}]] is needed")
+    names = [_text(entry, "name", f"[[{key}]]") for entry in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise CaseError(f"{path}: two [[{key}]] are called {name!r}; names must differ")
+    return entries
+
+
+def _text(entry: dict, key: str, where: str) -> str:
+    value = entry.get(key)
+    if not isinstance(value, str) or not value:
+        raise CaseError(f"{where}: {key} must be a text; got {value!r}")
+    return value
+
+
+def _number(entry: dict, key: str, where: str, *, low: float = -np.inf) -> float:
+    value = entry.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value) or value < low:
+        limit = "" if low == -np.inf else f" of {low:g} or more"
+        raise CaseError(f"{where}: {key} must be a number{limit}; got {value!r}")
+    return float(value)
+
+
+def _numbers(entry: dict, key: str, where: str, length: int | None = None) -> np.ndarray:
+    try:
+        values = np.array(entry.get(key), float)
+    except (TypeError, ValueError):
+        values = np.zeros((0, 0))
+    if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all() or values.size != (length or values.size):
+        many = "numbers" if length is None else f"{length} numbers"
+        raise CaseError(f"{where}: {key} must be a list of {many}; got {entry.get(key)!r}")
+    return values
+
+
+def _profile(entry: dict, key: str):
+    value = entry.get(key)
+    if isinstance(value, dict):
+        return (_numbers(value, "x", key), _numbers(value, "value", key))
+    return _number(entry, key, "[structure]", low=0.0)
+
+
+def _count(entry: dict, key: str) -> int:
+    value = entry.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 200:
+        raise CaseError(f"[structure]: {key} must be a whole number from 1 to 200; got {value!r}")
+    return value
+
+
+# --- rigs
+
+
+def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+    kind = table.get("kind")
+    if kind not in ("beam", "rod"):
+        raise CaseError(f"[structure]: kind is beam, rod or modal; got {kind!r}")
+    common = {
+        "length": _number(table, "length", "[structure]"),
+        "mass_per_length": _profile(table, "mass_per_length"),
+        "left": _text(table, "left", "[structure]"),
+        "right": _text(table, "right", "[structure]"),
+        "damping": ModalDamping(_number(table, "damping_ratio", "[structure]", low=0.0)),
+    }
+    structure: Structure
+    if kind == "beam":
+        structure = Beam(
+            bending_stiffness=_profile(table, "bending_stiffness"),
+            tension=_number(table, "tension", "[structure]") if "tension" in table else 0.0,
+            **common,
+        )
+    else:
+        structure = Bar(axial_stiffness=_profile(table, "axial_stiffness"), **common)
+    modes = structure.modes(_count(table, "modes"), tolerance=1e-9)
+    actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]")) for e in inputs)
+    sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]")) for e in outputs)
+    return Rig(modes, actuators, sensors, structure=structure)
+
+
+def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+    """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
+    if "mass" in table:
+        mass = _number(table, "mass", "[structure]", low=1e-300)
+        stiffness = _number(table, "stiffness", "[structure]", low=0.0)
+        omega = np.array([np.sqrt(stiffness / mass)])
+        damping = np.array([[_number(table, "damping", "[structure]", low=0.0) / mass]])
+        shape = np.array([1.0 / np.sqrt(mass)])
+        values = np.tile(shape, (len(inputs) + len(outputs), 1))
+    else:
+        omega = 2.0 * np.pi * _numbers(table, "natural_frequencies_hz", "[structure]")
+        damping = _numbers(table, "damping_ratios", "[structure]", omega.size)
+        values = np.array([
+            _numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
+            for key, entries in (("[[input]]", inputs), ("[[output]]", outputs)) for e in entries
+        ])
+    names = tuple(e["name"] for e in (*inputs, *outputs))
+    shapes = KnownPlaces(names, values)
+    modes = Modes(omega=omega, damping=damping, shapes=shapes, length=float(max(len(names) - 1, 1)))
+    actuators = tuple(_actuator(e, float(i)) for i, e in enumerate(inputs))
+    sensors = tuple(_sensor(e, float(i + len(inputs))) for i, e in enumerate(outputs))
+    return Rig(modes, actuators, sensors)
+
+
+def _place(entry: dict, length: float, where: str) -> float:
+    at = _number(entry, "at", f"{where} {entry['name']!r}")
+    if not 0 <= at <= length:
+        raise CaseError(f"{where} {entry['name']!r}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
+    return at
+
+
+def _actuator(entry: dict, at: float) -> Actuator:
+    kind = entry.get("kind")
+    if kind not in ("actuator", "hammer"):
+        raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {kind!r}")
+    return Actuator(entry["name"], at, direct=kind == "hammer")
+
+
+def _sensor(entry: dict, at: float) -> Sensor:
+    where = f"[[output]] {entry['name']!r}"
+    quantity = entry.get("quantity")
+    if quantity not in MEASURED:
+        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {quantity!r}")
+    noise = _number(entry, "noise_std", where, low=0.0)
+    if noise == 0:
+        raise CaseError(f"{where}: noise_std must be positive; the diagnosis weighs every residual by it")
+    return Sensor(entry["name"], at, quantity, noise_std=noise)
+
+
+# --- records
+
+
+def _use(entry: dict, path: Path) -> str:
+    if entry.get("use") not in ("fit", "validate"):
+        raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {entry.get('use')!r}")
+    return entry["use"]
+
+
+def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
+    name = entry["name"]
+    where = f"{path}: record {name!r}"
+    sample_time = _number(entry, "sample_time", where)
+    if sample_time <= 0:
+        raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
+    file = (folder / _text(entry, "file", where)).resolve()
+    if not file.is_relative_to(folder.resolve()):
+        raise CaseError(f"{where}: file {entry['file']!r} lies outside the case folder")
+    arrays = _arrays(file, where)
+    names = {part.name for part in (*rig.actuators, *rig.sensors)}
+    missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
+    if missing:
+        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; it holds {', '.join(sorted(arrays))}")
+    if extra:
+        raise CaseError(f"{file}: channel {extra[0]!r} is not named in case.toml; name it there or leave it out")
+    if "t" not in arrays:
+        raise CaseError(f"{file}: the array t of sample instants is missing")
+    n_samples = arrays["t"].size
+    for channel, values in arrays.items():
+        if values.shape != (n_samples,):
+            raise CaseError(f"{file}: channel {channel!r} has shape {values.shape}; t has {n_samples} samples")
+        bad = ~np.isfinite(values)
+        if bad.any():
+            raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
+    steps = np.diff(arrays["t"])
+    if n_samples < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
+        raise CaseError(
+            f"{file}: t must rise by sample_time = {sample_time:g} over at least {LEAST_SAMPLES} samples;"
+            f" it has {n_samples} and steps from {steps.min() if steps.size else np.nan:g} to"
+            f" {steps.max() if steps.size else np.nan:g}"
+        )
+    elastic = rig.modes.omega[rig.modes.omega > 0]
+    if elastic.size and n_samples * sample_time < 2.0 * np.pi / elastic[0]:
+        raise CaseError(
+            f"{file} lasts {n_samples * sample_time:g} s, less than a period of the first mode"
+            f" ({2.0 * np.pi / elastic[0]:g} s); take a longer record"
+        )
+    for sensor in rig.sensors:
+        if np.ptp(arrays[sensor.name]) == 0:
+            raise CaseError(f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?")
+    return Record(
+        sample_time=sample_time,
+        outputs=np.array([arrays[s.name] for s in rig.sensors]),
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
+        inputs=np.array([arrays[a.name] for a in rig.actuators]),
+        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
+        name=name,
+    )
+
+
+def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
+    if not file.is_file():
+        raise CaseError(f"{where}: there is no file {file}")
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            arrays = {}
+            for name in archive.files:
+                values = archive[name]
+                if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
+                    raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
+                arrays[name] = values.astype(float)
+            return arrays
+    except CaseError:
+        raise
+    except (OSError, ValueError, BadZipFile, EOFError, KeyError, AttributeError, MemoryError) as error:
+        raise CaseError(f"{file} cannot be read as an NPZ archive of arrays: {error}") from error
