@@ -1,0 +1,32 @@
+# Everything runs in .venv, made from the project's own files.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: study test test-slow bench figures lint clean
+
+$(BIN)/workbench: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	touch $@
+
+study: $(BIN)/workbench  ## the main job: a beam from measured response to controlled structure
+	$(BIN)/workbench study beam
+
+test: $(BIN)/workbench  ## the default test run
+	$(BIN)/python -m pytest -q
+
+test-slow: $(BIN)/workbench  ## the longer trials
+	$(BIN)/python -m pytest -q -m slow
+
+figures: $(BIN)/workbench  ## every study that makes its own data, with its figures and results
+	for name in $$($(BIN)/workbench study | grep -v 'needs --data' | cut -d' ' -f1); do $(BIN)/workbench study $$name || exit 1; done
+
+bench: $(BIN)/workbench  ## speeds, as ratios
+	$(BIN)/workbench study design_scaling
+
+lint: $(BIN)/workbench  ## style
+	$(BIN)/ruff check workbench studies tests
+
+clean:
+	rm -rf $(VENV) out

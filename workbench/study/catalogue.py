@@ -1,0 +1,96 @@
+"""Studies: scripts of one question each, found by name or path, and run."""
+
+import ast
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.study.outcome import Outcome
+from workbench.study.page import study_page
+
+
+class StudyError(ValueError):
+    """A study that is not there, or lacks what it needs."""
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """A study's script.
+
+    Attributes:
+        path: of the file.
+        name: its stem.
+        question: the first line of its docstring.
+        needs_data: what --data must name, where it must be given.
+    """
+
+    path: Path
+    name: str
+    question: str
+    needs_data: str | None
+
+
+def studies_folder() -> Path:
+    """`studies/` here, or beside the package in a checkout."""
+    here = Path.cwd() / "studies"
+    if here.is_dir():
+        return here
+    beside = Path(__file__).resolve().parents[2] / "studies"
+    if beside.is_dir():
+        return beside
+    raise StudyError("there is no folder studies/ here; run the command in a checkout of the project")
+
+
+def describe(path: Path) -> StudyFile:
+    """Read a study's question without running it."""
+    try:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+    except (SyntaxError, UnicodeDecodeError, OSError) as error:
+        raise StudyError(f"{path} is not a study: {error}") from error
+    if not any(isinstance(node, ast.FunctionDef) and node.name == "study" for node in tree.body):
+        raise StudyError(f"{path} defines no function study(outcome, data)")
+    needs = None
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "NEEDS_DATA":
+            needs = ast.literal_eval(node.value)
+    question = (ast.get_docstring(tree) or "").splitlines()
+    return StudyFile(path, path.stem, question[0] if question else "", needs)
+
+
+def list_studies() -> list[StudyFile]:
+    """All studies, by name."""
+    return [describe(path) for path in sorted(studies_folder().glob("*.py"))]
+
+
+def find_study(name: str) -> StudyFile:
+    """A study by name, or by path.
+
+    Raises:
+        StudyError: naming the studies there are.
+    """
+    path = Path(name)
+    if path.suffix == ".py":
+        if not path.is_file():
+            raise StudyError(f"there is no file {path}")
+        return describe(path)
+    found = {study.name: study for study in list_studies()}
+    if name not in found:
+        raise StudyError(f"no study is called {name!r}; there are {', '.join(found)}")
+    return found[name]
+
+
+def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
+    """Run a study; write its JSON (studies/results) and its page (out); return both paths.
+
+    Raises:
+        StudyError: data that are needed and not given, or not there.
+    """
+    if data is None and study.needs_data:
+        raise StudyError(f"study {study.name} needs --data: {study.needs_data}")
+    if data is not None and not data.exists():
+        raise StudyError(f"--data {data}: there is no such file or folder")
+    spec = importlib.util.spec_from_file_location(f"study_{study.name}", study.path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    module.study(outcome, data)
+    return outcome.write(study.path.parent / "results"), study_page(outcome, root / "out")

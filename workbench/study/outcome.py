@@ -1,0 +1,105 @@
+"""What a study found: lines, tables, checks and figures, kept as it goes and written as JSON and a page."""
+
+import json
+import platform
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+DIGITS = 10
+
+
+@dataclass
+class Outcome:
+    """Collects what a study finds; the only type that is filled in as it goes.
+
+    Attributes:
+        name: of the study.
+        title: the question it answers.
+        figures_folder: where figures are saved.
+        on_say, on_track: told each line, and each iterable to show progress for.
+    """
+
+    name: str
+    title: str = ""
+    figures_folder: Path = Path("figures")
+    on_say: object = None
+    on_track: object = None
+    lines: list[str] = field(default_factory=list)
+    tables: dict = field(default_factory=dict)
+    checks: list[dict] = field(default_factory=list)
+    figures: list[tuple[str, Path, str]] = field(default_factory=list)
+
+    def say(self, text: str) -> None:
+        """A line of what was found."""
+        self.lines.append(text)
+        if self.on_say is not None:
+            self.on_say(text)
+
+    def table(self, name: str, values) -> None:
+        """A table under its name: anything of numbers, texts, lists and dicts."""
+        self.tables[name] = plain(values)
+
+    def check(self, name: str, value: float, limit: float, at_least: bool = False) -> None:
+        """A figure that must hold: at most `limit`, or at least with `at_least`."""
+        holds = bool(value >= limit if at_least else value <= limit)
+        self.checks.append(
+            {"name": name, "value": plain(value), "limit": plain(limit), "holds": holds, "at_least": at_least}
+        )
+
+    def figure(self, name: str, figure: Figure, caption: str) -> None:
+        """Save a figure as figures/STUDY-name.png."""
+        self.figures_folder.mkdir(parents=True, exist_ok=True)
+        path = self.figures_folder / f"{self.name}-{name}.png"
+        figure.savefig(path, metadata={"Software": None})
+        self.figures.append((name, path, caption))
+
+    def track(self, iterable: Iterable, what: str) -> Iterator:
+        """The same iterable, with its progress shown."""
+        return iter(iterable) if self.on_track is None else self.on_track(iterable, what)
+
+    @property
+    def holds(self) -> bool:
+        return all(check["holds"] for check in self.checks)
+
+    def to_json(self) -> dict:
+        """Tables under their names, and `checks`."""
+        return {**self.tables, "checks": self.checks, "found": self.lines}
+
+    def write(self, folder: Path) -> Path:
+        """Write folder/NAME.json."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path = folder / f"{self.name}.json"
+        path.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        return path
+
+
+def plain(value):
+    """Numbers to ten digits, arrays to lists, keys to text: what JSON holds, the same from run to run."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(item) for item in value]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
+    return value
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    names = ("modal-workbench", "numpy", "scipy", "control", "casadi", "numba")
+    found = {"python": platform.python_version()}
+    for name in names:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
