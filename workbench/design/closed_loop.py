@@ -1,0 +1,118 @@
+"""The closed loop of all modes, controlled and residual, propagated exactly."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from workbench.design.law import Law
+from workbench.design.modal_filter import ModalFilter
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes, frozen
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """x' = A x, x = (q, q') of every mode, with the law's forces u = -K x̂ in it.
+
+    Attributes:
+        modes: all of them.
+        law: that closes the loop.
+        matrix: (2n, 2n) A, rad/s.
+        feedback: (n_actuators, 2n) from the state to the actuator forces, sign included.
+    """
+
+    modes: Modes
+    law: Law
+    matrix: np.ndarray
+    feedback: np.ndarray
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Closed-loop poles (2n,), rad/s."""
+        return np.linalg.eigvals(self.matrix)
+
+    @property
+    def stable(self) -> bool:
+        """Whether no pole is to the right of the axis (undamped residual modes sit on it)."""
+        return bool(self.poles.real.max() <= 1e-9 * max(np.abs(self.poles).max(), 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Modal motion and forces over time.
+
+    Attributes:
+        time: (n_times,) s.
+        modal: (2n, n_times) states (q, q').
+        forces: (n_actuators, n_times).
+        modes: whose shapes carry the motion.
+    """
+
+    time: np.ndarray
+    modal: np.ndarray
+    forces: np.ndarray
+    modes: Modes
+
+    def __post_init__(self) -> None:
+        for name in ("time", "modal", "forces"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def displacement(self, x) -> np.ndarray:
+        """w(x, t): (n_points, n_times)."""
+        return self.modes.phi(x) @ self.modal[: self.modes.n_modes]
+
+    @property
+    def energy(self) -> np.ndarray:
+        """Energy of each mode, (n_modes, n_times): ½ (q'² + ω² q²)."""
+        n = self.modes.n_modes
+        return 0.5 * (self.modal[n:] ** 2 + (self.modes.omega[:, None] * self.modal[:n]) ** 2)
+
+
+def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> ClosedLoop:
+    """The loop through exact modal coordinates, or through a modal filter of the controlled modes.
+
+    Args:
+        modes: all modes, controlled and residual.
+        filter_: rows are the controlled modes, in the law's order; rates are read through the same weights.
+    """
+    n = modes.n_modes
+    if filter_ is None:
+        seen = np.zeros((law.n_controlled, n))
+        seen[np.arange(law.n_controlled), list(law.controlled)] = 1.0
+    else:
+        seen = filter_.seen(modes)
+        if seen.shape[0] != law.n_controlled:
+            raise ValueError(f"the filter gives {seen.shape[0]} modes; the law controls {law.n_controlled}")
+    estimate = np.kron(np.eye(2), seen)
+    feedback = -law.gain @ estimate
+    b = input_matrix(modes, law.actuators)
+    open_loop = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]])
+    return ClosedLoop(modes, law, open_loop + np.vstack([np.zeros_like(b), b]) @ feedback, feedback)
+
+
+def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> np.ndarray:
+    """State (2n,) just after an impulse (N s) at x: q_r' = impulse φ_r(x) (5.58)."""
+    return np.r_[np.zeros(modes.n_modes), impulse * modes.phi(at)[0]]
+
+
+def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
+    """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
+
+    Uniform instants share one matrix exponential; others cost one each.
+
+    Raises:
+        ValueError: times that do not increase from zero or later.
+    """
+    time = np.asarray(time, float)
+    if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
+        raise ValueError("times must increase, from zero or later")
+    modal = np.empty((state.size, time.size))
+    modal[:, 0] = expm(loop.matrix * time[0]) @ state
+    steps = np.diff(time)
+    uniform = steps.size > 0 and np.ptp(steps) <= 1e-12 * max(time[-1], 1.0)
+    step = expm(loop.matrix * steps[0]) if uniform else None
+    for k in range(1, time.size):
+        modal[:, k] = (step if uniform else expm(loop.matrix * steps[k - 1])) @ modal[:, k - 1]
+    return Response(time, modal, loop.feedback @ modal, loop.modes)

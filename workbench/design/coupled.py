@@ -1,0 +1,54 @@
+"""Coupled control: one regulator for all controlled modes together, by python-control."""
+
+from collections.abc import Sequence
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.design.law import DesignError, Law, controlled_indices, participation
+from workbench.rig.actuators import Actuator
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes
+
+
+def controlled_plant(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]):
+    """A (2n, 2n) and B (2n, n_actuators) of the controlled modes alone."""
+    index = list(controlled)
+    n = len(index)
+    b = input_matrix(modes, actuators)[index]
+    a = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega[index] ** 2), -modes.damping[np.ix_(index, index)]]]
+    )
+    return a, np.vstack([np.zeros_like(b), b])
+
+
+def coupled_lqr(
+    modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, weight: ArrayLike
+) -> Law:
+    """The regulator that minimises ∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt over the actuator forces F.
+
+    Args:
+        modes, controlled, actuators: as for `imsc`; fewer actuators than modes will do.
+        weight: R, scalar, (n_actuators,) or (n_actuators, n_actuators).
+
+    Raises:
+        DesignError: a weight that is not positive definite, or modes that the actuators cannot stabilise.
+    """
+    index = controlled_indices(modes, controlled)
+    actuators = tuple(actuators)
+    if len(index) <= len(actuators):
+        participation(modes, index, actuators)
+    a, b = controlled_plant(modes, index, actuators)
+    q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
+    r = np.asarray(weight, float)
+    r = r * np.eye(len(actuators)) if r.ndim == 0 else np.diag(r) if r.ndim == 1 else r
+    if r.shape != (len(actuators),) * 2 or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
+        raise DesignError(f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {weight}")
+    try:
+        gain, _, poles = control.lqr(a, b, q, r)
+    except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
+        raise DesignError(f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}") from error
+    if not (np.real(poles) < 0).all():
+        raise DesignError(f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator")
+    return Law(np.asarray(gain), index, actuators, "coupled LQR")

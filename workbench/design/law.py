@@ -1,0 +1,90 @@
+"""A control law on the modal state of the controlled modes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.rig.actuators import Actuator
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes, frozen
+
+SINGULAR = 1e8
+
+
+class DesignError(ValueError):
+    """A design that cannot be: what conflicts, and the way out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """u = -K x, x = (q_1..q_n, q_1'..q_n') of the controlled modes.
+
+    Attributes:
+        gain: (n_actuators, 2 n_controlled) K.
+        controlled: (n_controlled,) zero-based indices of the controlled modes among all modes.
+        actuators: that the law drives.
+        name: for tables and plots.
+    """
+
+    gain: np.ndarray
+    controlled: tuple[int, ...]
+    actuators: tuple[Actuator, ...]
+    name: str = "law"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gain", frozen(self.gain))
+        object.__setattr__(self, "controlled", tuple(int(r) for r in self.controlled))
+        object.__setattr__(self, "actuators", tuple(self.actuators))
+        expected = (len(self.actuators), 2 * len(self.controlled))
+        if self.gain.shape != expected:
+            raise ValueError(f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {self.gain.shape}")
+
+    @property
+    def n_controlled(self) -> int:
+        return len(self.controlled)
+
+
+def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[int, ...]:
+    """Zero-based indices from a count of lowest modes or a list.
+
+    Raises:
+        DesignError: modes that are not there, or named twice.
+    """
+    index = range(controlled) if isinstance(controlled, int) else controlled
+    index = tuple(int(r) for r in index)
+    if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= modes.n_modes:
+        raise DesignError(f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)")
+    return index
+
+
+def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
+    """B of the controlled modes, (n_controlled, n_actuators), checked to be of full row rank.
+
+    Raises:
+        DesignError: more modes than actuators, two actuators at one place, a mode that no actuator moves.
+    """
+    actuators = tuple(actuators)
+    if len(controlled) > len(actuators):
+        raise DesignError(
+            f"{len(controlled)} controlled modes need as many actuators; there are {len(actuators)}:"
+            " control fewer modes or add actuators"
+        )
+    for i, first in enumerate(actuators):
+        for second in actuators[i + 1 :]:
+            if first.kind == second.kind and abs(first.at - second.at) <= 1e-6 * modes.length:
+                raise DesignError(
+                    f"actuators {first.name} and {second.name} both stand at x = {first.at:g}, so B is singular;"
+                    " move one by more than 1e-6 of the length"
+                )
+    b = input_matrix(modes, actuators)[list(controlled)]
+    for row, r in zip(b, controlled, strict=True):
+        if np.abs(row).max() < 1e-9 / np.sqrt(modes.length):
+            raise DesignError(f"no actuator moves mode {r + 1}: all stand at its nodes; move one")
+    condition = np.linalg.cond(b)
+    if condition > SINGULAR:
+        raise DesignError(
+            f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
+            f" {', '.join(f'{a.at:g}' for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
+        )
+    return b

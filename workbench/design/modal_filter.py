@@ -1,0 +1,121 @@
+"""Modal filters: from sensors to modal coordinates, by interpolation between them; weights computed once.
+
+Dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import BSpline, make_interp_spline
+
+from workbench.structure.modes import Modes, frozen
+from workbench.structure.profile import ProfileLike, as_profile
+
+GAUSS_POINTS = 24
+
+
+@dataclass(frozen=True, eq=False)
+class ModalFilter:
+    """Weights that turn readings into modal coordinates; rates go through the same weights.
+
+    Attributes:
+        positions: (n_sensors,) m, increasing.
+        displacement: (n_modes, n_sensors) weights of the displacements (or velocities).
+        slope: (n_modes, n_sensors) weights of the slopes (or angular velocities); no columns where none are read.
+    """
+
+    positions: np.ndarray
+    displacement: np.ndarray
+    slope: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("positions", "displacement", "slope"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> np.ndarray:
+        """Modal coordinates (n_modes, ...) from readings (n_sensors, ...), time last."""
+        modal = self.displacement @ np.asarray(displacement, float)
+        return modal if slope is None or self.slope.size == 0 else modal + self.slope @ np.asarray(slope, float)
+
+    def seen(self, modes: Modes) -> np.ndarray:
+        """What the filter makes of each mode: (n_filtered, n_modes); the identity for a perfect filter.
+
+        Columns beyond the filtered modes are observation spillover.
+        """
+        matrix = self.displacement @ modes.phi(self.positions)
+        return matrix if self.slope.size == 0 else matrix + self.slope @ modes.phi(self.positions, 1)
+
+
+def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileLike) -> ModalFilter:
+    """The filter of displacements and slopes: Hermite cubics between neighbouring sensors (5.50)-(5.53).
+
+    Args:
+        modes: to be filtered, n_modes of them.
+        positions: (n_sensors,) increasing, m; the first and last sensor bound what is integrated.
+        mass_per_length: kg/m.
+
+    Raises:
+        ValueError: fewer than two sensors, or positions that do not increase.
+    """
+    x = _checked(positions, 2)
+    mass = as_profile(mass_per_length)
+    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+    displacement = np.zeros((modes.n_modes, x.size))
+    slope = np.zeros_like(displacement)
+    for i in range(x.size - 1):
+        h = x[i + 1] - x[i]
+        s = 0.5 * (points + 1.0)
+        at = x[i] + h * s
+        density = modes.phi(at) * (mass(at) * weights * 0.5 * h)[:, None]
+        cubics = np.array([1 - 3 * s**2 + 2 * s**3, h * (s - 2 * s**2 + s**3), 3 * s**2 - 2 * s**3, h * (s**3 - s**2)])
+        left, left_slope, right, right_slope = cubics @ density
+        displacement[:, i] += left
+        displacement[:, i + 1] += right
+        slope[:, i] += left_slope
+        slope[:, i + 1] += right_slope
+    return ModalFilter(x, displacement, slope)
+
+
+def displacement_filter(
+    modes: Modes, positions: ArrayLike, mass_per_length: ProfileLike, *, degree: int = 5
+) -> ModalFilter:
+    """The filter of displacements alone: a spline of odd degree through the sensors and the held ends.
+
+    Where a support holds the displacement at an end that carries no sensor, its zero is a reading too.
+
+    Args:
+        degree: of the spline, lowered where there are too few sensors for it.
+
+    Raises:
+        ValueError: fewer than two readings, or positions that do not increase.
+    """
+    x = _checked(positions, 1)
+    held = [at for at, derivative in modes.essential if derivative == 0 and np.abs(x - at).min() > 1e-9 * modes.length]
+    nodes = np.sort(np.r_[x, held])
+    if nodes.size < 2:
+        raise ValueError("a displacement filter needs at least two readings; add a sensor")
+    degree = min(degree, nodes.size - 1)
+    degree -= 1 - degree % 2
+    splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
+    weights = _spline_weights(modes, splines, as_profile(mass_per_length))
+    return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)))
+
+
+def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:
+    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+    breaks = np.unique(np.r_[0.0, splines.t, modes.length])
+    breaks = breaks[(breaks >= 0) & (breaks <= modes.length)]
+    total = 0.0
+    for a, b in zip(breaks[:-1], breaks[1:], strict=True):
+        at = a + 0.5 * (b - a) * (points + 1.0)
+        density = modes.phi(at) * (mass(at) * weights * 0.5 * (b - a))[:, None]
+        total = total + density.T @ splines(at)
+    return total
+
+
+def _checked(positions: ArrayLike, least: int) -> np.ndarray:
+    x = np.asarray(positions, float)
+    if x.ndim != 1 or x.size < least or not (np.diff(x) > 0).all():
+        raise ValueError(f"at least {least} sensor positions, increasing, are needed; got {positions}")
+    return x
