@@ -4,50 +4,64 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import minimize
 
-from workbench.gap.missing_force import ForceFilter, force_filter, log_likelihood, sampled_model, whiten
+from workbench.gap.missing_force import (
+    ForceFilter,
+    SampledModel,
+    force_filter,
+    log_likelihood,
+    sampled_model,
+    smoothed_states,
+    whiten,
+)
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
+
+COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))
+LEVEL_SPREAD = 0.15
+WHITENED = 0.08
+FOLLOWS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class RandomForceFit:
-    """A white force at x with the same strength in every record.
+    """A random force at x with the same strength and colour in every record.
 
     Attributes:
         at, rms: m, N.
         at_std, rms_std: standard deviations.
+        memory, stages: colour of the force; see `force_filter`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
-        chi2_by_record: (n_records,) mean squares of the whitened residual: all near 1 if the model holds.
-        whiteness: (n_records,) largest lag-one correlation of a whitened channel.
+        chi2_by_record: (n_records,) mean squares of the whitened residual.
+        rms_by_record: (n_records,) of the smoothed force, N.
+        follows: largest share of the force that the inputs and the motion of its record account for.
     """
 
     at: float
     rms: float
     at_std: float
     rms_std: float
+    memory: float
+    stages: int
     cost: float
     chi2_by_record: np.ndarray
-    whiteness: np.ndarray
+    rms_by_record: np.ndarray
+    follows: float
 
     @property
     def holds(self) -> bool:
-        """Whether the residual is what a stationary white force at one point leaves: in level, and in colour."""
-        level = np.abs(self.chi2_by_record - 1.0).max() < 0.08
-        return bool(level and self.whiteness.max() < 0.12)
-
-
-def random_filter(rig: Rig, data: FitData, at: float, rms: float) -> ForceFilter:
-    """The steady Kalman filter of the rig's linear part with a white force at x."""
-    model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
-    return force_filter(model, rig.modes.phi(at).T, np.array([rms**2]), 0.0)
+        """Whether the force is the same in every record, whatever the level, and follows nothing that the rig does."""
+        spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
+        whitened = np.abs(self.chi2_by_record - 1.0).max()
+        return bool(spread < LEVEL_SPREAD and whitened < WHITENED and self.follows < FOLLOWS)
 
 
 def fit_random_force(
     rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[float], size: float
 ) -> RandomForceFit:
-    """Maximum likelihood of place and strength, from the best of a grid.
+    """Maximum likelihood of place, strength and colour, from the best of a grid.
 
     Args:
         residuals: (n_outputs, n_samples) a record, in the sensors' units.
@@ -55,52 +69,80 @@ def fit_random_force(
         size: a typical force, N.
     """
     model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
-    residuals = list(residuals)
-    length = rig.modes.length
+    residuals, length = list(residuals), rig.modes.length
+    quick = residuals[:2]
 
-    def at_point(x: float, log_rms: float) -> ForceFilter:
-        return force_filter(model, rig.modes.phi(x).T, np.array([np.exp(2.0 * log_rms)]), 0.0)
+    def filter_at(x: float, log_rms: float, memory: float, stages: int) -> ForceFilter:
+        variance = np.exp(2.0 * log_rms) / _power(memory, stages)
+        return force_filter(model, rig.modes.phi(x * length).T, np.array([variance]), memory, stages)
 
-    def loss(point: np.ndarray) -> float:
-        x = point[0] * length
-        if not 0.0 < x < length:
+    def loss(point: np.ndarray, stages: int, records: list[np.ndarray]) -> float:
+        x, memory = point[0], 1.0 / (1.0 + np.exp(-point[2]))
+        if not 0.0 < x < 1.0 or memory > 0.9995:
             return 1e300
-        value = -2.0 * log_likelihood(at_point(x, point[1]), residuals)
+        value = -2.0 * log_likelihood(filter_at(x, point[1], memory, stages), records)
         return value if np.isfinite(value) else 1e300
 
-    grid = [(x / length, np.log(size * share)) for x in places for share in (1e-3, 1e-2, 1e-1, 1.0)]
-    best = min(grid, key=lambda point: loss(np.array(point)))
-    simplex = np.array([best, (best[0] + 0.02, best[1]), (best[0], best[1] + 0.5)])
-    found = minimize(
-        loss, best, method="Nelder-Mead", options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 80}
-    )
-    x, log_rms = found.x
-    kalman = at_point(x * length, log_rms)
+    grid = [
+        (np.array([x / length, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))]), stages)
+        for x in places
+        for share in (3e-3, 3e-2, 3e-1)
+        for memory, stages in COLOURS
+    ]
+    start, stages = min(grid, key=lambda candidate: loss(*candidate, quick))
+    simplex = np.array([start, start + (0.03, 0, 0), start + (0, 0.5, 0), start + (0, 0, 0.7)])
+    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 160}
+    found = minimize(loss, start, args=(stages, residuals), method="Nelder-Mead", options=options)
+    x, log_rms, logit = found.x
+    memory = float(1.0 / (1.0 + np.exp(-logit)))
+    kalman = filter_at(x, log_rms, memory, stages)
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
-    whitened = [whiten(kalman, r) for r in residuals]
-    deviations = _deviations(loss, found.x)
+    forces = [smoothed_states(kalman, r)[2 * rig.modes.n_modes] for r in residuals]
+    deviations = [_deviation(lambda p: loss(p, stages, residuals), found.x, j, step) for j, step in ((0, 2e-3), (1, 2e-2))]
     return RandomForceFit(
         at=float(x * length),
         rms=float(np.exp(log_rms)),
         at_std=deviations[0] * length,
         rms_std=deviations[1] * float(np.exp(log_rms)),
+        memory=memory,
+        stages=stages,
         cost=float((found.fun - noise_part) / n_values),
-        chi2_by_record=np.array([np.mean(w**2) for w in whitened]),
-        whiteness=np.array([np.abs((w[:, 1:] * w[:, :-1]).mean(axis=1) / (w**2).mean(axis=1)).max() for w in whitened]),
+        chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
+        rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
+        follows=max(_followed(f, r.inputs) for f, r in zip(forces, data.records, strict=True)),
     )
 
 
-def _deviations(loss, point: np.ndarray) -> tuple[float, float]:
+def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceFilter:
+    """The filter of a fitted random force."""
+    variance = found.rms**2 / _power(found.memory, found.stages)
+    return force_filter(model, rig.modes.phi(found.at).T, np.array([variance]), found.memory, found.stages)
+
+
+def _power(memory: float, stages: int) -> float:
+    """Variance of the force per variance of what drives its colour."""
+    a = memory * np.eye(stages) + np.eye(stages, k=1)
+    drive = np.zeros((stages, stages))
+    drive[-1, -1] = 1.0
+    return float(solve_discrete_lyapunov(a, drive)[0, 0])
+
+
+def _followed(force: np.ndarray, inputs: np.ndarray) -> float:
+    """Share of the force that inputs of the last few samples account for, chance taken off."""
+    active = [row for row in inputs if np.any(row)]
+    if not active:
+        return 0.0
+    lags = np.array([np.roll(row, lag) for row in active for lag in (0, 1, 2, 4, 8, 16)]).T[16:]
+    target = force[16:] - force[16:].mean()
+    fitted = lags @ np.linalg.lstsq(lags, target, rcond=None)[0]
+    return float(max(fitted @ fitted / (target @ target) - 3.0 * lags.shape[1] / target.size, 0.0))
+
+
+def _deviation(loss, point: np.ndarray, j: int, step: float) -> float:
     """From the curvature of minus twice the log-likelihood."""
-    out = []
-    centre = loss(point)
-    for j, step in enumerate((2e-3, 2e-2)):
-        ahead, behind = point.copy(), point.copy()
-        ahead[j] += step
-        behind[j] -= step
-        curvature = (loss(ahead) - 2.0 * centre + loss(behind)) / step**2
-        out.append(float(np.sqrt(2.0 / curvature)) if 0 < curvature < 1e300 else 0.0)
-    return out[0], out[1]
-
-
+    ahead, behind = point.copy(), point.copy()
+    ahead[j] += step
+    behind[j] -= step
+    curvature = (loss(ahead) - 2.0 * loss(point) + loss(behind)) / step**2
+    return float(np.sqrt(2.0 / curvature)) if 0 < curvature < 1e300 else 0.0

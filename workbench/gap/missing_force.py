@@ -77,20 +77,22 @@ class ForceFilter:
 
 
 def force_filter(
-    model: SampledModel, patterns: np.ndarray, variances: np.ndarray, memory: float
+    model: SampledModel, patterns: np.ndarray, variances: np.ndarray, memory: float, stages: int = 1
 ) -> ForceFilter:
     """The filter for forces along `patterns` (n_modes, n_forces) with the given process variances.
 
-    memory is the correlation of a force from one sample to the next: 0 for white, near 1 for a random walk.
+    memory is the correlation of a force from one sample to the next: 0 for white, near 1 for a random walk. Several
+    stages in a row make the force smoother, as a band limit does.
     """
     n_state, m = model.transition.shape[0], patterns.shape[1]
-    a = np.zeros((n_state + m, n_state + m))
+    size = n_state + stages * m
+    a = np.zeros((size, size))
     a[:n_state, :n_state] = model.transition
-    a[:n_state, n_state:] = model.growth @ patterns
-    a[n_state:, n_state:] = memory * np.eye(m)
-    h = np.hstack([model.output, model.feedthrough @ patterns])
+    a[:n_state, n_state : n_state + m] = model.growth @ patterns
+    a[n_state:, n_state:] = memory * np.eye(stages * m) + np.eye(stages * m, k=m)
+    h = np.hstack([model.output, model.feedthrough @ patterns, np.zeros((model.output.shape[0], (stages - 1) * m))])
     q = np.zeros_like(a)
-    q[n_state:, n_state:] = np.diag(variances)
+    q[-m:, -m:] = np.diag(variances)
     covariance = steady_covariance(a, h, q, model.noise_variance)
     s = h @ covariance @ h.T + np.diag(model.noise_variance)
     gain = np.linalg.solve(s, h @ covariance @ a.T).T
