@@ -1,0 +1,214 @@
+"""Mass and stiffness along the structure, from modes alone and the mass at a point (Ch. 4).
+
+Modes are orthogonal with respect to the mass and to the stiffness, whatever their scale:
+
+    ∫ m φ_r φ_s dx = a_r² δ_rs,   ∫ k φ_r^(p) φ_s^(p) dx = a_r² ω_r² δ_rs   (4.6), p = 1 for a bar, 2 for a beam.
+
+With m = m_0 + Σ d_j M_j and k = k_0 + Σ e_j K_j these are linear in d, e and a_r². Each a_r² stands in one mass
+relation only, the one with s = r, so these define a_r² and leave the relations r ≠ s to find d. They say nothing of
+the overall size: the mass must be known somewhere, and is held there exactly. All relations then serve to find e.
+
+The relations of the stiffness rest on integration by parts: no force or moment may do work at an end.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.linalg import null_space
+
+from workbench.structure.modes import Modes, frozen
+from workbench.structure.profile import Profile, ProfileLike, as_profile
+
+KNOWN_TOLERANCE = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Basis:
+    """Known functions of x whose sum, with coefficients to be found, is a distribution.
+
+    Attributes:
+        functions: x (n_points,) -> (n_points, n_terms).
+        n_terms: how many.
+        breaks: places where they are not smooth, m.
+    """
+
+    functions: Callable[[np.ndarray], np.ndarray] = field(repr=False)
+    n_terms: int
+    breaks: tuple[float, ...] = ()
+
+    @classmethod
+    def polynomial(cls, n_terms: int) -> "Basis":
+        """1, x, x², ... (4.32)."""
+        return cls(lambda x: np.vander(np.asarray(x, float), n_terms, increasing=True), n_terms)
+
+    @classmethod
+    def splines(cls, n_terms: int, *, length: float, degree: int = 2) -> "Basis":
+        """B-splines on equal intervals: local functions, each zero over most of the structure.
+
+        Raises:
+            ValueError: fewer terms than degree + 1.
+        """
+        if n_terms < degree + 1:
+            raise ValueError(f"B-splines of degree {degree} are at least {degree + 1}; asked for {n_terms}")
+        nodes = np.linspace(0.0, length, n_terms - degree + 1)
+        knots = np.r_[[0.0] * degree, nodes, [length] * degree]
+        return cls(lambda x: BSpline(knots, np.eye(n_terms), degree)(np.clip(x, 0.0, length)), n_terms, tuple(nodes))
+
+
+@dataclass(frozen=True, eq=False)
+class Distribution:
+    """An identified mass or stiffness: a prior estimate (zero if none) plus a series.
+
+    Attributes:
+        coefficients: (n_terms,) d_j or e_j.
+        basis: the functions they multiply.
+        prior: m_0 or k_0.
+        misfit: root mean square of the relations left over, relative to the terms in them; 0 for a perfect fit.
+    """
+
+    coefficients: np.ndarray
+    basis: Basis
+    prior: Profile
+    misfit: float
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Values at x, in the shape of x."""
+        x = np.asarray(x, float)
+        series = self.basis.functions(np.atleast_1d(x)) @ self.coefficients
+        return self.prior(x) + series.reshape(x.shape)
+
+    @property
+    def profile(self) -> Profile:
+        """The same as a `Profile`, to build a structure with."""
+        return Profile(self.__call__, tuple(sorted({*self.basis.breaks, *self.prior.breaks})))
+
+
+@dataclass(frozen=True, eq=False)
+class Distributions:
+    """The mass and stiffness of one structure, and the scale of its modes found with them.
+
+    Attributes:
+        mass: kg/m.
+        stiffness: EA in N, or EI in N m².
+        scales: (n_modes,) a_r = (∫ m φ_r² dx)^½; φ_r / a_r is mass-normalised.
+    """
+
+    mass: Distribution
+    stiffness: Distribution
+    scales: np.ndarray
+
+
+def mass_and_stiffness(
+    modes: Modes,
+    *,
+    kind: str,
+    mass_basis: Basis,
+    stiffness_basis: Basis,
+    known_mass: Sequence[tuple[float, float]],
+    prior_mass: ProfileLike = 0.0,
+    prior_stiffness: ProfileLike = 0.0,
+) -> Distributions:
+    """Series for mass and stiffness from the orthogonality of modes of any scale (4.3-4.24).
+
+    Args:
+        modes: identified or computed; frequencies and shapes are used.
+        kind: "bar" or "beam".
+        mass_basis, stiffness_basis: functions of the series.
+        known_mass: ((x, kg/m), ...), at least one place; held exactly.
+        prior_mass, prior_stiffness: first estimates, kg/m and N (N m²); the series then corrects them.
+
+    Raises:
+        ValueError: no known mass, more terms than relations, known values that the series cannot take.
+    """
+    if kind not in ("bar", "beam"):
+        raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
+    q = modes.n_modes
+    available = (q * (q - 1) // 2 + len(known_mass), q * (q + 1) // 2)
+    for what, basis, most in zip(("mass", "stiffness"), (mass_basis, stiffness_basis), available, strict=True):
+        if basis.n_terms > most:
+            raise ValueError(
+                f"{basis.n_terms} terms of {what} cannot be found from {most} relations of {q} modes;"
+                " use more modes or fewer terms"
+            )
+    prior_mass, prior_stiffness = as_profile(prior_mass), as_profile(prior_stiffness)
+    unit, scale = _unit_mean_square(modes)
+    mass = _mass(unit, mass_basis, prior_mass, known_mass)
+    shapes, weights, x = _sampled(unit, 0, mass.profile.breaks)
+    a_squared = (weights * mass(x)) @ shapes**2
+    if (a_squared <= 0).any():
+        raise ValueError(
+            "the identified mass is negative over so much of the structure that a mode has no positive scale; use"
+            " fewer terms, more sensors, or a prior estimate"
+        )
+    order = 1 if kind == "bar" else 2
+    stiffness = _stiffness(unit, order, a_squared, stiffness_basis, prior_stiffness)
+    return Distributions(mass, stiffness, frozen(np.sqrt(a_squared) / scale))
+
+
+def _mass(modes: Modes, basis: Basis, prior: Profile, known) -> Distribution:
+    if len(known) == 0:
+        raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
+    u, u0 = _relations(modes, 0, basis, prior, np.triu_indices(modes.n_modes, 1))
+    places, values = np.array(known, float).T
+    rows, targets = basis.functions(places), values - prior(places)
+    coefficients = _constrained(u, -u0, rows, targets)
+    return Distribution(frozen(coefficients), basis, prior, _misfit(u @ coefficients + u0, u, coefficients, u0))
+
+
+def _stiffness(modes: Modes, order: int, a_squared: np.ndarray, basis: Basis, prior: Profile) -> Distribution:
+    r, s = np.triu_indices(modes.n_modes)
+    v, v0 = _relations(modes, order, basis, prior, (r, s))
+    targets = np.where(r == s, a_squared[r] * modes.omega[r] ** 2, 0.0)
+    # A relation between high modes is larger by ω_r ω_s, and so is its error; divided by it they weigh alike.
+    weight = 1.0 / np.maximum(modes.omega[r] * modes.omega[s], 1e-12 * modes.omega.max() ** 2)
+    coefficients = np.linalg.lstsq(weight[:, None] * v, weight * (targets - v0), rcond=None)[0]
+    left = weight * (v @ coefficients + v0 - targets)
+    return Distribution(
+        frozen(coefficients), basis, prior, _misfit(left, weight[:, None] * v, coefficients, weight * v0)
+    )
+
+
+def _unit_mean_square(modes: Modes) -> tuple[Modes, np.ndarray]:
+    """The same modes with shapes of mean square 1, so that all relations weigh alike, and the factors applied."""
+    x = (np.arange(2000) + 0.5) / 2000 * modes.length
+    scale = 1.0 / np.sqrt((modes.phi(x) ** 2).mean(axis=0))
+    return replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * scale), scale
+
+
+def _sampled(modes: Modes, derivative: int, breaks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Shapes (n_points, n_modes), weights and places of a Gauss rule that no break interrupts."""
+    points, weights = np.polynomial.legendre.leggauss(12)
+    n_pieces = 16 * (1 + modes.n_modes // 4)
+    nodes = np.unique(np.r_[np.linspace(0.0, modes.length, n_pieces + 1), [b for b in breaks if 0 < b < modes.length]])
+    h = np.diff(nodes)[:, None]
+    x = (nodes[:-1, None] + 0.5 * h * (points + 1.0)).ravel()
+    return modes.phi(x, derivative), (0.5 * h * weights).ravel(), x
+
+
+def _relations(modes: Modes, derivative: int, basis: Basis, prior: Profile, pairs):
+    """U_rsj (n_relations, n_terms) of (4.8) and U_rs0 (n_relations,) of (4.23) for pairs of modes (r, s)."""
+    shapes, weights, x = _sampled(modes, derivative, (*basis.breaks, *prior.breaks))
+    products = weights[:, None] * shapes[:, pairs[0]] * shapes[:, pairs[1]]
+    return products.T @ basis.functions(x), products.T @ prior(x)
+
+
+def _constrained(matrix, target, rows, values) -> np.ndarray:
+    """Least squares of matrix @ c = target with rows @ c = values held exactly."""
+    particular = np.linalg.lstsq(rows, values, rcond=None)[0]
+    left = np.abs(rows @ particular - values).max()
+    if left > KNOWN_TOLERANCE * max(np.abs(values).max(), 1e-300):
+        raise ValueError(
+            f"the series with {rows.shape[1]} terms cannot take the {rows.shape[0]} known masses (off by {left:.3g});"
+            " use more terms or fewer known places"
+        )
+    free = null_space(rows)
+    if free.shape[1] == 0:
+        return particular
+    return particular + free @ np.linalg.lstsq(matrix @ free, target - matrix @ particular, rcond=None)[0]
+
+
+def _misfit(left, matrix, coefficients, offset) -> float:
+    terms = np.sqrt(np.mean((np.abs(matrix) @ np.abs(coefficients) + np.abs(offset)) ** 2)) if left.size else 0.0
+    return float(np.sqrt(np.mean(left**2)) / terms) if terms else 0.0

@@ -1,0 +1,77 @@
+"""Free decay written out from its modes: what a model says a ring-down should look like."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from workbench.records.record import Channel, Record
+from workbench.structure.modes import Modes, SampledModes
+
+TIME_DERIVATIVE = {"displacement": 0, "slope": 0, "velocity": 1, "angular velocity": 1, "acceleration": 2}
+
+
+def time_derivatives(channels: Sequence[Channel]) -> np.ndarray:
+    """Order of the time derivative each channel measures, (n_channels,); 0 where its quantity is not a motion."""
+    return np.array([TIME_DERIVATIVE.get(channel.quantity, 0) for channel in channels])
+
+
+def struck(modes: Modes, *, at: float, positions: Sequence[float], impulse: float = 1.0) -> SampledModes:
+    """The free decay after a blow, as sampled modes whose shapes carry amplitude and phase.
+
+    A blow J at x0 leaves q_r'(0) = J φ_r(x0), so w(x, t) = Re Σ_r s_r(x) e^{λ_r t} with
+    s_r(x) = -i J φ_r(x) φ_r(x0) / ω_dr.
+
+    Args:
+        modes: with proportional damping below critical.
+        at: x0, m.
+        positions: (n_outputs,) places of the sensors, m.
+        impulse: J, N s.
+
+    Raises:
+        ValueError: rigid-body, overdamped or coupled modes, which have no such form.
+    """
+    if not modes.proportional or (modes.omega == 0).any() or (modes.zeta >= 1).any():
+        raise ValueError(
+            "a struck structure decays in separate modes only if each is elastic and underdamped;"
+            " select such modes, or simulate the rig"
+        )
+    omega_d = modes.omega * np.sqrt(1.0 - modes.zeta**2)
+    shapes = -1j * impulse * modes.phi(positions) * modes.phi(at)[0] / omega_d
+    return SampledModes(modes.omega, modes.zeta, shapes, positions)
+
+
+def free_decay(
+    modes: SampledModes,
+    *,
+    sample_time: float,
+    n_samples: int,
+    quantity: str = "displacement",
+    start_time: float = 0.0,
+    noise_std: float = 0.0,
+    seed: int | np.random.Generator = 0,
+) -> Record:
+    """The record y_j(t) = d^k/dt^k Re Σ_r s_jr e^{λ_r t}, k = 0, 1, 2 for displacement, velocity, acceleration.
+
+    Args:
+        modes: shapes s_jr (n_outputs, n_modes) carry the amplitude and phase at t = 0.
+        sample_time: s.
+        n_samples: number of samples.
+        quantity: of every sensor.
+        start_time: time of the first sample, s.
+        noise_std: standard deviation of white noise added, in the unit of the quantity.
+        seed: of that noise.
+
+    Raises:
+        ValueError: a quantity that is not a motion of a point.
+    """
+    if quantity not in TIME_DERIVATIVE:
+        raise ValueError(f"a free decay is of {', '.join(TIME_DERIVATIVE)}; got {quantity!r}")
+    time = start_time + sample_time * np.arange(n_samples)
+    amplitudes = modes.shapes * modes.poles ** TIME_DERIVATIVE[quantity]
+    outputs = (amplitudes @ np.exp(modes.poles[:, None] * time)).real
+    if noise_std:
+        outputs = outputs + noise_std * np.random.default_rng(seed).standard_normal(outputs.shape)
+    channels = tuple(
+        Channel(f"y{j + 1}", quantity, at=None if np.isnan(x) else float(x)) for j, x in enumerate(modes.positions)
+    )
+    return Record(sample_time, outputs, channels, start_time=start_time, name="free decay")
