@@ -83,8 +83,7 @@ def study(
     with _progress() as progress:
 
         def track(iterable, what):
-            items = list(iterable)
-            yield from progress.track(items, description=what, total=len(items))
+            yield from progress.track(iterable, description=what, total=len(iterable))
 
         outcome = Outcome(
             name=found.name,

@@ -25,9 +25,10 @@ SETTINGS = {
 }
 
 
+matplotlib.rcParams.update(SETTINGS)
+
+
 def new_figure(rows: int = 1, cols: int = 1, *, width: float = 9.0, height: float = 4.5, **options):
     """A figure in the house style and its axes, as `Figure.subplots` gives them."""
-    with matplotlib.rc_context(SETTINGS):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        axes = figure.subplots(rows, cols, **options)
-    return figure, axes
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(rows, cols, **options)

@@ -20,6 +20,7 @@ def diagnose(
     catalogue: tuple[Kind, ...] = CATALOGUE,
     name: str = "case",
     report: Callable[[str, float], None] = lambda text, share: None,
+    workers: int = 2,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -32,6 +33,7 @@ def diagnose(
         catalogue: kinds of effects to try.
         name: of the case.
         report: told (what, share done) as the search proceeds.
+        workers: threads.
 
     Raises:
         ValueError: records that do not fit the rig, or sensors without noise_std.
@@ -40,7 +42,7 @@ def diagnose(
         _check(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
-    found = attribute(rig, records, catalogue=catalogue, report=report)
+    found = attribute(rig, records, catalogue=catalogue, report=report, workers=workers)
     corrected = apply_all(rig, found.best.effects)
     effects = found.best.effects if found.outcome in ("none", "explained") else ()
     return Verdict(

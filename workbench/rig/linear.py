@@ -145,7 +145,10 @@ def _growth(poles: np.ndarray, span: float) -> np.ndarray:
 
 def _faded_growth(poles: np.ndarray, rate: float, span: float) -> np.ndarray:
     """∫_0^span e^{λ (span - t)} e^{-rate t} dt."""
-    return np.exp(-rate * span) * np.expm1((poles + rate) * span) / (poles + rate)
+    total = (poles + rate) * span
+    near = np.abs(total) < 1.0
+    difference = np.exp(poles * span) - np.exp(-rate * span)
+    return np.where(near, np.exp(-rate * span) * np.expm1(np.where(near, total, 0.0)), difference) / (poles + rate)
 
 
 def _shifted(values: np.ndarray, samples: int) -> np.ndarray:

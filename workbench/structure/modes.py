@@ -155,6 +155,11 @@ class SampledModes:
         """Upper-half-plane poles (n_modes,): -ζω + iω√(1-ζ²), rad/s."""
         return -self.zeta * self.omega + 1j * self.omega * np.sqrt(np.maximum(1.0 - self.zeta**2, 0.0))
 
+    def select(self, modes: Sequence[int] | slice) -> "SampledModes":
+        """Only some of the modes, by zero-based index."""
+        index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
+        return SampledModes(self.omega[index], self.zeta[index], self.shapes[:, index], self.positions)
+
     @property
     def phase_collinearity(self) -> np.ndarray:
         """Modal phase collinearity MPC (n_modes,): 1 for a real shape, towards 0 for a travelling one.

@@ -1,0 +1,42 @@
+"""Where should four actuators stand, and what does less spillover cost?"""
+
+import numpy as np
+
+from workbench.design.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.draw.design import plot_effort_front
+from workbench.structure.member import Beam
+
+SPACING = 0.5
+
+
+def study(outcome, data=None):
+    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    modes = beam.modes(9)
+    task = placement_task(modes, 4, impulse_at=6.3, weight=20.0)
+    nodes = task.placed(nodes_of_mode(modes, 4), "nodes of mode 5")
+
+    front = [
+        place(task, effort_limit=factor * nodes.effort, spacing=SPACING)
+        for factor in outcome.track((1.0001, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0), "effort limits")
+    ]
+    best = place(task, effort_limit=1.5 * nodes.effort, spacing=SPACING)
+    on_grid, tried = scan(task, effort_limit=1.5 * nodes.effort, spacing=SPACING, n_places=50)
+
+    work, effort = symbolic_work(task)(best.positions)
+    outcome.table("front", [
+        {"effort": p.effort, "W_R": p.residual_work, "positions": p.positions, "condition": p.condition} for p in front
+    ])
+    outcome.table("nodes_of_mode_5", {"effort": nodes.effort, "W_R": nodes.residual_work, "positions": nodes.positions})
+    outcome.table("best", {"effort": best.effort, "W_R": best.residual_work, "positions": best.positions, "tried": tried})
+    outcome.check("CasADi's W_R against the closed form, relative", abs(float(work) / best.residual_work - 1.0), 1e-8)
+    outcome.check("CasADi's effort against the closed form, relative", abs(float(effort) / best.effort - 1.0), 1e-8)
+    outcome.check("W_R of the optimum over the best of a full grid", best.residual_work / on_grid.residual_work, 1.0)
+    outcome.check("nodes of mode 5 spill nothing into mode 5", nodes.by_mode[0], 1e-20)
+    outcome.say(
+        f"the nodes of mode 5 leave W_R = {nodes.residual_work:.3e}; half as much effort again brings"
+        f" {best.residual_work:.3e} at x = {', '.join(f'{x:.2f}' for x in best.positions)}"
+    )
+    outcome.say(f"none of {tried} placements on a grid does better under the same limits")
+    outcome.figure("front", plot_effort_front(front, {"nodes of mode 5": nodes, "effort limit 1.5 times theirs": best}),
+                   "Least spillover at each effort, and where the actuators then stand.")
+    assert np.all(np.diff(best.positions) >= SPACING - 1e-6)

@@ -1,0 +1,107 @@
+"""Figures of control design: motion, work by mode, placements."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from workbench.design.closed_loop import Response
+from workbench.design.placement import Placement
+from workbench.design.spillover import Spillover
+from workbench.draw.style import COLOURS, GREY, new_figure
+
+
+def plot_displacements(
+    responses: dict[str, Response], positions: dict[str, Sequence[float]], times: Sequence[float], x: np.ndarray
+) -> Figure:
+    """The structure's displacement at several times, one column a design, one row a time; actuators marked."""
+    figure, axes = new_figure(
+        len(times), len(responses), width=10, height=1.55 * len(times), sharex=True, sharey=True, squeeze=False
+    )
+    for column, (name, response) in enumerate(responses.items()):
+        motion = response.displacement(x)
+        for row, time in enumerate(times):
+            ax = axes[row, column]
+            k = int(np.argmin(np.abs(response.time - time)))
+            ax.plot(x, motion[:, k], color=COLOURS[0])
+            ax.axhline(0.0, color=GREY, linewidth=0.8)
+            ax.plot(positions[name], np.zeros(len(positions[name])), "x", color=COLOURS[1], markersize=7, mew=2)
+            if column == 0:
+                ax.set_ylabel(f"t = {time:g} s")
+        axes[0, column].set_title(f"actuators at {name}")
+        axes[-1, column].set_xlabel("x [m]")
+    return figure
+
+
+def plot_work(spillovers: dict[str, Spillover]) -> Figure:
+    """Work that spills into each residual mode, one group of bars a design, on a logarithmic scale."""
+    figure, ax = new_figure(1, 1, width=9, height=4)
+    first = next(iter(spillovers.values()))
+    modes = np.array(first.residual) + 1
+    width = 0.8 / len(spillovers)
+    for i, (name, work) in enumerate(spillovers.items()):
+        values = np.maximum(work.residual_work, 1e-12)
+        ax.bar(modes + (i - 0.5 * (len(spillovers) - 1)) * width, values, width, label=f"{name}: W_R = {work.residual_total:.3g}")
+    ax.set(yscale="log", xlabel="residual mode", ylabel="work spilled into the mode, W_r", xticks=modes, ylim=(1e-6, None))
+    ax.set_title("control spillover: the energy that control leaves in the modes it does not control")
+    ax.legend()
+    return figure
+
+
+def plot_modal_coordinates(responses: dict[str, Response], modes: Sequence[int]) -> Figure:
+    """Modal coordinates over time, one panel a mode, one line a design."""
+    figure, axes = new_figure(len(modes), 1, width=10, height=1.7 * len(modes), sharex=True, squeeze=False)
+    styles = ("-", "--", ":", "-.")
+    for ax, r in zip(axes[:, 0], modes, strict=True):
+        for (name, response), style in zip(responses.items(), styles, strict=False):
+            ax.plot(response.time, response.modal[r], style, label=name)
+        ax.set_ylabel(f"q{r + 1}")
+    axes[0, 0].legend(ncols=len(responses))
+    axes[-1, 0].set_xlabel("time [s]")
+    return figure
+
+
+def plot_effort_front(placements: Sequence[Placement], marked: dict[str, Placement]) -> Figure:
+    """Spillover against effort along the front of placements, with named ones marked; the places below."""
+    figure, axes = new_figure(2, 1, width=9, height=7, height_ratios=[3, 2])
+    effort = [p.effort for p in placements]
+    work = [p.residual_work for p in placements]
+    axes[0].plot(effort, work, "o-", color=COLOURS[0], label="least W_R at each effort")
+    for (name, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
+        axes[0].plot(p.effort, p.residual_work, "s", color=colour, markersize=9, label=name)
+    axes[0].set(xscale="log", yscale="log", xlabel="effort ∫ FᵀF dt [N² s]", ylabel="spillover work W_R")
+    axes[0].set_title("what less spillover costs")
+    axes[0].legend()
+    for p in placements:
+        axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "o", color=COLOURS[0], markersize=4)
+    for (_, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
+        axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "s", color=colour)
+    axes[1].set(yscale="log", xlabel="places of the actuators, x [m]", ylabel="effort")
+    return figure
+
+
+def plot_filter_errors(counts: Sequence[int], errors: np.ndarray) -> Figure:
+    """Error of each modal coordinate against the number of sensors."""
+    figure, ax = new_figure(1, 1, width=9, height=4)
+    for r in range(errors.shape[1]):
+        ax.semilogy(counts, np.maximum(errors[:, r], 1e-7), "o-", label=f"mode {r + 1}", color=COLOURS[r % 7])
+    ax.set(xlabel="number of sensors (displacement and slope each)", ylabel="error of the modal coordinate, |û - u|")
+    ax.set_title("modal filters: how many sensors it takes")
+    ax.legend(ncols=2)
+    return figure
+
+
+def plot_comparison(rows: Sequence[dict]) -> Figure:
+    """Cost, effort and spillover of several designs as ratios to the first."""
+    figure, ax = new_figure(1, 1, width=9, height=4)
+    keys = ("cost", "effort", "W_R")
+    width = 0.8 / len(rows)
+    for i, row in enumerate(rows):
+        values = [row[key] / rows[0][key] for key in keys]
+        ax.bar(np.arange(len(keys)) + (i - 0.5 * (len(rows) - 1)) * width, values, width, label=row["law"])
+    ax.set_xticks(np.arange(len(keys)), ["quadratic cost", "actuator effort", "spillover W_R"])
+    ax.axhline(1.0, color=GREY, linewidth=0.8)
+    ax.set_ylabel(f"ratio to {rows[0]['law']}")
+    ax.set_title("two ways to control the same modes with the same actuators")
+    ax.legend()
+    return figure

@@ -1,0 +1,122 @@
+"""Figures of a diagnosis."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.gap.verdict import Verdict
+from workbench.records.record import Record
+from workbench.rig.simulate import simulate
+
+
+def plot_responses(verdict: Verdict, records: Sequence[Record]) -> Figure:
+    """Measured, nominal and corrected, for the sensor and the stretch of each record where they differ most."""
+    records = list(records)[-3:]
+    figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
+    for ax, record in zip(axes[:, 0], records, strict=True):
+        nominal, corrected = (
+            simulate(rig, record.inputs, sample_time=record.sample_time).outputs
+            for rig in (verdict.nominal, verdict.corrected)
+        )
+        spread = ((record.outputs - nominal) / record.outputs.std(axis=1, keepdims=True)) ** 2
+        j = int(spread.mean(axis=1).argmax())
+        width = min(record.n_samples, 300)
+        smooth = np.convolve(spread[j], np.ones(width), mode="valid")
+        piece = slice(int(smooth.argmax()), int(smooth.argmax()) + width)
+        channel = record.output_channels[j]
+        time = record.time[piece]
+        ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=2.6, alpha=0.35)
+        ax.plot(time, nominal[j, piece], color=COLOURS[1], label="nominal", linestyle="--")
+        ax.plot(time, corrected[j, piece], color=COLOURS[0], label="corrected")
+        ax.set_title(f"record {record.name}, sensor {channel.name}")
+        ax.set_ylabel(f"{channel.quantity} [{channel.unit}]" if channel.unit else channel.quantity)
+        ax.legend(loc="upper right", ncols=3)
+    axes[-1, 0].set_xlabel("time [s]")
+    return figure
+
+
+def plot_where(verdict: Verdict) -> Figure:
+    """The gap taken apart: by mode, by sensor, by record and level, and the likelihood of a place."""
+    where = verdict.where
+    figure, axes = new_figure(2, 2, width=10, height=6.4)
+    modes = np.arange(1, where.mode_shares.size + 1)
+    axes[0, 0].bar(modes, 100 * where.mode_shares, color=COLOURS[0])
+    axes[0, 0].set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
+    names = [s.name for s in verdict.nominal.sensors]
+    axes[0, 1].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
+    axes[0, 1].set(title="by sensor", ylabel="share of the gap [%]")
+    order = np.argsort(where.input_levels)
+    axes[1, 0].plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
+    for i in order:
+        axes[1, 0].annotate(f" {where.record_names[i]}", (where.input_levels[i], where.record_gaps[i]), fontsize=8)
+    axes[1, 0].set(title="by record and level", xlabel="input level [N rms]", ylabel="gap", xscale="log", yscale="log")
+    evidence = verdict.attribution.evidence
+    profile = evidence.profile - evidence.profile.max()
+    axes[1, 1].plot(evidence.places, profile, color=COLOURS[3])
+    axes[1, 1].axvline(where.at, color=GREY, linestyle=":")
+    for effect in verdict.effects:
+        if "at" in effect.values and effect.kind.path in ("structure", "environment"):
+            axes[1, 1].axvline(effect.values["at"], color=COLOURS[0])
+    low = max(profile.min(), -50.0 * max(1.0, abs(profile[np.argsort(profile)[-3]])))
+    axes[1, 1].set(
+        title="where a missing force would stand", xlabel="x [m]", ylabel="log-likelihood, less its peak", ylim=(low, None)
+    )
+    return figure
+
+
+def plot_missing_force(verdict: Verdict) -> Figure:
+    """The missing force at its likeliest place against displacement and velocity."""
+    place = verdict.attribution.evidence.at_peaks[0]
+    chosen = [e for e in verdict.effects if "at" in e.values and e.kind.path == "structure"]
+    if chosen:
+        place = verdict.attribution.evidence.place(chosen[0].values["at"])
+    figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
+    step = max(1, place.force.size // 4000)
+    for ax, series, name in ((axes[0], place.displacement, "displacement [m]"), (axes[1], place.velocity, "velocity [m/s]")):
+        ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
+        ax.set_xlabel(f"{name} at x = {place.at:.3g}")
+        law = _law(chosen, series, name)
+        if law is not None:
+            ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")
+            ax.legend()
+    axes[0].set_ylabel("missing force [N]")
+    axes[0].set_title("the force that the nominal model lacks, no law assumed")
+    return figure
+
+
+def _law(chosen, series: np.ndarray, name: str):
+    """The fitted law as a line over one variable, where it depends on that variable alone."""
+    if not chosen:
+        return None
+    effect, v = chosen[0], chosen[0].values
+    grid = np.linspace(series.min(), series.max(), 400)
+    of_displacement = {
+        "ground_spring": lambda w: -v["stiffness"] * w,
+        "cubic_spring": lambda w: -v["stiffness"] * w**3,
+        "clearance": lambda w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0),
+        "one_sided_stop": lambda w: -v["stiffness"] * np.maximum(w - v["gap"], 0.0),
+    }
+    of_velocity = {
+        "point_damper": lambda u: -v["coefficient"] * u,
+        "coulomb_friction": lambda u: -v["force"] * np.tanh(u / v["smoothing_speed"]),
+    }
+    laws = of_velocity if name.startswith("velocity") else of_displacement
+    return (grid, laws[effect.kind.name](grid)) if effect.kind.name in laws else None
+
+
+def plot_rivals(verdict: Verdict) -> Figure:
+    """What each effect alone would leave of the gap."""
+    singles = verdict.attribution.singles[:8]
+    figure, ax = new_figure(1, 1, width=10, height=0.42 * len(singles) + 1.6)
+    labels = [" + ".join(fit.labels) for fit in singles]
+    costs = [max(fit.cost, 1e-3) for fit in singles]
+    chosen = {effect.label for effect in verdict.effects} if verdict.outcome == "explained" else set()
+    colours = [COLOURS[0] if set(fit.labels) <= chosen and chosen else GREY for fit in singles]
+    ax.barh(labels[::-1], costs[::-1], color=colours[::-1])
+    ax.axvline(1.0, color=COLOURS[2], label="noise floor")
+    ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
+    ax.set(xscale="log", xlabel="mean square residual, in units of the noise", title="each effect alone, fitted as well as it can be")
+    ax.legend(loc="lower right")
+    return figure
