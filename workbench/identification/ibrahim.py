@@ -77,7 +77,7 @@ def stacked_delays(
         ValueError: too few samples, records that differ in sensors or rate.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    _check_alike(records)
+    check_alike(records)
     basis = signal_subspace(records, 2 * n_modes, delays=delays)
     mu, vectors = shift_eigenpairs(basis, records[0].n_outputs)
     return _as_modes(mu, vectors, records[0], branch)
@@ -140,7 +140,8 @@ def _as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int =
     )
 
 
-def _check_alike(records: Sequence[Record]) -> None:
+def check_alike(records: Sequence[Record]) -> None:
+    """Refuse no records, or records that differ in outputs or sample time."""
     if not records:
         raise ValueError("identification needs at least one record")
     first = records[0]

@@ -93,8 +93,8 @@ def choose_terms(
 ) -> Identified:
     """Identify with each pair of numbers of terms and keep the one whose own modes agree best with the measured.
 
-    A pair with more terms must halve the worst frequency error of every smaller one to be preferred: unneeded terms
-    only fit the noise.
+    A pair with more terms must halve the worst frequency error of every smaller one to be preferred, and none is
+    sought beyond the error of the measured frequencies: unneeded terms only fit the noise.
 
     Args:
         measured: as `mass_and_stiffness`.
@@ -109,6 +109,7 @@ def choose_terms(
     """
     ends = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
     best, tried, reason = None, [], "no number of terms was given"
+    enough = _frequency_error(measured)
     pairs = sorted(((a, b) for a in terms for b in terms), key=lambda pair: (sum(pair), pair))
     for n_mass, n_stiffness in pairs:
         try:
@@ -126,8 +127,17 @@ def choose_terms(
         check = self_check(found, measured, **ends)
         reason = check.refusal or reason
         tried.append((n_mass, n_stiffness, check.worst))
-        if np.isfinite(check.worst) and (best is None or check.worst < 0.5 * best[1].worst):
+        if np.isfinite(check.worst) and (
+            best is None or (enough < best[1].worst and check.worst < 0.5 * best[1].worst)
+        ):
             best = (found, check, (n_mass, n_stiffness))
     if best is None:
         raise ValueError(f"no number of terms gives a structure: {reason}")
     return Identified(best[0], best[2], best[1], tuple(tried))
+
+
+def _frequency_error(measured: Modes) -> float:
+    """Largest relative standard error of the measured frequencies; round-off where they were computed."""
+    if measured.covariance is None:
+        return 1e-9
+    return float((np.sqrt(np.diag(measured.covariance)[: measured.n_modes]) / measured.omega).max())

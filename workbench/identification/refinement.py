@@ -1,0 +1,308 @@
+"""Maximum likelihood refinement: modes as accurate as the record allows, with standard errors that are true.
+
+In white noise the most likely modes minimise the squares of what y_j(t) = Re Σ_r a_jr e^{λ_r t} leaves of the record.
+For given poles the amplitudes are linear and drop out (variable projection, Golub & Pereyra 1973), so only the
+2 n_modes numbers σ_r, ω_dr of λ = -σ + iω_d are searched, however many sensors there are. With columns
+Φ = [e^{-σt} cos ω_d t, e^{-σt} sin ω_d t] all derivatives of Φ lie in the span of tΦ, so one matrix
+
+    G = (tΦ)^T (I - Φ Φ^+) (tΦ)                                       (2 n_modes, 2 n_modes)
+
+gives the whole Gauss-Newton matrix H, and s² H^-1 is at the same time the Cramér-Rao bound of the poles.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from scipy.special import ndtri
+
+from workbench.identification.ibrahim import check_alike, normalised_shapes
+from workbench.identification.synthesis import time_derivatives
+from workbench.records.record import Record
+from workbench.structure.modes import SampledModes, frozen
+
+MOST_STEPS = 60
+# A step is small once it moves the estimate by less than a thousandth of its standard error.
+SETTLED = 1e-6
+ROUND_OFF = 1e-13
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """Most likely modes of a record, and how far each figure is to be trusted.
+
+    Attributes:
+        modes: refined; shapes of displacement, largest entry 1.
+        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
+        amplitudes: one (n_outputs, n_modes) complex a record: y = Re Σ a_r e^{λ_r (t - t_first)}, in its own units.
+        shape_covariance: (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to each one's
+            largest entry (which is 1 and so without error).
+        noise_std: (n_outputs,) of what the modes leave over, in the unit of each output.
+        converged: whether the search ended because the step was small.
+        steps: taken.
+    """
+
+    modes: SampledModes
+    covariance: np.ndarray
+    amplitudes: tuple[np.ndarray, ...] = field(repr=False)
+    shape_covariance: np.ndarray = field(repr=False)
+    noise_std: np.ndarray
+    converged: bool
+    steps: int
+
+    @property
+    def omega_std(self) -> np.ndarray:
+        """Standard error of each frequency (n_modes,), rad/s."""
+        return np.sqrt(np.diag(self.covariance)[: self.modes.n_modes])
+
+    @property
+    def zeta_std(self) -> np.ndarray:
+        """Standard error of each damping ratio (n_modes,)."""
+        return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
+
+    @property
+    def shape_std(self) -> np.ndarray:
+        """Standard error of the real part of each shape (n_outputs, n_modes)."""
+        return np.sqrt(np.einsum("rjj->jr", self.shape_covariance))
+
+    def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+        """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row."""
+        width = float(ndtri(0.5 * (1.0 + level)))
+        return tuple(
+            np.stack([value - width * std, value + width * std])
+            for value, std in ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
+        )
+
+
+def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: bool = False) -> Refined:
+    """The most likely modes near `start`, with the Cramér-Rao covariance of frequencies, damping and shapes.
+
+    Sensors are weighted by the noise that each turns out to have. Several records share poles, not amplitudes.
+
+    Args:
+        records: free decay in white noise, of the same sensors at one rate.
+        start: from `stacked_delays`; its shapes are not used.
+        offset: whether each output may also hold a constant.
+
+    Returns:
+        `Refined`; look at `converged`: a start with modes that the record does not hold may not settle.
+
+    Raises:
+        ValueError: fewer samples than unknowns; no modes to start from.
+    """
+    records = [records] if isinstance(records, Record) else list(records)
+    check_alike(records)
+    if start.n_modes == 0:
+        raise ValueError("there is no mode to refine; identify with more modes or a longer record first")
+    unknowns = 2 * start.n_modes + int(offset)
+    shortest = min(r.n_samples for r in records)
+    if shortest <= unknowns + 1:
+        raise ValueError(
+            f"{start.n_modes} modes are {unknowns} unknowns a sensor; a record has {shortest} samples: measure longer"
+        )
+    poles, weights = start.poles, np.ones(records[0].n_outputs)
+    steps = 0
+    for _ in range(2):
+        # Noise differs from sensor to sensor: it is measured at the first optimum and the sensors reweighted.
+        poles, fit, converged, taken = _search(records, poles, weights, offset)
+        steps += taken
+        noise = _noise(records, fit)
+        weights = 1.0 / noise
+    return _report(records, poles, fit, noise, {"converged": bool(converged), "steps": steps})
+
+
+def amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: bool = False) -> SampledModes:
+    """The same modes with shapes of displacement that carry amplitude and phase at the time `at`, by least squares.
+
+    Args:
+        record: free decay.
+        modes: poles are used.
+        at: s on the record's clock; for a blow, the time it was struck.
+        offset: whether each output may also hold a constant.
+
+    Returns:
+        `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r (t - at)}, k the derivative each sensor measures.
+    """
+    fit = _project(record, modes.poles, offset)
+    lag = np.exp(modes.poles * (at - record.start_time))
+    derivative = time_derivatives(record.output_channels)
+    return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
+
+
+@dataclass(frozen=True, eq=False)
+class _Projection:
+    """A record projected on the columns Φ of given poles."""
+
+    residual: np.ndarray  # (n_samples, n_outputs)
+    coefficients: np.ndarray  # (n_columns, n_outputs)
+    gram: np.ndarray  # G
+    slopes: np.ndarray  # (tΦ)^T residual, (2 n_modes, n_outputs)
+    spread: np.ndarray  # (Φ^T Φ)^-1
+    tilt: np.ndarray  # Φ^+ tΦ, (n_columns, 2 n_modes)
+
+    @property
+    def complex_amplitudes(self) -> np.ndarray:
+        """a_jr = α - iβ of α cos + β sin, (n_outputs, n_modes)."""
+        n = self.gram.shape[0] // 2
+        return (self.coefficients[:n] - 1j * self.coefficients[n : 2 * n]).T
+
+
+def _project(record: Record, poles: np.ndarray, offset: bool) -> _Projection:
+    tau = record.sample_time * np.arange(record.n_samples)
+    # Complex powers cost one exponential a sample and mode; both real columns come from it.
+    decay = np.exp(np.outer(tau, poles))
+    phi = np.hstack([decay.real, decay.imag])
+    t_phi = tau[:, None] * phi
+    columns = np.hstack([phi, np.ones((tau.size, 1))]) if offset else phi
+    q, r = qr(columns, mode="economic", check_finite=False)
+    y = record.outputs.T
+    qy = q.T @ y
+    residual = y - q @ qy
+    q_t = q.T @ t_phi
+    rest = t_phi - q @ q_t
+    inverse = solve_triangular(r, np.eye(r.shape[0]))
+    return _Projection(residual, inverse @ qy, rest.T @ rest, t_phi.T @ residual, inverse @ inverse.T, inverse @ q_t)
+
+
+def _directions(fit: _Projection) -> np.ndarray:
+    """How each pole parameter moves the model within tΦ: (2 n_modes parameters, 2 n_modes, n_outputs).
+
+    For σ_r: -(α, β); for ω_dr: (β, -α); on the two columns of mode r only.
+    """
+    n = fit.gram.shape[0] // 2
+    alpha, beta = fit.coefficients[:n], fit.coefficients[n : 2 * n]
+    moves = np.zeros((2 * n, 2 * n, alpha.shape[1]))
+    r = np.arange(n)
+    moves[r, r], moves[r, n + r] = -alpha, -beta
+    moves[n + r, r], moves[n + r, n + r] = beta, -alpha
+    return moves
+
+
+def _normal(fits: Sequence[_Projection], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton matrix H and right-hand side, over all records, outputs weighted by 1 / noise."""
+    size = fits[0].gram.shape[0]
+    n = size // 2
+    h, g = np.zeros((size, size)), np.zeros(size)
+    for fit in fits:
+        a, b = fit.coefficients[:n] * weights, fit.coefficients[n : 2 * n] * weights
+        aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
+        (cc, cs), (sc, ss) = fit.gram.reshape(2, n, 2, n).transpose(0, 2, 1, 3)
+        h[:n, :n] += aa * cc + ab * cs + ab.T * sc + bb * ss
+        h[n:, n:] += bb * cc - ab.T * cs - ab * sc + aa * ss
+        cross = -(ab * cc) + aa * cs - bb * sc + ab.T * ss
+        h[:n, n:] += cross
+        h[n:, :n] += cross.T
+        x, y = fit.slopes[:n] * weights, fit.slopes[n:] * weights
+        g[:n] += -(a * x + b * y).sum(axis=1)
+        g[n:] += (b * x - a * y).sum(axis=1)
+    return h, g
+
+
+def _search(records, poles: np.ndarray, weights: np.ndarray, offset: bool):
+    """Levenberg-Marquardt over (σ, ω_d): poles, projections, whether it settled, steps taken."""
+    n = poles.size
+    fits = [_project(record, poles, offset) for record in records]
+    cost = _cost(fits, weights)
+    free = sum(r.outputs.size for r in records) - 2 * n - sum(f.coefficients.size for f in fits)
+    signal = sum(((r.outputs * weights[:, None]) ** 2).sum() for r in records)
+    damping = 1e-3
+    for step in range(1, MOST_STEPS + 1):
+        h, g = _normal(fits, weights)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
+        while True:
+            matrix = h * np.outer(scale, scale) + damping * np.eye(2 * n)
+            move = scale * cho_solve(cho_factor(matrix), scale * g)
+            trial = poles - move[:n] + 1j * move[n:]
+            gain = float(move @ g)
+            small = gain <= SETTLED * cost / free or gain <= ROUND_OFF**2 * signal
+            fits_there = [_project(record, trial, offset) for record in records]
+            cost_there = _cost(fits_there, weights)
+            if cost_there <= cost or small or damping > 1e8:
+                break
+            damping *= 8.0
+        if cost_there <= cost:
+            poles, fits, cost = trial, fits_there, cost_there
+        damping = max(0.1 * damping, 1e-12)
+        if small or damping > 1e6:
+            return poles, fits, small, step
+    return poles, fits, False, MOST_STEPS
+
+
+def _cost(fits, weights: np.ndarray) -> float:
+    return float(sum((weights**2 * (fit.residual**2).sum(axis=0)).sum() for fit in fits))
+
+
+def _noise(records, fits) -> np.ndarray:
+    """Standard deviation of the residual of each output, the degrees of freedom the fit took away made good."""
+    n_poles, m = fits[0].gram.shape[0], records[0].n_outputs
+    free = sum(r.n_samples - f.coefficients.shape[0] for r, f in zip(records, fits, strict=True)) - n_poles / m
+    squares = sum((f.residual**2).sum(axis=0) for f in fits)
+    signal = sum((r.outputs**2).sum(axis=1) for r in records)
+    floor = np.maximum(1e-32 * signal, 1e-32 * signal.max() + 1e-300)
+    return np.sqrt(np.maximum(squares, floor) / max(free, 1.0))
+
+
+def _report(records, poles, fits, noise, search: dict) -> Refined:
+    n = poles.size
+    h, _ = _normal(fits, 1.0 / noise)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
+    covariance = np.linalg.pinv(h * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
+    omega = np.abs(poles)
+    sigma, omega_d = -poles.real, poles.imag
+    # ω² = σ² + ω_d² and ζ = σ/ω carry the covariance of (σ, ω_d) to that of (ω, ζ).
+    jacobian = np.block(
+        [
+            [np.diag(sigma / omega), np.diag(omega_d / omega)],
+            [np.diag(omega_d**2 / omega**3), np.diag(-sigma * omega_d / omega**3)],
+        ]
+    )
+    order = np.argsort(omega)
+    both = np.r_[order, order + n]
+    derivative = time_derivatives(records[0].output_channels)[:, None]
+    loudest = max(fits, key=lambda fit: float((fit.coefficients**2).sum()))
+    shapes = loudest.complex_amplitudes / poles**derivative
+    shape_covariance = _shape_covariance(loudest, poles, derivative, covariance, noise)
+    return Refined(
+        modes=SampledModes(
+            omega[order], (sigma / omega)[order], normalised_shapes(shapes)[:, order], records[0].positions
+        ),
+        covariance=frozen((jacobian @ covariance @ jacobian.T)[np.ix_(both, both)]),
+        amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
+        shape_covariance=frozen(shape_covariance[order]),
+        noise_std=frozen(noise),
+        **search,
+    )
+
+
+def _shape_covariance(fit: _Projection, poles, derivative, pole_covariance, noise) -> np.ndarray:
+    """Of Re(s_j / s_k), k the largest entry: (n_modes, n_outputs, n_outputs).
+
+    d(s_j/s_k) = (ds_j - ds_k s_j/s_k) / s_k, and an amplitude moves with its own noise, of covariance (Φ^T Φ)^-1, and with the poles, by -Φ^+ dΦ.
+    """
+    shapes = fit.complex_amplitudes / poles**derivative
+    n, m = poles.size, shapes.shape[0]
+    moves = _directions(fit)
+    drift = -np.einsum("ck,pkj->cpj", fit.tilt, moves)  # (n_columns, 2 n_modes, n_outputs)
+    result = np.zeros((n, m, m))
+    root = _root(pole_covariance)
+    for r in range(n):
+        k = int(np.argmax(np.abs(shapes[:, r])))
+        with_poles = ((drift[r] - 1j * drift[n + r]).T @ root) / poles[r] ** derivative
+        own = fit.spread[np.ix_([r, n + r], [r, n + r])]
+        pair = np.array([1.0, -1j]) @ _root(own)
+        each = noise[:, None] * pair / poles[r] ** derivative  # (n_outputs, 2)
+        ratio = shapes[:, r] / shapes[k, r]
+        shared = ((with_poles - ratio[:, None] * with_poles[k]) / shapes[k, r]).real
+        single = (each / shapes[k, r]).real
+        common = (ratio[:, None] * each[k] / shapes[k, r]).real
+        common[k] = single[k] = 0.0
+        result[r] = shared @ shared.T + common @ common.T + np.diag((single**2).sum(axis=1))
+        result[r][k] = result[r][:, k] = 0.0
+    return result
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """R with R R^T = matrix, for a matrix that may be singular."""
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
