@@ -27,7 +27,7 @@ def eigenvalue_errors(errors: Mapping, sensors: Sequence[int]) -> Figure:
         axes[0, column].set_title(f"{m} sensors")
         axes[1, column].set_xlabel("mode")
         axes[1, column].set_xticks([1, 5, 10, 15, 20])
-    axes[0, 0].legend(loc="center left", bbox_to_anchor=(0.0, 0.45))
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure
 
 
@@ -61,5 +61,5 @@ def distribution_errors(x: np.ndarray, curves: Mapping, sensors: Sequence[int], 
         axes[1, column].set_xlabel("x")
     axes[0, 0].set_ylabel("error of m(x)")
     axes[1, 0].set_ylabel("error of EA(x)")
-    axes[0, 0].legend(ncols=1, loc="lower left")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure

@@ -13,13 +13,12 @@ from scipy.interpolate import BSpline
 
 from workbench.identification.ibrahim import normalised_shapes
 from workbench.structure.modes import Modes, SampledModes, frozen
-from workbench.structure.profile import ProfileLike, as_profile
+from workbench.structure.profile import Profile, ProfileLike, as_profile
 
-# In section 4.4 each two degrees more cut the error of the recovered mass and stiffness by three to five, up to the
-# ninth with 12 sensors. A spline that keeps fewer than three inner knots is all but one polynomial through every
-# sensor, and swings between them at the least noise.
-HIGHEST_DEFAULT_DEGREE = 9
-INNER_KNOTS = 3
+# In section 4.4 each two degrees more cut the error of the lowest eigenfunctions by ten, and that of the highest, which
+# swing too fast for their sensors, is made worse at the ends. So every mode takes the degree that best foretells each
+# inner sensor from all the others.
+DEFAULT_DEGREES = (3, 5, 7, 9)
 
 ZERO_AT = {
     ("bar", "fixed"): (0,),
@@ -87,7 +86,7 @@ class Spline:
 
 
 def interpolating_spline(
-    positions: Sequence[float], *, length: float, ends: KnownEnds = KnownEnds(), degree: int | None = None
+    positions: Sequence[float], *, length: float, ends: KnownEnds = KnownEnds(), degree: int
 ) -> Spline:
     """The spline through values at the sensors that honours the known ends.
 
@@ -95,14 +94,12 @@ def interpolating_spline(
         positions: (n_sensors,) m, no two alike; a sensor on a held end adds nothing and is passed over.
         length: m.
         ends: what is known there; at most (degree - 1) / 2 derivatives an end are used, lowest first.
-        degree: 1, 3, 5, ...; unless given, the highest up to 9 that still leaves three knots inside.
+        degree: 1, 3, 5, ...
 
     Raises:
         ValueError: an even degree, too few sensors for it, sensors outside, unplaced or at one place.
     """
     positions = np.asarray(positions, float)
-    if degree is None:
-        degree = _default_degree(positions, ends, length)
     _check_places(positions, length, degree)
     slack = 1e-9 * length
     conditions = _usable(ends.zeros, degree, length)
@@ -133,6 +130,7 @@ def eigenfunctions(
     driven_at: float | None = None,
     ends: KnownEnds = KnownEnds(),
     degree: int | None = None,
+    covariance: np.ndarray | None = None,
 ) -> Modes:
     """`Modes` from `SampledModes`: real parts of the shapes, interpolated and scaled.
 
@@ -146,28 +144,89 @@ def eigenfunctions(
         mass_per_length: kg/m, where known; without it and without `driven_at` the shapes keep ∫ φ_r² dx = length.
         driven_at: x0 of a unit blow at t = 0 that `sampled` answers, m.
         ends: what the supports hold at zero.
-        degree: of the splines, odd; chosen as in `interpolating_spline` unless given.
+        degree: of the splines, odd; chosen mode by mode as in `best_degrees` unless given.
+        covariance: of (ω, ζ), carried along where `refine` gave one.
 
     Raises:
         ValueError: as `interpolating_spline`; both ways of scaling at once; a blow at a node of a mode.
     """
     if mass_per_length is not None and driven_at is not None:
         raise ValueError("modes are scaled by the mass distribution or by a driving point, not by both; give one")
-    spline = interpolating_spline(sampled.positions, length=length, ends=ends, degree=degree)
+    splines = _Splines.through(sampled, length=length, ends=ends, degree=degree)
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
         density = as_profile(1.0 / length if mass_per_length is None else mass_per_length)
-        values = values / np.sqrt(_weighted_squares(spline, values, density, length))
+        values = values / np.sqrt(splines.weighted_squares(values, density, length))
     else:
-        values = _scaled_by_blow(sampled, spline, driven_at)
+        values = _scaled_by_blow(sampled, splines, driven_at)
     values = frozen(values)
     return Modes(
         omega=sampled.omega,
         damping=sampled.zeta,
-        shapes=lambda x, derivative: spline.matrix(x, derivative) @ values,
+        shapes=lambda x, derivative: splines(values, x, derivative),
         length=length,
         essential=ends.essential,
+        covariance=covariance,
     )
+
+
+def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = KnownEnds()) -> np.ndarray:
+    """The degree among 3, 5, 7 and 9 that best foretells every inner sensor from the others, (n_modes,).
+
+    Args:
+        sampled: shapes of displacement at placed sensors.
+        length: m.
+        ends: what is known there.
+    """
+    values = normalised_shapes(sampled.shapes).real
+    order = np.argsort(sampled.positions)
+    errors, degrees = [], []
+    for degree in DEFAULT_DEGREES:
+        squares = np.zeros(sampled.n_modes)
+        try:
+            for j in order[1:-1]:
+                others = np.arange(sampled.positions.size) != j
+                spline = interpolating_spline(sampled.positions[others], length=length, ends=ends, degree=degree)
+                squares += (spline.matrix(sampled.positions[j])[0] @ values[others] - values[j]) ** 2
+        except ValueError:
+            break  # too few sensors for this degree, and so for any higher one
+        errors.append(squares)
+        degrees.append(degree)
+    if not degrees:
+        return np.full(sampled.n_modes, DEFAULT_DEGREES[0])
+    return np.array(degrees)[np.argmin(errors, axis=0)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Splines:
+    """One spline a mode, grouped by degree: [(spline, modes), ...]."""
+
+    groups: tuple[tuple[Spline, np.ndarray], ...]
+
+    @classmethod
+    def through(cls, sampled: SampledModes, *, length: float, ends: KnownEnds, degree: int | None) -> "_Splines":
+        where = {"length": length, "ends": ends}
+        degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
+        return cls(
+            tuple(
+                (interpolating_spline(sampled.positions, degree=int(d), **where), np.flatnonzero(degrees == d))
+                for d in np.unique(degrees)
+            )
+        )
+
+    def __call__(self, values: np.ndarray, x: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """Splines through values (n_sensors, n_modes), at x: (n_points, n_modes)."""
+        result = np.zeros((np.size(x), values.shape[1]))
+        for spline, modes in self.groups:
+            result[:, modes] = spline.matrix(x, derivative) @ values[:, modes]
+        return result
+
+    def weighted_squares(self, values: np.ndarray, density: Profile, length: float) -> np.ndarray:
+        """∫ density φ_r² dx, (n_modes,)."""
+        breaks = [b for b in density.breaks if 0 < b < length]
+        knots = np.concatenate([*(spline.knots for spline, _ in self.groups), breaks])
+        x, weights = quadrature(knots, max(spline.degree for spline, _ in self.groups))
+        return (weights * density(x)) @ self(values, x) ** 2
 
 
 def quadrature(knots: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
@@ -177,13 +236,6 @@ def quadrature(knots: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
     h = np.diff(nodes)
     x = nodes[:-1, None] + 0.5 * h[:, None] * (points + 1.0)
     return x.ravel(), (0.5 * h[:, None] * weights).ravel()
-
-
-def _default_degree(positions: np.ndarray, ends: KnownEnds, length: float) -> int:
-    for degree in range(HIGHEST_DEFAULT_DEGREE, 1, -2):
-        if len(np.unique(positions)) + len(_usable(ends.zeros, degree, length)) >= degree + 1 + INNER_KNOTS:
-            return degree
-    return 3
 
 
 def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
@@ -222,17 +274,10 @@ def _knots(sites: np.ndarray, derivatives: list, length: float, degree: int) -> 
     return np.r_[[0.0] * (degree + 1), inner[left : left + wanted], [length] * (degree + 1)]
 
 
-def _weighted_squares(spline: Spline, values: np.ndarray, density, length: float) -> np.ndarray:
-    """∫ density φ_r² dx, (n_modes,)."""
-    nodes = np.r_[spline.knots, [b for b in density.breaks if 0 < b < length]]
-    x, w = quadrature(nodes, spline.degree)
-    return (w * density(x)) @ (spline.matrix(x) @ values) ** 2
-
-
-def _scaled_by_blow(sampled: SampledModes, spline: Spline, x0: float) -> np.ndarray:
+def _scaled_by_blow(sampled: SampledModes, splines: _Splines, x0: float) -> np.ndarray:
     omega_d = np.abs(sampled.poles.imag)
     products = (1j * sampled.shapes * omega_d).real
-    at_blow = (spline.matrix(x0) @ products)[0]
+    at_blow = splines(products, np.array([x0]))[0]
     weak = at_blow <= 1e-3 * np.abs(products).max(axis=0)
     if weak.any():
         raise ValueError(

@@ -278,7 +278,8 @@ def _report(records, poles, fits, noise, search: dict) -> Refined:
 def _shape_covariance(fit: _Projection, poles, derivative, pole_covariance, noise) -> np.ndarray:
     """Of Re(s_j / s_k), k the largest entry: (n_modes, n_outputs, n_outputs).
 
-    d(s_j/s_k) = (ds_j - ds_k s_j/s_k) / s_k, and an amplitude moves with its own noise, of covariance (Φ^T Φ)^-1, and with the poles, by -Φ^+ dΦ.
+    d(s_j/s_k) = (ds_j - ds_k s_j/s_k) / s_k. An amplitude moves with its own noise, of covariance (Φ^T Φ)^-1, and with
+    the poles, by -Φ^+ dΦ.
     """
     shapes = fit.complex_amplitudes / poles**derivative
     n, m = poles.size, shapes.shape[0]
