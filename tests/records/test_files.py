@@ -1,0 +1,100 @@
+"""Records survive every format, and damaged files are named."""
+
+import numpy as np
+import pytest
+
+from workbench.records.files import FORMATS, RecordFileError, read_record, write_record
+from workbench.records.record import Channel, Record
+
+
+def sample() -> Record:
+    rng = np.random.default_rng(1)
+    return Record(
+        sample_time=0.002,
+        outputs=rng.standard_normal((2, 50)),
+        output_channels=(
+            Channel("tip", "displacement", at=1.25, noise_std=1e-3),
+            Channel("root strain", "strain", "1", at=0.0),
+        ),
+        inputs=rng.standard_normal((1, 50)),
+        input_channels=(Channel("hammer", "force", at=0.5),),
+        start_time=0.1,
+        name="a run",
+    )
+
+
+@pytest.mark.parametrize("ending", sorted(FORMATS))
+def test_a_record_comes_back_as_it_went(tmp_path, ending):
+    record = sample()
+    back = read_record(write_record(record, tmp_path / f"run{ending}"))
+    exact = 1e-10 if ending in (".uff", ".unv") else 0.0
+    np.testing.assert_allclose(back.outputs, record.outputs, rtol=exact, atol=0)
+    np.testing.assert_allclose(back.inputs, record.inputs, rtol=exact, atol=0)
+    assert back.output_channels == record.output_channels
+    assert back.input_channels == record.input_channels
+    assert (back.sample_time, back.start_time, back.name) == (record.sample_time, record.start_time, record.name)
+
+
+def test_a_plain_csv_of_another_program(tmp_path):
+    path = tmp_path / "plain.csv"
+    path.write_text("time,v,theta\n0.0,1,2\n0.5,3,4\n1.0,5,6\n")
+    record = read_record(path, inputs=("v",))
+    assert record.input_names == ("v",) and record.output_names == ("theta",)
+    np.testing.assert_array_equal(record.outputs, [[2, 4, 6]])
+    assert record.sample_time == 0.5
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "empty"),
+        ("time,a\n0,1\n1,x\n", "channel 'a', row 3"),
+        ("time,a\n0,1\n1,nan\n2,2\n", "channel 'a', row 2"),
+        ("time,a\n0,1\n1,2,3\n", "row 3 has 3 fields"),
+        ("time,a\n0,1\n1,2\n5,3\n", "not uniformly sampled"),
+        ("0,1\n1,2\n", "header"),
+        ("a,a\n1,2\n3,4\n", "must differ"),
+        ("a,b\n1,2\n3,4\n", "sample_rate_hz"),
+    ],
+)
+def test_a_damaged_csv_is_named(tmp_path, text, words):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(RecordFileError, match=words) as caught:
+        read_record(path)
+    assert "bad.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize("ending", [".npz", ".mat", ".h5", ".uff"])
+def test_a_file_that_is_something_else_is_refused(tmp_path, ending):
+    path = tmp_path / f"bad{ending}"
+    path.write_bytes(b"this is not a record" * 10)
+    with pytest.raises(RecordFileError):
+        read_record(path)
+
+
+def test_channels_of_unequal_length_are_named(tmp_path):
+    np.savez(tmp_path / "x.npz", t=np.arange(5.0), a=np.arange(5.0), b=np.arange(4.0))
+    with pytest.raises(RecordFileError, match="'b' has 4 samples"):
+        read_record(tmp_path / "x.npz")
+
+
+def test_a_pickle_is_never_opened(tmp_path):
+    np.savez(tmp_path / "x.npz", t=np.arange(3.0), a=np.array([{}, [], 1], dtype=object))
+    with pytest.raises(RecordFileError):
+        read_record(tmp_path / "x.npz")
+
+
+def test_python_control_round_trip():
+    record = sample()
+    back = Record.from_control(record.to_control())
+    np.testing.assert_array_equal(back.outputs, record.outputs)
+    np.testing.assert_array_equal(back.inputs, record.inputs)
+    assert back.output_names == record.output_names
+
+
+def test_a_record_refuses_what_does_not_fit():
+    with pytest.raises(ValueError, match="channel 'a': sample 1 is nan"):
+        Record(sample_time=0.1, outputs=[[1.0, np.nan]], output_channels=(Channel("a"),))
+    with pytest.raises(ValueError, match="time the last axis"):
+        Record(sample_time=0.1, outputs=np.zeros((50, 2)), output_channels=(Channel("a"), Channel("b")))
