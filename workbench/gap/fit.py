@@ -42,12 +42,18 @@ class Fit:
 
 def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
     """Cost per measured value; `HOPELESS` where the rig cannot be (a buckled beam, say)."""
-    try:
-        residual = data.residual(apply_all(rig, effects))
-    except (ValueError, np.linalg.LinAlgError):
-        return HOPELESS
-    cost = float(residual @ residual) / residual.size
-    return cost if np.isfinite(cost) else HOPELESS
+    residual = _finite_residual(rig, effects, data)
+    return HOPELESS if residual is None else float(residual @ residual) / residual.size
+
+
+def _finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray | None:
+    """The residual, or None where the rig cannot be or its motion runs away."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        try:
+            residual = data.residual(apply_all(rig, effects))
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        return residual if residual @ residual < HOPELESS else None
 
 
 class _Problem:
@@ -71,11 +77,7 @@ class _Problem:
         return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
 
     def residual(self, free: np.ndarray) -> np.ndarray | None:
-        try:
-            residual = self.data.residual(apply_all(self.rig, self.at(free)))
-        except (ValueError, np.linalg.LinAlgError):
-            return None
-        return residual if np.isfinite(residual @ residual) else None
+        return _finite_residual(self.rig, self.at(free), self.data)
 
     def jacobian(self, free: np.ndarray, residual: np.ndarray) -> np.ndarray:
         columns = []

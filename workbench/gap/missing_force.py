@@ -15,6 +15,9 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
 
+RUNAWAY = 1e100
+
+
 @dataclass(frozen=True, eq=False)
 class SampledModel:
     """The modal equations over one sample interval, with held modal forces.
@@ -152,6 +155,8 @@ def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
     total = 0.0
     for residual in residuals:
         e = innovations(filter_, residual)
+        if not np.abs(e).max() < RUNAWAY:
+            return -np.inf
         total -= 0.5 * (np.sum(e * cho_solve(factor, e)) + e.shape[1] * log_det)
     return total
 

@@ -63,8 +63,11 @@ class _Member:
 
     def _segments(self, n_modes: int, stiffness: Profile, continuity: int, extra: int) -> Segments:
         """Segments that can carry n_modes half waves, with `extra` more degrees than the bare count."""
-        points = tuple(part.at for part in self.attachments)
-        nodes = self._nodes((*self.mass_per_length.breaks, *stiffness.breaks, *points))
+        nodes = self._nodes((*self.mass_per_length.breaks, *stiffness.breaks))
+        for part in self.attachments:
+            # a node at an attachment keeps its kink out of the polynomials; a sliver of a segment would cost more
+            if np.abs(nodes - part.at).min() > 1e-3 * self.length:
+                nodes = np.sort(np.r_[nodes, part.at])
         degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / self.length)) + 12 + extra
         pieces = int(np.ceil(degree / HIGHEST_DEGREE))
         if pieces > 1:
