@@ -48,8 +48,8 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
     width = 0.8 / len(works)
     for i, (name, work) in enumerate(works.items()):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, np.abs(work), width, label=f"{name}: W_R = {work.sum():.2e}")
-    ax.set(yscale="log", xticks=numbers, xlabel="residual mode", ylabel="work spilled into the mode, |W_r|")
+        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.2e}")
+    ax.set(xticks=numbers, xlabel="residual mode", ylabel="work spilled into the mode, W_r")
     ax.set_title("which residual mode a design feeds")
     ax.legend()
     return figure

@@ -1,0 +1,187 @@
+"""From a measured ring-down to a controlled beam: what is found, what is designed, and which mode does it feed?
+
+A hinged beam is struck; eleven noisy sensors listen. Everything after the first function knows the record, the length,
+the ends and the mass of the beam, never its modes. The law designed on what was found then drives the true beam.
+"""
+
+import numpy as np
+
+from workbench.design.closed_loop import close_loop, impulse_state, respond
+from workbench.design.coupled import coupled_lqr
+from workbench.design.imsc import imsc
+from workbench.design.law import Law
+from workbench.design.modal_filter import displacement_filter
+from workbench.design.placement import place, placement_task
+from workbench.design.spillover import effort, finite_spillover, quadratic_cost
+from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works
+from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.ibrahim import stacked_delays
+from workbench.identification.refinement import refine
+from workbench.identification.synthesis import free_decay, struck
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import state_space
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.modes import mac
+
+LENGTH, MASS = 10.0, 1.0
+SENSORS = np.linspace(0.0, LENGTH, 13)[1:-1]
+HAMMER_AT = 7.3  # well away from the nodes of all nine modes
+DISTURBED_AT = 6.3  # as in section 5.8
+N_MODES, N_CONTROLLED = 9, 4
+MODAL_WEIGHT, FORCE_WEIGHT = 20.0, 10.0
+FINAL_TIME = 60.0
+EVEN = (2.0, 4.0, 6.0, 8.0)
+
+
+def measured():
+    """The beam's true modes, and its ring-down at eleven sensors with 1 % noise."""
+    beam = Beam(
+        length=LENGTH,
+        mass_per_length=MASS,
+        bending_stiffness=1.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.002),
+    )
+    modes = beam.modes(N_MODES)
+    decay = struck(modes, at=HAMMER_AT, positions=SENSORS)
+    sampling = {"sample_time": 0.2, "n_samples": 3000, "quantity": "velocity"}
+    noise = 0.01 * free_decay(decay, **sampling).outputs.std()
+    return modes, free_decay(decay, **sampling, noise_std=noise, seed=1)
+
+
+def identified(record):
+    """Mass-normalised modes with the uncertainty of each figure."""
+    found = refine(record, stacked_delays(record, n_modes=N_MODES))
+    ends = KnownEnds.of("beam", length=LENGTH, left="hinged", right="hinged")
+    modes = eigenfunctions(
+        found.modes, length=LENGTH, mass_per_length=MASS, ends=ends, covariance=found.covariance
+    )
+    return modes, found
+
+
+def actuators_at(places) -> list[Actuator]:
+    return [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(places)]
+
+
+def designs(modes) -> dict[str, Law]:
+    """Three laws for the lowest four of the identified modes."""
+    even = actuators_at(EVEN)
+    task = placement_task(modes, N_CONTROLLED, impulse_at=DISTURBED_AT, weight=MODAL_WEIGHT)
+    limit = 1.5 * task.placed(EVEN, "even").effort
+    best = place(task, effort_limit=limit, spacing=0.5)
+    return {
+        "IMSC": imsc(modes, N_CONTROLLED, even, weight=MODAL_WEIGHT),
+        "coupled LQR": coupled_lqr(modes, N_CONTROLLED, even, weight=FORCE_WEIGHT),
+        "IMSC, placed": imsc(modes, N_CONTROLLED, actuators_at(best.positions), weight=MODAL_WEIGHT),
+    }
+
+
+def study(outcome, data=None) -> None:
+    stages = iter(outcome.track(range(4), "measure, identify, design, close the loop"))
+    truth, record = measured()
+    next(stages)
+
+    modes, found = identified(record)
+    next(stages)
+    x = np.linspace(0.0, LENGTH, 201)
+    report_modes(outcome, truth, modes, found, x)
+
+    laws = designs(modes)
+    next(stages)
+    model = state_space(modes, laws["IMSC"].actuators, [Sensor(f"y{j + 1}", at) for j, at in enumerate(SENSORS)])
+    outcome.say(f"The model: {model.nstates} states, {model.ninputs} actuators, {model.noutputs} sensors.")
+    report_designs(outcome, truth, modes, laws)
+    next(stages)
+
+    outcome.figure(
+        "ring_down", plot_ring_down(record, stretch=120.0),
+        "What was measured: velocity at eleven places after a blow at x = 7.3. Noise is 1 % of the signal.",
+    )
+    outcome.figure(
+        "modes", plot_identified(modes, truth, SENSORS, count=6),
+        "What was found: eigenfunctions through the sensors (dots), over the true ones (grey).",
+    )
+    report_motion(outcome, truth, modes, laws, x)
+
+
+def report_modes(outcome, truth, modes, found, x) -> None:
+    frequency = np.abs(modes.omega / truth.omega - 1)
+    damping = np.abs(modes.zeta / truth.zeta - 1)
+    same = np.diag(mac(modes.phi(x), truth.phi(x)))
+    scale = np.abs((modes.phi(x) * truth.phi(x)).sum(0) / (truth.phi(x) ** 2).sum(0))
+    outcome.table("modes", [
+        {"mode": r + 1, "frequency_hz": modes.frequencies_hz[r], "frequency_std_hz": found.omega_std[r] / (2 * np.pi),
+         "damping": modes.zeta[r], "damping_std": found.zeta_std[r], "mac": same[r], "scale": scale[r]}
+        for r in range(modes.n_modes)
+    ])
+    off = np.abs(modes.omega - truth.omega) / found.omega_std
+    outcome.say(f"All nine modes found: frequencies to {frequency.max():.1e}, damping to {100 * damping.max():.1f} %.")
+    outcome.check("frequencies, worst relative error", frequency.max(), 1e-4)
+    outcome.check("damping ratios, worst relative error", damping.max(), 0.05)
+    outcome.check("frequencies, worst error in standard errors", off.max(), 4.0)
+    outcome.check("shapes, least MAC of six", same[:6].min(), 0.999, at_least=True)
+    outcome.check("shapes, worst error of scale of six", np.abs(scale[:6] - 1).max(), 0.02)
+
+
+def report_designs(outcome, truth, modes, laws) -> None:
+    """Cost, effort and spillover of each law, on the true beam."""
+    state = impulse_state(truth, DISTURBED_AT)
+    state[truth.n_modes + N_CONTROLLED :] = 0.0  # residual modes at rest, so that W_r is what control puts there
+    rows = []
+    for name, law in laws.items():
+        work = finite_spillover(close_loop(truth, law), state, FINAL_TIME)
+        expected = finite_spillover(close_loop(modes, law), state, FINAL_TIME)
+        rows.append({
+            "law": name, "places": [a.at for a in law.actuators],
+            "cost": quadratic_cost(truth, law, state, FORCE_WEIGHT), "effort": effort(truth, law, state),
+            "W_C": work.controlled_total, "W_r": work.residual_work, "W_R": work.residual_total,
+            "W_R_expected": expected.residual_total,
+        })
+    outcome.table("designs", rows)
+    even, coupled, placed = rows
+    outcome.say(
+        f"IMSC at 2, 4, 6, 8 leaves W_R = {even['W_R']:.2e} in the residual modes, {100 * even['W_R'] / -even['W_C']:.1f} %"
+        f" of what it takes out of the controlled ones; coupled LQR {coupled['W_R']:.2e}: at the nodes of mode 5 the two"
+        " are one law."
+    )
+    where = ", ".join(f"{at:.2f}" for at in placed["places"])
+    outcome.say(f"Placed at {where}, the same law leaves {placed['W_R']:.2e} for at most 1.5 times the effort.")
+    outcome.check("placed: W_R over that of even places", placed["W_R"] / even["W_R"], 1.0)
+    outcome.check("placed: effort over that of even places", placed["effort"] / even["effort"], 1.505)
+    outcome.figure(
+        "work",
+        plot_two_works({row["law"]: row["W_r"] for row in rows}, first=N_CONTROLLED),
+        "Work that each law puts into the modes it does not control, on the true beam.",
+    )
+
+
+def report_motion(outcome, truth, modes, laws, x) -> None:
+    """The true beam under the identified law, fed by eleven displacement sensors through modal filters."""
+    state = impulse_state(truth, DISTURBED_AT)
+    time = np.linspace(0.0, FINAL_TIME, 601)
+    filter_ = displacement_filter(modes.select(slice(N_CONTROLLED)), SENSORS, MASS)
+    idle = Law(np.zeros_like(laws["IMSC"].gain), laws["IMSC"].controlled, laws["IMSC"].actuators, "no control")
+    loops = {
+        "no control": close_loop(truth, idle),
+        "through modal filters": close_loop(truth, laws["IMSC"], filter_),
+        "exact modal coordinates": close_loop(truth, laws["IMSC"]),
+    }
+    responses = {name: respond(loop, state, time) for name, loop in loops.items()}
+    energy = {name: r.energy[:N_CONTROLLED].sum(0) for name, r in responses.items()}
+    left = energy["through modal filters"][-1] / energy["no control"][-1]
+    apart = np.abs(
+        responses["through modal filters"].displacement(x) - responses["exact modal coordinates"].displacement(x)
+    ).max()
+    apart /= np.abs(responses["exact modal coordinates"].displacement(x)).max()
+    poles = np.linalg.eigvals(loops["through modal filters"].matrix)
+    outcome.say(f"After {FINAL_TIME:g} s the controlled modes keep {100 * left:.1e} % of the energy they would have had.")
+    outcome.check("closed loop on the true beam, largest real part of its poles", poles.real.max(), 0.0)
+    outcome.check("energy left in the controlled modes, share of the uncontrolled", left, 0.02)
+    outcome.check("filtered against exact feedback, share of the largest displacement", apart, 0.02)
+    outcome.figure(
+        "motion", plot_motion(responses, x),
+        "The beam from end to end (upwards) over time (rightwards), without and with control.",
+    )
