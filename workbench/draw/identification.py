@@ -4,9 +4,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.structure.modes import Modes
+from workbench.identification.stabilisation import Stabilisation
+from workbench.identification.telling import Told
+from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
 LABELS = ("printed in 1981", "two delays, as in 1981", "stacked delays")
@@ -62,4 +65,92 @@ def distribution_errors(x: np.ndarray, curves: Mapping, sensors: Sequence[int], 
     axes[0, 0].set_ylabel("error of m(x)")
     axes[1, 0].set_ylabel("error of EA(x)")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
+    return figure
+
+
+def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz: float) -> Figure:
+    """Frequencies found at each order; dark dots stand (phase collinearity near 1), pale ones travel."""
+    figure, ax = new_figure(width=9, height=4.5)
+    for line, frequency in enumerate(stayed.frequencies_hz):
+        ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stays")
+    for order, modes in zip(diagram.orders, diagram.found, strict=True):
+        keep = modes.frequencies_hz < band_hz
+        dots = ax.scatter(
+            modes.frequencies_hz[keep],
+            np.full(keep.sum(), order),
+            c=modes.phase_collinearity[keep],
+            cmap="Blues",
+            vmin=0,
+            vmax=1,
+            s=22,
+            edgecolors=GREY,
+            linewidths=0.4,
+            zorder=3,
+        )
+    figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
+    ax.set_xlabel("frequency, Hz")
+    ax.set_ylabel("number of modes asked for")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    figure.legend(loc="outside upper right")
+    return figure
+
+
+def measured_modes(bending: SampledModes, others: SampledModes, told: Told, model: Modes) -> Figure:
+    """Measured shapes over the model's, one panel a mode; those that are not the model's last, in grey."""
+    n = bending.n_modes + others.n_modes
+    figure, axes = new_figure(int(np.ceil(n / 4)), 4, width=12, height=2.7 * np.ceil(n / 4), sharex=True, sharey=True)
+    x = np.linspace(0.0, model.length, 200)
+    at_sensors = model.phi(bending.positions)
+    for ax, r in zip(axes.ravel(), range(n), strict=False):
+        is_model = r < bending.n_modes
+        modes, k = (bending, r) if is_model else (others, r - bending.n_modes)
+        values = modes.shapes[:, k] * np.exp(-0.5j * np.angle((modes.shapes[:, k] ** 2).sum()))
+        values = values.real / np.abs(values).max()
+        if is_model:
+            shape = at_sensors[:, told.model[k]]
+            scale = (values @ shape) / (shape @ shape)
+            ax.plot(x, scale * model.phi(x)[:, told.model[k]], color=GREY, lw=3, alpha=0.5)
+        ax.plot(modes.positions, values, "o" if is_model else "s", color=COLOURS[0] if is_model else COLOURS[1])
+        what = f"beam {told.scaled_hz[k]:.1f} Hz, MAC {told.mac[k]:.3f}" if is_model else "not bending"
+        ax.set_title(f"{modes.frequencies_hz[k]:.1f} Hz: {what}", fontsize=9.5)
+    for ax in axes.ravel()[n:]:
+        ax.set_visible(False)
+    for ax in np.atleast_2d(axes)[-1]:
+        ax.set_xlabel("x / length")
+    return figure
+
+
+def placement_on_shapes(modes: Modes, placements: Mapping, *, n_controlled: int) -> Figure:
+    """Where actuators stand on the mode shapes, and what each placement leaves in the residual modes."""
+    figure, (left, right) = new_figure(1, 2, width=12, height=4.5, width_ratios=(3, 2))
+    x = np.linspace(0.0, modes.length, 300)
+    shapes = modes.phi(x)
+    for r in range(modes.n_modes):
+        controlled = r < n_controlled
+        label = {0: "controlled modes", n_controlled: "residual modes"}.get(r)
+        left.plot(x, shapes[:, r], color=COLOURS[0] if controlled else GREY, lw=2 if controlled else 0.9, label=label)
+    bottom, width = shapes.min(), 0.8 / len(placements)
+    for i, (name, placement) in enumerate(placements.items()):
+        colour = COLOURS[i + 1]
+        level = bottom - 0.35 * (i + 1)
+        left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
+        label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
+        number = np.arange(n_controlled + 1, modes.n_modes + 1)
+        right.bar(
+            number + (i - 1) * width,
+            np.maximum(placement.by_mode, 1e-12),
+            width,
+            bottom=1e-12,
+            color=colour,
+            label=label,
+        )
+    left.set_xlabel("x / length")
+    left.set_ylabel("mode shape; actuators below")
+    left.legend(loc="upper center", ncols=2)
+    right.set_yscale("log")
+    right.set_ylim(1e-12, None)
+    right.set_xticks(number)
+    right.set_xlabel("residual mode")
+    right.set_ylabel("work left in it")
+    right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure

@@ -51,7 +51,7 @@ def two_delays(record: Record, *, first: int = 0, spacing: int = 1, columns: int
     before, after = np.vstack(u[:2]), np.vstack(u[1:])
     transition = lstsq(before.T, after.T)[0].T
     mu, vectors = np.linalg.eig(transition)
-    return _as_modes(mu, vectors[:m], record)
+    return as_modes(mu, vectors[:m], record)
 
 
 def stacked_delays(
@@ -80,7 +80,7 @@ def stacked_delays(
     check_alike(records)
     basis = signal_subspace(records, 2 * n_modes, delays=delays)
     mu, vectors = shift_eigenpairs(basis, records[0].n_outputs)
-    return _as_modes(mu, vectors, records[0], branch)
+    return as_modes(mu, vectors, records[0], branch)
 
 
 def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None = None) -> np.ndarray:
@@ -124,7 +124,8 @@ def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     return turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0)
 
 
-def _as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
+def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
+    """Modes from eigenvalues of one step, λ = (log μ + 2πi k)/Δt (3.23); real eigenvalues are no modes."""
     upper = (mu.imag > 0) & (np.abs(mu) > 0)
     # Above Nyquist every second branch folds the spectrum over: the conjugate is the one that is seen.
     seen = mu[upper] if branch % 2 == 0 else mu[upper].conj()

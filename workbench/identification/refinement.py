@@ -216,8 +216,8 @@ def _search(records, poles: np.ndarray, weights: np.ndarray, offset: bool):
             trial = poles - move[:n] + 1j * move[n:]
             gain = float(move @ g)
             small = gain <= SETTLED * cost / free or gain <= ROUND_OFF**2 * signal
-            fits_there = [_project(record, trial, offset) for record in records]
-            cost_there = _cost(fits_there, weights)
+            fits_there = [_project(record, trial, offset) for record in records] if _sane(trial, records) else fits
+            cost_there = _cost(fits_there, weights) if fits_there is not fits else np.inf
             if cost_there <= cost or small or damping > 1e8:
                 break
             damping *= 8.0
@@ -227,6 +227,12 @@ def _search(records, poles: np.ndarray, weights: np.ndarray, offset: bool):
         if small or damping > 1e6:
             return poles, fits, small, step
     return poles, fits, False, MOST_STEPS
+
+
+def _sane(poles: np.ndarray, records) -> bool:
+    """Whether every mode still swings, and none grows by more than e^20 over a record."""
+    longest = max(r.n_samples * r.sample_time for r in records)
+    return bool((poles.imag > 0).all() and (poles.real * longest < 20.0).all())
 
 
 def _cost(fits, weights: np.ndarray) -> float:

@@ -1,0 +1,104 @@
+"""A measured steel ruler: which of its modes are bending, is it a uniform beam, and where should three actuators stand?
+
+Ten points of a ruler hung free at both ends, hammer and accelerometer, as transfer functions: the MATLAB file given by
+--data, `ruler.mat` of the public project torebutlin/pydvma. Its length and mass were not recorded: the length, the
+mass and the mass per length are 1 here, so work and effort compare placements but are not in joules.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from workbench.design.placement import nodes_of_mode, place, placement_task
+from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
+from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.refinement import amplitudes
+from workbench.identification.stabilisation import real_modes, stabilise
+from workbench.identification.telling import tell_apart
+from workbench.records.resample import decimate
+from workbench.records.transfer_file import read_transfer
+from workbench.structure.member import Beam
+
+NEEDS_DATA = "ruler.mat, the measured transfer functions"
+
+POSITIONS = np.linspace(0.003, 0.983, 10)
+BAND_HZ = 800.0
+SEEN_HZ = (39.4, 108.8, 212.0, 352.6, 517.9, 729.0)
+OTHERS_HZ = (6.7, 551.0)
+DAMPING_WANTED = 0.05
+
+
+def study(outcome, data: Path | None = None) -> None:
+    record = decimate(read_transfer(data, positions=POSITIONS, quantity="acceleration"), 6)
+    diagram = stabilise(record, orders=range(6, 25), delays=150)
+    stayed = amplitudes(record, real_modes(diagram).modes)
+    stayed = stayed.select(np.flatnonzero(stayed.frequencies_hz < BAND_HZ))
+
+    beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(8)
+    told = tell_apart(stayed, beam.select(range(2, 8)))
+    bending = stayed.select(told.matched)
+    others = stayed.select(told.others)
+    report_modes(outcome, bending, others, told)
+    outcome.figure(
+        "stabilisation",
+        stabilisation_diagram(diagram, stayed, BAND_HZ),
+        "Modes found at each order asked for; the lines mark those that stay.",
+    )
+    outcome.figure(
+        "modes",
+        measured_modes(bending, others, told, beam.select(range(2, 8))),
+        "The ruler's shapes at its ten points, over those of a uniform free-free beam.",
+    )
+    place_actuators(outcome, bending)
+
+
+def report_modes(outcome, bending, others, told) -> None:
+    outcome.table("bending_hz", bending.frequencies_hz)
+    outcome.table("bending_zeta", bending.zeta)
+    outcome.table("mac", told.mac)
+    outcome.table("beam_hz", told.scaled_hz)
+    outcome.table("other_hz", others.frequencies_hz)
+    outcome.say(
+        f"bending at {', '.join(f'{f:.1f}' for f in bending.frequencies_hz)} Hz; a uniform beam scaled to the"
+        f" first has {', '.join(f'{f:.1f}' for f in told.scaled_hz)} Hz"
+    )
+    outcome.say(f"not bending: {', '.join(f'{f:.1f}' for f in others.frequencies_hz)} Hz")
+    outcome.check("number of bending modes", abs(bending.n_modes - len(SEEN_HZ)), 0)
+    outcome.check("number of other modes", abs(others.n_modes - len(OTHERS_HZ)), 0)
+    found, seen = bending.frequencies_hz, SEEN_HZ
+    if bending.n_modes == len(seen):
+        outcome.check("bending frequencies against those seen by eye, relative", np.abs(found / seen - 1).max(), 0.01)
+    outcome.check("MAC with the free-free beam, first five", told.mac[:5].min(), 0.95, at_least=True)
+
+
+def place_actuators(outcome, bending) -> None:
+    ends = KnownEnds.of("beam", length=1.0, left="free", right="free")
+    modes = eigenfunctions(bending, length=1.0, mass_per_length=1.0, ends=ends)
+    # The design leaves damping out, as in Chapter 5: it only helps.
+    modes = replace(modes, damping=np.zeros(modes.n_modes))
+    weight = 2.0 / (2.0 * DAMPING_WANTED * modes.omega[0]) ** 2
+    task = placement_task(modes, 3, impulse_at=0.3, weight=weight)
+    even = task.placed([0.25, 0.5, 0.75], "evenly spaced")
+    nodes = nodes_of_mode(modes, 3)
+    at_nodes = [task.placed(nodes[list(keep)], "nodes of mode 4") for keep in ((0, 1, 2), (0, 1, 3), (0, 2, 3))]
+    rule = min(at_nodes, key=lambda placement: placement.residual_work)
+    best = place(task, effort_limit=1.5 * rule.effort, spacing=0.05, margin=0.02)
+    named = {"evenly spaced": even, "nodes of mode 4": rule, "least W_R": best}
+    outcome.table(
+        "placements",
+        {
+            name: {"positions": p.positions, "W_R": p.residual_work, "W_r": p.by_mode, "effort": p.effort}
+            for name, p in named.items()
+        },
+    )
+    outcome.check("W_R of the optimum over that of the nodes of mode 4", best.residual_work / rule.residual_work, 1.0)
+    outcome.say(
+        f"three modes controlled: W_R = {rule.residual_work:.2e} with actuators at nodes of mode 4,"
+        f" {best.residual_work:.2e} at x = {', '.join(f'{x:.3f}' for x in best.positions)}"
+    )
+    outcome.figure(
+        "placement",
+        placement_on_shapes(modes, named, n_controlled=3),
+        "Three placements on the identified mode shapes, and the work each leaves in the residual modes.",
+    )

@@ -1,0 +1,54 @@
+"""Which measured modes are those of a model, and which come from elsewhere."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from workbench.structure.modes import Modes, SampledModes, mac
+
+
+@dataclass(frozen=True, eq=False)
+class Told:
+    """Measured modes matched one to one with those of a model.
+
+    Attributes:
+        matched: (n_matched,) indices of the measured modes that are the model's, by increasing mode of the model.
+        model: (n_matched,) indices of the model's modes they are.
+        mac: (n_matched,) agreement of the shapes.
+        scaled_hz: (n_matched,) the model's frequencies, scaled to the first match, Hz.
+        others: (n_others,) indices of the measured modes that are not the model's.
+    """
+
+    matched: np.ndarray
+    model: np.ndarray
+    mac: np.ndarray
+    scaled_hz: np.ndarray
+    others: np.ndarray
+
+
+def tell_apart(measured: SampledModes, model: Modes, *, shape: float = 0.9, frequency: float = 0.1) -> Told:
+    """Match measured modes with a model of unknown scale of frequency, each at most once, by shape, then frequency.
+
+    A measured mode is the model's if its shape agrees with that of a mode that no other measured mode agrees with
+    better, and if the frequencies keep the model's ratios.
+
+    Args:
+        measured: shapes at placed sensors.
+        model: computed modes of the structure it should be; its frequencies count by their ratios only.
+        shape: least MAC of a match.
+        frequency: largest relative difference from the median ratio.
+    """
+    agreement = mac(measured.shapes, model.phi(measured.positions))
+    rows, columns = linear_sum_assignment(-np.where(agreement >= shape, agreement, 0.0))
+    good = agreement[rows, columns] >= shape
+    rows, columns = rows[good], columns[good]
+    ratio = measured.omega[rows] / model.omega[columns]
+    if ratio.size:
+        near = np.abs(ratio / np.median(ratio) - 1.0) <= frequency
+        rows, columns = rows[near], columns[near]
+    order = np.argsort(columns)
+    rows, columns = rows[order], columns[order]
+    scale = measured.frequencies_hz[rows[0]] / model.frequencies_hz[columns[0]] if rows.size else 1.0
+    others = np.setdiff1d(np.arange(measured.n_modes), rows)
+    return Told(rows, columns, agreement[rows, columns], scale * model.frequencies_hz[columns], others)
