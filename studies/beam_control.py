@@ -28,7 +28,9 @@ def quadrature_work(modes, law, state, r):
     g1, g2 = np.diag(gains[:, :c]), np.diag(gains[:, c:])
     decay, ring = 0.5 * g2, np.sqrt(omega**2 + g1 - 0.25 * g2**2)
     rate = state[n : n + c]
-    spread = modes.phi([a.at for a in law.actuators])[:, r] @ np.linalg.inv(modes.phi([a.at for a in law.actuators]).T[:c])
+    spread = modes.phi([a.at for a in law.actuators])[:, r] @ np.linalg.inv(
+        modes.phi([a.at for a in law.actuators]).T[:c]
+    )
 
     def force(t):
         q = rate / ring * np.exp(-decay * t) * np.sin(ring * t)
@@ -38,7 +40,10 @@ def quadrature_work(modes, law, state, r):
     end = 45.0 / decay.min()
     edges = np.linspace(0.0, end, 400)
     parts = [
-        sum(quad(lambda t, w=wave: force(t) * w(modes.omega[r] * t), a, b, epsabs=1e-14)[0] for a, b in zip(edges, edges[1:]))
+        sum(
+            quad(lambda t, w=wave: force(t) * w(modes.omega[r] * t), a, b, epsabs=1e-14)[0]
+            for a, b in zip(edges, edges[1:])
+        )
         for wave in (np.cos, np.sin)
     ]
     return 0.5 * (parts[0] ** 2 + parts[1] ** 2)
@@ -66,29 +71,56 @@ def study(outcome, data=None):
         size = np.abs(responses[name].displacement(x)).max()
         difference = max(difference, np.abs(filtered.displacement(x) - responses[name].displacement(x)).max() / size)
         gained = energy_gained(exact, struck, 60.0)
-        balance = max(balance, np.abs(finite_spillover(exact, struck, 60.0).by_mode - gained).max() / np.abs(gained).max())
+        balance = max(
+            balance, np.abs(finite_spillover(exact, struck, 60.0).by_mode - gained).max() / np.abs(gained).max()
+        )
         by_quadrature = np.array([quadrature_work(modes, law, at_rest, r) for r in range(4, 9)])
         closed = works[name].residual_work
-        outcome.check(f"W_r, set {name}: closed form against quadrature of (5.43), relative to W_R",
-                      np.abs(by_quadrature - closed).max() / closed.sum(), 1e-6)
-        outcome.check(f"W_r, set {name}: against independent values, relative", max(
-            abs(v - c) / max(c, 1e-3 * max(CHECKED[name])) for v, c in zip(closed, CHECKED[name], strict=True)), 1e-6)
+        outcome.check(
+            f"W_r, set {name}: closed form against quadrature of (5.43), relative to W_R",
+            np.abs(by_quadrature - closed).max() / closed.sum(),
+            1e-6,
+        )
+        outcome.check(
+            f"W_r, set {name}: against independent values, relative",
+            max(abs(v - c) / max(c, 1e-3 * max(CHECKED[name])) for v, c in zip(closed, CHECKED[name], strict=True)),
+            1e-6,
+        )
 
     outcome.table("W_r", {name: work.residual_work for name, work in works.items()})
     outcome.table("W_R", {name: work.residual_total for name, work in works.items()})
-    outcome.table("displacement", {
-        name: {f"{t:g}": r.displacement(np.linspace(0, 10, 21))[:, int(10 * t)] for t in TIMES} for name, r in responses.items()
-    })
-    outcome.check("energy of the controlled modes after the impulse, against 0.2484470",
-                  abs(-works["a"].controlled_total - 0.2484470), 5e-8)
+    outcome.table(
+        "displacement",
+        {
+            name: {f"{t:g}": r.displacement(np.linspace(0, 10, 21))[:, int(10 * t)] for t in TIMES}
+            for name, r in responses.items()
+        },
+    )
+    outcome.check(
+        "energy of the controlled modes after the impulse, against 0.2484470",
+        abs(-works["a"].controlled_total - 0.2484470),
+        5e-8,
+    )
     outcome.check("energy balance: work in against energy gained, relative", balance, 1e-9)
     outcome.check("nine sensors: filtered against exact feedback, share of the largest displacement", difference, 0.005)
     ratio = works["c"].residual_total / works["a"].residual_total
-    outcome.say(f"crowding the actuators on the left half (c) spills {ratio:.0f} times the work of the nodes of mode 5 (a)")
+    outcome.say(
+        f"crowding the actuators on the left half (c) spills {ratio:.0f} times the work of the nodes of mode 5 (a)"
+    )
     outcome.say(f"the controlled modes give up {-works['a'].controlled_total:.7f} whatever the places")
     labels = {name: ", ".join(f"{x:g}" for x in places) for name, places in PLACES.items()}
-    outcome.figure("response", plot_displacements(
-        {labels[n]: r for n, r in responses.items()}, {labels[n]: p for n, p in PLACES.items()}, TIMES, np.linspace(0, 10, 201)),
-        "Displacement of the beam after an impulse at x = 6.3, for three sets of actuators (crosses). Figs. 5.1-5.6.")
-    outcome.figure("work", plot_work({labels[n]: w for n, w in works.items()}),
-                   "Work that control spills into the five residual modes.")
+    outcome.figure(
+        "response",
+        plot_displacements(
+            {labels[n]: r for n, r in responses.items()},
+            {labels[n]: p for n, p in PLACES.items()},
+            TIMES,
+            np.linspace(0, 10, 201),
+        ),
+        "Displacement of the beam after an impulse at x = 6.3, for three sets of actuators (crosses). Figs. 5.1-5.6.",
+    )
+    outcome.figure(
+        "work",
+        plot_work({labels[n]: w for n, w in works.items()}),
+        "Work that control spills into the five residual modes.",
+    )

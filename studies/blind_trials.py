@@ -24,20 +24,31 @@ def verdicts(folders: list[Path]) -> Iterator[dict]:
 
 def study(outcome, data: Path) -> None:
     folders = sorted(path.parent for path in data.glob("*/case.toml"))
-    found = dict(zip([f.name for f in folders], outcome.track(_Sized(verdicts(folders), len(folders)), "cases"), strict=True))
+    found = dict(
+        zip([f.name for f in folders], outcome.track(_Sized(verdicts(folders), len(folders)), "cases"), strict=True)
+    )
 
     rows = []
     for name, verdict in found.items():
         kinds = " + ".join(effect["kind"] for effect in verdict["effects"]) or "none"
         closed = verdict["shrinkage"].get("validate")
-        rows.append({"case": name, "outcome": verdict["outcome"], "effects": kinds, "share_closed": closed,
-                     "residual": verdict["residual"]["corrected"]})
+        rows.append(
+            {
+                "case": name,
+                "outcome": verdict["outcome"],
+                "effects": kinds,
+                "share_closed": closed,
+                "residual": verdict["residual"]["corrected"],
+            }
+        )
         outcome.say(f"{name}  {verdict['sentence']}")
     outcome.table("verdicts", found)
     outcome.table("table", rows)
     closed = sorted(r["share_closed"] for r in rows if r["outcome"] == "explained" and r["share_closed"] is not None)
     if closed:
-        outcome.check("median share of the closable gap closed where explained", closed[len(closed) // 2], 0.95, at_least=True)
+        outcome.check(
+            "median share of the closable gap closed where explained", closed[len(closed) // 2], 0.95, at_least=True
+        )
 
 
 class _Sized:

@@ -11,7 +11,6 @@ from workbench.draw.design import plot_comparison
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 
-
 MODAL_WEIGHT = 20.0
 # at the nodes of mode 5, B Bᵀ = ½ I, so R f² on modal forces is R/2 F² on actuator forces: one and the same problem
 FORCE_WEIGHT = 10.0
@@ -41,11 +40,19 @@ def study(outcome, data=None):
 
     def compared(places):
         actuators = [Actuator(f"F{i + 1}", x) for i, x in enumerate(places)]
-        laws = {"IMSC": imsc(modes, 4, actuators, weight=MODAL_WEIGHT),
-                "coupled LQR": coupled_lqr(modes, 4, actuators, weight=FORCE_WEIGHT)}
-        return [{"law": label, "cost": quadratic_cost(modes, law, state, FORCE_WEIGHT),
-                 "effort": effort(modes, law, state), "W_R": spillover(modes, law, state).residual_total}
-                for label, law in laws.items()]
+        laws = {
+            "IMSC": imsc(modes, 4, actuators, weight=MODAL_WEIGHT),
+            "coupled LQR": coupled_lqr(modes, 4, actuators, weight=FORCE_WEIGHT),
+        }
+        return [
+            {
+                "law": label,
+                "cost": quadratic_cost(modes, law, state, FORCE_WEIGHT),
+                "effort": effort(modes, law, state),
+                "W_R": spillover(modes, law, state).residual_total,
+            }
+            for label, law in laws.items()
+        ]
 
     rows, crowded = compared((2.0, 4.0, 6.0, 8.0)), compared((1.3, 2.6, 3.9, 5.2))
     outcome.table("nodes_of_mode_5", rows)
@@ -54,8 +61,11 @@ def study(outcome, data=None):
     residual, gains = riccati_errors()
     outcome.check("Riccati residual of the closed form over five decades, relative", residual, 1e-12)
     outcome.check("gains against control.lqr mode by mode, relative", gains, 1e-8)
-    outcome.check("nodes of mode 5: cost of coupled LQR against IMSC, relative difference",
-                  abs(rows[1]["cost"] / rows[0]["cost"] - 1.0), 1e-9)
+    outcome.check(
+        "nodes of mode 5: cost of coupled LQR against IMSC, relative difference",
+        abs(rows[1]["cost"] / rows[0]["cost"] - 1.0),
+        1e-9,
+    )
     outcome.check("cost of coupled LQR over IMSC, actuators crowded", crowded[1]["cost"] / crowded[0]["cost"], 1.0)
     outcome.say("actuators at the nodes of mode 5: IMSC and coupled LQR are the same law")
     outcome.say(

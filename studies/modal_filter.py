@@ -23,7 +23,9 @@ PRINTED = {
 def pattern(x, derivative=0):
     """F(x) of (5.54), or its slope."""
     i = np.arange(1, 16)
-    waves = np.sin(np.outer(x, i) * np.pi / 10) if derivative == 0 else np.cos(np.outer(x, i) * np.pi / 10) * i * np.pi / 10
+    waves = (
+        np.sin(np.outer(x, i) * np.pi / 10) if derivative == 0 else np.cos(np.outer(x, i) * np.pi / 10) * i * np.pi / 10
+    )
     return waves @ (1.0 / (2.0 * i) ** 2) / np.sqrt(5.0)
 
 
@@ -42,7 +44,11 @@ def study(outcome, data=None):
     outcome.table("displacement_only", alone)
 
     digits = max(np.abs(np.round(table[k], 5) - PRINTED[k]).max() for k in PRINTED)
-    outcome.check("Table 5.1: largest difference from the printed value, in its last digit", round(digits * 1e5, 3), 1.0)
+    outcome.check(
+        "Table 5.1: largest difference from the printed value, in its last digit", round(digits * 1e5, 3), 1.0
+    )
     errors = np.array([np.abs(table[k] - exact) for k in PRINTED])
     outcome.say(f"11 sensors estimate the first five modal coordinates within {errors[-1].max():.1e}")
-    outcome.figure("errors", plot_filter_errors(list(PRINTED), errors), "Error of each modal coordinate against sensors.")
+    outcome.figure(
+        "errors", plot_filter_errors(list(PRINTED), errors), "Error of each modal coordinate against sensors."
+    )

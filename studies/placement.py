@@ -23,11 +23,17 @@ def study(outcome, data=None):
     on_grid, tried = scan(task, effort_limit=1.5 * nodes.effort, spacing=SPACING, n_places=50)
 
     work, effort = symbolic_work(task)(best.positions)
-    outcome.table("front", [
-        {"effort": p.effort, "W_R": p.residual_work, "positions": p.positions, "condition": p.condition} for p in front
-    ])
+    outcome.table(
+        "front",
+        [
+            {"effort": p.effort, "W_R": p.residual_work, "positions": p.positions, "condition": p.condition}
+            for p in front
+        ],
+    )
     outcome.table("nodes_of_mode_5", {"effort": nodes.effort, "W_R": nodes.residual_work, "positions": nodes.positions})
-    outcome.table("best", {"effort": best.effort, "W_R": best.residual_work, "positions": best.positions, "tried": tried})
+    outcome.table(
+        "best", {"effort": best.effort, "W_R": best.residual_work, "positions": best.positions, "tried": tried}
+    )
     outcome.check("CasADi's W_R against the closed form, relative", abs(float(work) / best.residual_work - 1.0), 1e-8)
     outcome.check("CasADi's effort against the closed form, relative", abs(float(effort) / best.effort - 1.0), 1e-8)
     outcome.check("W_R of the optimum over the best of a full grid", best.residual_work / on_grid.residual_work, 1.0)
@@ -37,6 +43,9 @@ def study(outcome, data=None):
         f" {best.residual_work:.3e} at x = {', '.join(f'{x:.2f}' for x in best.positions)}"
     )
     outcome.say(f"none of {tried} placements on a grid does better under the same limits")
-    outcome.figure("front", plot_effort_front(front, {"nodes of mode 5": nodes, "effort limit 1.5 times theirs": best}),
-                   "Least spillover at each effort, and where the actuators then stand.")
+    outcome.figure(
+        "front",
+        plot_effort_front(front, {"nodes of mode 5": nodes, "effort limit 1.5 times theirs": best}),
+        "Least spillover at each effort, and where the actuators then stand.",
+    )
     assert np.all(np.diff(best.positions) >= SPACING - 1e-6)

@@ -63,7 +63,9 @@ def _progress() -> Progress:
 @app.command()
 @_guarded
 def study(
-    name: Annotated[str | None, typer.Argument(help="Name of a study, or path of its script; without it, a list.")] = None,
+    name: Annotated[
+        str | None, typer.Argument(help="Name of a study, or path of its script; without it, a list.")
+    ] = None,
     data: Annotated[Path | None, typer.Option(help="File or folder that the study works on.")] = None,
 ) -> None:
     """Run a study, or list them.
@@ -133,10 +135,13 @@ def diagnose(
     console.print(verdict.sentence, style="bold", markup=False)
     shown = verdict.to_json()
     where = verdict.where
-    console.print(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on level")
+    console.print(
+        f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on level"
+    )
     console.print(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
+    after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
-        console.print(f"  {name:<10} gap {before:.4g} → {shown['gap']['after'][name]:.4g}, floor {shown['gap']['floor'][name]:.4g}")
+        console.print(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, floor {floor[name]:.4g}")
     for label, probability in verdict.alternatives[:3]:
         console.print(f"  rival      {label} ({probability:.2g})", markup=False)
     for note in verdict.notes:

@@ -44,11 +44,17 @@ def coupled_lqr(
     r = np.asarray(weight, float)
     r = r * np.eye(len(actuators)) if r.ndim == 0 else np.diag(r) if r.ndim == 1 else r
     if r.shape != (len(actuators),) * 2 or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
-        raise DesignError(f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {weight}")
+        raise DesignError(
+            f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {weight}"
+        )
     try:
         gain, _, poles = control.lqr(a, b, q, r)
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
-        raise DesignError(f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}") from error
+        raise DesignError(
+            f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
+        ) from error
     if not (np.real(poles) < 0).all():
-        raise DesignError(f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator")
+        raise DesignError(
+            f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
+        )
     return Law(np.asarray(gain), index, actuators, "coupled LQR")

@@ -38,7 +38,9 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
         raise DesignError(f"the control weight R must be positive; got {weight.min() if weight.size else weight}")
     square, inverse = omega**2, 1.0 / weight
     # a rigid-body mode has no potential energy to weigh: the gain on its displacement is then zero
-    g1 = np.where(square > 0, square * inverse / np.maximum(square + np.sqrt(square**2 + square * inverse), 1e-300), 0.0)
+    g1 = np.where(
+        square > 0, square * inverse / np.maximum(square + np.sqrt(square**2 + square * inverse), 1e-300), 0.0
+    )
     excess = inverse + 2.0 * g1
     g2 = excess / (c + np.sqrt(c**2 + excess))
     return g1, g2
@@ -70,9 +72,7 @@ def pole_gains(omega: ArrayLike, poles: ArrayLike, damping: ArrayLike = 0.0) -> 
     return np.abs(poles) ** 2 - omega**2, -2.0 * poles.real - damping
 
 
-def imsc(
-    modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, weight: ArrayLike
-) -> Law:
+def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, weight: ArrayLike) -> Law:
     """The optimal IMSC law: closed-form Riccati gains, one mode at a time.
 
     Args:
@@ -87,7 +87,9 @@ def imsc(
     return _law(modes, index, actuators, gains, "IMSC")
 
 
-def imsc_poles(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, poles: ArrayLike) -> Law:
+def imsc_poles(
+    modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, poles: ArrayLike
+) -> Law:
     """The IMSC law with the closed-loop poles given, one of each conjugate pair per controlled mode, rad/s."""
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]

@@ -38,7 +38,9 @@ class Law:
         object.__setattr__(self, "actuators", tuple(self.actuators))
         expected = (len(self.actuators), 2 * len(self.controlled))
         if self.gain.shape != expected:
-            raise ValueError(f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {self.gain.shape}")
+            raise ValueError(
+                f"Law.gain must have shape (n_actuators, 2 n_controlled) = {expected}; got {self.gain.shape}"
+            )
 
     @property
     def n_controlled(self) -> int:
@@ -54,7 +56,9 @@ def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[i
     index = range(controlled) if isinstance(controlled, int) else controlled
     index = tuple(int(r) for r in index)
     if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= modes.n_modes:
-        raise DesignError(f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)")
+        raise DesignError(
+            f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)"
+        )
     return index
 
 

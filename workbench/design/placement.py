@@ -82,7 +82,9 @@ class PlacementTask:
     def placed(self, positions: ArrayLike, status: str, optima=()) -> Placement:
         """A `Placement` of given positions."""
         total, by_mode, effort, condition = self.evaluate(positions)
-        return Placement(np.sort(np.asarray(positions, float)), total, by_mode, effort, condition, status, tuple(optima))
+        return Placement(
+            np.sort(np.asarray(positions, float)), total, by_mode, effort, condition, status, tuple(optima)
+        )
 
 
 def placement_task(modes: Modes, n_controlled: int, *, impulse_at: float, weight: float, impulse: float = 1.0):
@@ -232,7 +234,8 @@ def symbolic_work(task: PlacementTask):
     spline = make_interp_spline(grid, modes.phi(grid), k=SPLINE_DEGREE)
     x = ca.MX.sym("x", n)
     columns = [
-        ca.bspline(x[i], ca.DM(spline.c.ravel()), [list(spline.t)], [SPLINE_DEGREE], modes.n_modes, {}) for i in range(n)
+        ca.bspline(x[i], ca.DM(spline.c.ravel()), [list(spline.t)], [SPLINE_DEGREE], modes.n_modes, {})
+        for i in range(n)
     ]
     shapes = ca.horzcat(*columns)
     inverse = ca.inv(shapes[:n, :])

@@ -109,7 +109,7 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
 
 
 def _cross(push: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """The share of W_r from motion already there: z' = iω z + f with z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)."""
+    """The share of W_r from motion already there: with z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)."""
     return (np.conj(moving) * push).real
 
 
@@ -170,4 +170,3 @@ def _energies(modes: Modes, state: np.ndarray) -> np.ndarray:
 def energy_gained(loop: ClosedLoop, state: np.ndarray, final_time: float) -> np.ndarray:
     """Energy of each mode at the final time less that at the start, (n_modes,), from the motion itself."""
     return _energies(loop.modes, expm(loop.matrix * final_time) @ state) - _energies(loop.modes, state)
-

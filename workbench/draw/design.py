@@ -41,8 +41,15 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     width = 0.8 / len(spillovers)
     for i, (name, work) in enumerate(spillovers.items()):
         values = np.maximum(work.residual_work, 1e-12)
-        ax.bar(modes + (i - 0.5 * (len(spillovers) - 1)) * width, values, width, label=f"{name}: W_R = {work.residual_total:.3g}")
-    ax.set(yscale="log", xlabel="residual mode", ylabel="work spilled into the mode, W_r", xticks=modes, ylim=(1e-6, None))
+        ax.bar(
+            modes + (i - 0.5 * (len(spillovers) - 1)) * width,
+            values,
+            width,
+            label=f"{name}: W_R = {work.residual_total:.3g}",
+        )
+    ax.set(
+        yscale="log", xlabel="residual mode", ylabel="work spilled into the mode, W_r", xticks=modes, ylim=(1e-6, None)
+    )
     ax.set_title("control spillover: the energy that control leaves in the modes it does not control")
     ax.legend()
     return figure

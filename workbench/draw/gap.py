@@ -61,7 +61,10 @@ def plot_where(verdict: Verdict) -> Figure:
             axes[1, 1].axvline(effect.values["at"], color=COLOURS[0])
     low = max(profile.min(), -50.0 * max(1.0, abs(profile[np.argsort(profile)[-3]])))
     axes[1, 1].set(
-        title="where a missing force would stand", xlabel="x [m]", ylabel="log-likelihood, less its peak", ylim=(low, None)
+        title="where a missing force would stand",
+        xlabel="x [m]",
+        ylabel="log-likelihood, less its peak",
+        ylim=(low, None),
     )
     return figure
 
@@ -74,7 +77,10 @@ def plot_missing_force(verdict: Verdict) -> Figure:
         place = verdict.attribution.evidence.place(chosen[0].values["at"])
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
     step = max(1, place.force.size // 4000)
-    for ax, series, name in ((axes[0], place.displacement, "displacement [m]"), (axes[1], place.velocity, "velocity [m/s]")):
+    for ax, series, name in (
+        (axes[0], place.displacement, "displacement [m]"),
+        (axes[1], place.velocity, "velocity [m/s]"),
+    ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
         ax.set_xlabel(f"{name} at x = {place.at:.3g}")
         law = _law(chosen, series, name)
@@ -117,6 +123,10 @@ def plot_rivals(verdict: Verdict) -> Figure:
     ax.barh(labels[::-1], costs[::-1], color=colours[::-1])
     ax.axvline(1.0, color=COLOURS[2], label="noise floor")
     ax.axvline(verdict.attribution.nominal_cost, color=COLOURS[1], linestyle="--", label="nominal")
-    ax.set(xscale="log", xlabel="mean square residual, in units of the noise", title="each effect alone, fitted as well as it can be")
+    ax.set(
+        xscale="log",
+        xlabel="mean square residual, in units of the noise",
+        title="each effect alone, fitted as well as it can be",
+    )
     ax.legend(loc="lower right")
     return figure

@@ -8,8 +8,8 @@ import numpy as np
 
 from workbench.gap.disturbance import RandomForceFit, fit_random_force
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.containment import simpler_forms
+from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence

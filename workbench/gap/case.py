@@ -79,8 +79,11 @@ def read_case(folder: str | Path) -> Case:
     if not isinstance(structure, dict):
         raise CaseError(f"{path}: the table [structure] is missing")
     try:
-        rig = _modal_rig(structure, inputs, outputs) if structure.get("kind") == "modal" else _member_rig(
-            structure, inputs, outputs)
+        rig = (
+            _modal_rig(structure, inputs, outputs)
+            if structure.get("kind") == "modal"
+            else _member_rig(structure, inputs, outputs)
+        )
     except CaseError as error:
         raise CaseError(f"{path}: {error}") from error
     except (ValueError, TypeError, ArithmeticError) as error:
@@ -192,10 +195,13 @@ def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     else:
         omega = 2.0 * np.pi * _numbers(table, "natural_frequencies_hz", "[structure]")
         damping = _numbers(table, "damping_ratios", "[structure]", omega.size)
-        values = np.array([
-            _numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
-            for key, entries in (("[[input]]", inputs), ("[[output]]", outputs)) for e in entries
-        ])
+        values = np.array(
+            [
+                _numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
+                for key, entries in (("[[input]]", inputs), ("[[output]]", outputs))
+                for e in entries
+            ]
+        )
     names = tuple(e["name"] for e in (*inputs, *outputs))
     shapes = KnownPlaces(names, values)
     modes = Modes(omega=omega, damping=damping, shapes=shapes, length=float(max(len(names) - 1, 1)))
@@ -278,7 +284,9 @@ def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
         )
     for sensor in rig.sensors:
         if np.ptp(arrays[sensor.name]) == 0:
-            raise CaseError(f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?")
+            raise CaseError(
+                f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?"
+            )
     return Record(
         sample_time=sample_time,
         outputs=np.array([arrays[s.name] for s in rig.sensors]),

@@ -99,7 +99,9 @@ def fit_random_force(
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
     forces = [smoothed_states(kalman, r)[2 * rig.modes.n_modes] for r in residuals]
-    deviations = [_deviation(lambda p: loss(p, stages, residuals), found.x, j, step) for j, step in ((0, 2e-3), (1, 2e-2))]
+    deviations = [
+        _deviation(lambda p: loss(p, stages, residuals), found.x, j, step) for j, step in ((0, 2e-3), (1, 2e-2))
+    ]
     return RandomForceFit(
         at=float(x * length),
         rms=float(np.exp(log_rms)),

@@ -141,7 +141,7 @@ class Evidence:
         for motion, residual in zip(self.motions, self.residuals, strict=True):
             states = smoothed_states(kalman, residual)
             error_q, error_v, force = states[:n], states[n : 2 * n], states[2 * n]
-            error_a = -self.rig.modes.omega[:, None] ** 2 * error_q - self.rig.modes.damping @ error_v
+            error_a = -(self.rig.modes.omega[:, None] ** 2) * error_q - self.rig.modes.damping @ error_v
             pieces.append(
                 (
                     force,

@@ -66,8 +66,10 @@ class _Problem:
         for i, effect in enumerate(self.effects):
             self.parameters += [(i, p) for p in effect.parameters(base)]
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
-        floor = [1e-2 if p.logarithmic or p.name == "at" else 1e-3 * abs(z) + 1e-9 for (_, p), z in zip(
-            self.parameters, self.start, strict=True)]
+        floor = [
+            1e-2 if p.logarithmic or p.name == "at" else 1e-3 * abs(z) + 1e-9
+            for (_, p), z in zip(self.parameters, self.start, strict=True)
+        ]
         self.steps = np.array(floor)
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
@@ -92,9 +94,7 @@ class _Problem:
         return np.array(columns).T
 
 
-def fit(
-    rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int = 25, tolerance: float = 1e-5
-) -> Fit:
+def fit(rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int = 25, tolerance: float = 1e-5) -> Fit:
     """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
 
     Args:

@@ -51,8 +51,10 @@ class Where:
 def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
     """Take the gap on the fit records apart; the path is that of the effects, where they are known."""
     data = evidence.data
-    scaled = [r / record.outputs.std(axis=1, keepdims=True) for record, r in zip(
-        data.records, evidence.residuals, strict=True)]
+    scaled = [
+        r / record.outputs.std(axis=1, keepdims=True)
+        for record, r in zip(data.records, evidence.residuals, strict=True)
+    ]
     floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.records]
     excess = np.array([(s**2).mean(axis=1) - f for s, f in zip(scaled, floors, strict=True)])
     by_sensor = np.maximum(excess, 0.0).sum(axis=0)

@@ -14,7 +14,6 @@ from scipy.linalg import cho_factor, cho_solve, expm
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
 
-
 RUNAWAY = 1e100
 
 

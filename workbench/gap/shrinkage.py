@@ -46,8 +46,14 @@ def measure(
         scale = record.outputs.std(axis=1, keepdims=True)
         scale = np.where(scale > 0, scale, 1.0)
         errors = [
-            ((record.outputs - simulate(rig, record.inputs, sample_time=record.sample_time, substeps=substeps).outputs)
-             / scale) ** 2
+            (
+                (
+                    record.outputs
+                    - simulate(rig, record.inputs, sample_time=record.sample_time, substeps=substeps).outputs
+                )
+                / scale
+            )
+            ** 2
             for rig in (nominal, corrected)
         ]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale

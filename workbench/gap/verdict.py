@@ -143,7 +143,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
     units = {p.name: p.unit for p in effect.parameters(nominal)}
     numbers = [
-        f"{name.replace('_', ' ')} {_with_deviation(value, effect.deviations.get(name, 0.0))} {units.get(name, '')}".strip()
+        " ".join((name.replace("_", " "), _with_deviation(value, effect.deviations.get(name, 0.0)), units[name])).strip()
         for name, value in effect.values.items()
         if name != "at"
     ]

@@ -120,8 +120,9 @@ def _assembled(path, time, signals, header, sample_rate_hz, inputs) -> Record:
     start, step = _sampling(path, time, most, header, sample_rate_hz)
     missing = [name for name in inputs if name not in {_plain(key) for key in signals}]
     if missing:
-        raise RecordFileError(f"{path} has no channel {missing[0]!r} to be an input; it has"
-                              f" {', '.join(_plain(key) for key in signals)}")
+        raise RecordFileError(
+            f"{path} has no channel {missing[0]!r} to be an input; it has {', '.join(_plain(key) for key in signals)}"
+        )
     channels, rows = {"input": [], "output": []}, {"input": [], "output": []}
     for key, values in signals.items():
         facts = known.get(key, {})

@@ -151,7 +151,9 @@ class Record:
             time <= (time[-1] if stop is None else stop) + slack
         )
         if not keep.any():
-            raise ValueError(f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: nothing in {start}..{stop}")
+            raise ValueError(
+                f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: nothing in {start}..{stop}"
+            )
         return Record(
             sample_time=self.sample_time,
             outputs=self.outputs[:, keep],
@@ -166,7 +168,9 @@ class Record:
         """The record with only the named outputs, in that order."""
         missing = [name for name in outputs if name not in self.output_names]
         if missing:
-            raise ValueError(f"record {self.name!r} has no output {missing[0]!r}; it has {', '.join(self.output_names)}")
+            raise ValueError(
+                f"record {self.name!r} has no output {missing[0]!r}; it has {', '.join(self.output_names)}"
+            )
         rows = [self.output_names.index(name) for name in outputs]
         return Record(
             sample_time=self.sample_time,

@@ -28,12 +28,19 @@ def read(path: Path):
             raise RecordFileError(f"{path}, data set {number} is complex: is it a transfer function?")
         facts = _facts(entry)
         name = facts.get("name") or f"node {entry['rsp_node']} direction {entry['rsp_dir']}"
-        facts = {"kind": "output", "quantity": QUANTITIES.get(entry.get("ordinate_spec_data_type"), ""), **facts, "name": name}
+        facts = {
+            "kind": "output",
+            "quantity": QUANTITIES.get(entry.get("ordinate_spec_data_type"), ""),
+            **facts,
+            "name": name,
+        }
         key = f"{facts['kind']}:{name}"
         if key in signals:
             raise RecordFileError(f"{path}, data set {number}: a second channel is called {name!r}")
         here = np.asarray(entry["x"], float)
-        if time is not None and (here.size != time.size or np.abs(here - time).max() > 1e-6 * max(np.abs(time).max(), 1e-300)):
+        if time is not None and (
+            here.size != time.size or np.abs(here - time).max() > 1e-6 * max(np.abs(time).max(), 1e-300)
+        ):
             raise RecordFileError(f"{path}, data set {number} ({name}) has other sample instants than the first")
         time = here if time is None else time
         signals[key] = data.astype(float)
@@ -78,11 +85,25 @@ def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
         lines = {f"id{j + 1}": text[j * LINE : (j + 1) * LINE].ljust(LINE, " ") or " " for j in range(5)}
         file.write_sets(
             pyuff.prepare_58(
-                **lines, binary=0, func_type=1, rsp_node=i + 1, rsp_dir=3, ref_node=1, ref_dir=3, ver_num=0,
-                ord_data_type=4, abscissa_spacing=1, num_pts=values.size, abscissa_min=float(time[0]),
-                abscissa_inc=header["sample_time"], abscissa_spec_data_type=17, orddenom_spec_data_type=0,
+                **lines,
+                binary=0,
+                func_type=1,
+                rsp_node=i + 1,
+                rsp_dir=3,
+                ref_node=1,
+                ref_dir=3,
+                ver_num=0,
+                ord_data_type=4,
+                abscissa_spacing=1,
+                num_pts=values.size,
+                abscissa_min=float(time[0]),
+                abscissa_inc=header["sample_time"],
+                abscissa_spec_data_type=17,
+                orddenom_spec_data_type=0,
                 z_axis_spec_data_type=0,
-                ordinate_spec_data_type=TYPES.get(facts["quantity"], 0), x=time, data=np.asarray(values, float),
+                ordinate_spec_data_type=TYPES.get(facts["quantity"], 0),
+                x=time,
+                data=np.asarray(values, float),
                 return_full_dict=False,
             ),
             mode="add",

@@ -107,11 +107,13 @@ class PeriodicForce:
 
 @dataclass(frozen=True)
 class RandomForce:
-    """An unmeasured force at x, white from sample to sample: rms in N. No prediction can hold it, only its statistics."""
+    """An unmeasured random force at x: rms in N. No prediction can hold it, only its statistics."""
 
     at: float
     rms: float
 
 
-PointElement = LinearSpring | LinearDamper | CubicSpring | Clearance | OneSidedStop | CoulombFriction | BoucWen | UserLaw
+PointElement = (
+    LinearSpring | LinearDamper | CubicSpring | Clearance | OneSidedStop | CoulombFriction | BoucWen | UserLaw
+)
 Element = PointElement | AirDrag | MidplaneStretching | PeriodicForce | RandomForce

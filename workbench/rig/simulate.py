@@ -8,7 +8,6 @@ import numpy as np
 from scipy.signal import lfilter
 
 from workbench.records.record import Channel, Record
-from workbench.rig import stepping
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import (
     AirDrag,
@@ -27,16 +26,28 @@ from workbench.rig.elements import (
 from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.stepping import (
+    BOUC_WEN,
+    CLEARANCE,
+    CUBIC,
+    FRICTION,
+    LINEAR_DAMPER,
+    LINEAR_SPRING,
+    ONE_SIDED,
+    USER,
+    make_stepper,
+    step_record,
+)
 
 LAWS = {
-    LinearSpring: (stepping.LINEAR_SPRING, lambda e: (e.stiffness,)),
-    LinearDamper: (stepping.LINEAR_DAMPER, lambda e: (e.coefficient,)),
-    CubicSpring: (stepping.CUBIC, lambda e: (e.stiffness,)),
-    Clearance: (stepping.CLEARANCE, lambda e: (e.stiffness, e.gap)),
-    OneSidedStop: (stepping.ONE_SIDED, lambda e: (e.stiffness, e.gap)),
-    CoulombFriction: (stepping.FRICTION, lambda e: (e.force, e.smoothing_speed)),
-    BoucWen: (stepping.BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
-    UserLaw: (stepping.USER, lambda e: e.parameters),
+    LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
+    LinearDamper: (LINEAR_DAMPER, lambda e: (e.coefficient,)),
+    CubicSpring: (CUBIC, lambda e: (e.stiffness,)),
+    Clearance: (CLEARANCE, lambda e: (e.stiffness, e.gap)),
+    OneSidedStop: (ONE_SIDED, lambda e: (e.stiffness, e.gap)),
+    CoulombFriction: (FRICTION, lambda e: (e.force, e.smoothing_speed)),
+    BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
+    UserLaw: (USER, lambda e: e.parameters),
 }
 
 
@@ -217,10 +228,10 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
 @cache
 def _stepper(laws: tuple[Callable, ...]):
     if not laws:
-        return stepping.step_record
+        return step_record
     if len(set(laws)) > 1:
         raise ValueError("a rig carries one law of the user's own at a time; got several")
-    return stepping.make_stepper(laws[0])
+    return make_stepper(laws[0])
 
 
 def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:

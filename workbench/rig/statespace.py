@@ -22,7 +22,8 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
         for at, held in modes.essential:
             if held == derivative and abs(actuator.at - at) <= 1e-9 * modes.length:
                 raise ValueError(
-                    f"actuator {actuator.name} stands on the support at x = {at:g}, where it moves no mode; move it inside"
+                    f"actuator {actuator.name} stands on the support at x = {at:g}, where it moves no mode;"
+                    " move it inside"
                 )
         columns.append(actuator.gain * modes.phi(actuator.at, derivative)[0])
     return np.array(columns).reshape(len(columns), modes.n_modes).T

@@ -124,8 +124,24 @@ def solve_element(kind, p, w0, v0, aw, av, z, w_old, start):
 
 @njit(cache=True, nogil=True)
 def step_record(
-    omega, c, coupling, dt, n_sub, rate, forces, participation, stretch, stretching, drag_shapes, drag_weights,
-    kinds, shapes, parameters, q_out, v_out, f_out,
+    omega,
+    c,
+    coupling,
+    dt,
+    n_sub,
+    rate,
+    forces,
+    participation,
+    stretch,
+    stretching,
+    drag_shapes,
+    drag_weights,
+    kinds,
+    shapes,
+    parameters,
+    q_out,
+    v_out,
+    f_out,
 ):
     """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest.
 
@@ -184,7 +200,7 @@ def step_record(
                         kinds[0], parameters[0], w0, v0, aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
                     )
                 else:
-                    for gauss in range(12 if n_elements > 1 else 0):
+                    for _ in range(12 if n_elements > 1 else 0):
                         largest = 0.0
                         for i in range(n_elements):
                             w0, v0 = 0.0, 0.0

@@ -140,21 +140,17 @@ class _Member:
         # relative to them and not to the highest frequency the basis can carry. σ keeps K + σ M definite where the
         # ends leave rigid-body modes.
         middle = np.linspace(0.05, 0.95, 19) * self.length
-        shift = np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle)) * (np.pi / self.length) ** (2 * order)
+        shift = (
+            np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle)) * (np.pi / self.length) ** (2 * order)
+        )
         try:
             nu, vectors = eigh(mass, rigidity + shift * mass, subset_by_index=[free.size - n_modes, free.size - 1])
         except LinAlgError as error:
-            if tension < 0:
-                raise ValueError(
-                    f"a tension of {tension:g} compresses the beam beyond buckling; lower its magnitude"
-                ) from error
-            raise ValueError("a negative stiffness makes the structure unstable; check springs and profiles") from error
+            raise ValueError(_unstable(tension)) from error
         nu, vectors = nu[::-1], vectors[:, ::-1]
         eigenvalues = 1.0 / nu - shift
         if (eigenvalues < -1e-7 * shift).any():
-            raise ValueError(
-                f"the structure is unstable: an eigenvalue ω² of {eigenvalues.min():g}; check compression and springs"
-            )
+            raise ValueError(_unstable(tension))
         omega = np.sqrt(np.where(eigenvalues < 1e-10 * shift, 0.0, eigenvalues))
         coefficients = np.zeros((segments.n_functions, n_modes))
         coefficients[free] = vectors / np.sqrt(np.einsum("ir,ij,jr->r", vectors, mass, vectors, optimize=True))
@@ -191,6 +187,12 @@ class _Member:
                         row = segments.evaluation(part.at, derivative) @ coefficients
                         matrix = matrix + value * row.T @ row
         return matrix
+
+
+def _unstable(tension: float) -> str:
+    if tension < 0:
+        return f"a tension of {tension:g} compresses the beam beyond buckling; lower its magnitude"
+    return "the structure is unstable: an eigenvalue ω² is negative; check springs and profiles"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -20,8 +20,11 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...]) -> Modes:
             extra_damping.append(part)
             continue
         target = mass if isinstance(part, PointMass) else stiffness
-        pair = (part.mass, part.rotary_inertia) if isinstance(part, PointMass) else (
-            part.stiffness, part.rotational_stiffness)
+        pair = (
+            (part.mass, part.rotary_inertia)
+            if isinstance(part, PointMass)
+            else (part.stiffness, part.rotational_stiffness)
+        )
         for derivative, value in enumerate(pair):
             if value:
                 shape = modes.phi(part.at, derivative)[0]

@@ -80,7 +80,9 @@ def write_page(
         lead=lead,
         lines=list(lines),
         figures=shown,
-        tables=[{"title": t, "heads": heads, "rows": [[_cell(c) for c in r] for r in rows]} for t, heads, rows in tables],
+        tables=[
+            {"title": t, "heads": heads, "rows": [[_cell(c) for c in r] for r in rows]} for t, heads, rows in tables
+        ],
         made_by=made_by,
         versions=versions(),
     )

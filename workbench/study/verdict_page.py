@@ -13,10 +13,16 @@ def verdict_page(verdict: Verdict, case: Case, path: Path) -> Path:
     """Write the page: the verdict, measured beside nominal and corrected, where, the missing force, the rivals."""
     shown = verdict.to_json()
     figures = [
-        (plot_responses(verdict, (*case.fit, *case.validation)), "Measured, nominal and corrected response where they"
-         " differ most. Validation records were not seen by any fit."),
-        (plot_where(verdict), "Where the gap is. Its squared size above the noise, shared out; and how likely a single"
-         " unknown force at each place would explain it, before any effect is guessed."),
+        (
+            plot_responses(verdict, (*case.fit, *case.validation)),
+            "Measured, nominal and corrected response where they"
+            " differ most. Validation records were not seen by any fit.",
+        ),
+        (
+            plot_where(verdict),
+            "Where the gap is. Its squared size above the noise, shared out; and how likely a single"
+            " unknown force at each place would explain it, before any effect is guessed.",
+        ),
         (plot_missing_force(verdict), "The missing force as the records tell it, against the motion at its place."),
         (plot_rivals(verdict), "What each effect alone leaves of the gap: at the noise floor, it explains all of it."),
     ]
@@ -25,9 +31,17 @@ def verdict_page(verdict: Verdict, case: Case, path: Path) -> Path:
         for name, before in shown["gap"]["before"].items()
     ]
     effects = [
-        (effect["kind"], name, value, effect.get("parameters_std", {}).get(name, ""), effect.get("at", ""),
-         effect.get("input", effect.get("output", "")))
-        for effect in (shown["effects"] if shown["effects"] and shown["effects"][0]["kind"] != "unknown" else shown["nearest"])
+        (
+            effect["kind"],
+            name,
+            value,
+            effect.get("parameters_std", {}).get(name, ""),
+            effect.get("at", ""),
+            effect.get("input", effect.get("output", "")),
+        )
+        for effect in (
+            shown["effects"] if shown["effects"] and shown["effects"][0]["kind"] != "unknown" else shown["nearest"]
+        )
         for name, value in effect["parameters"].items()
     ]
     rivals = [(r["kind"], r["probability"]) for r in shown["alternatives"]]

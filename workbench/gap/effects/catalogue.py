@@ -15,10 +15,13 @@ A kind of your own is one more `Kind`; hand `(*CATALOGUE, mine)` to the diagnosi
     )
 """
 
-from workbench.gap.effects import environment, nonlinear, ports, structural
 from workbench.gap.effects.effect import Kind
+from workbench.gap.effects.environment import KINDS as OF_THE_ENVIRONMENT
+from workbench.gap.effects.nonlinear import KINDS as NONLINEAR
+from workbench.gap.effects.ports import KINDS as OF_PORTS
+from workbench.gap.effects.structural import KINDS as STRUCTURAL
 
-CATALOGUE: tuple[Kind, ...] = (*structural.KINDS, *nonlinear.KINDS, *ports.KINDS, *environment.KINDS)
+CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_PORTS, *OF_THE_ENVIRONMENT)
 
 
 def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:

@@ -40,9 +40,7 @@ def _change_actuators(rig: Rig, target: str, **changes) -> Rig:
 
 
 def _change_sensors(rig: Rig, target: str, **changes) -> Rig:
-    return replace(
-        rig, sensors=tuple(replace(s, **changes) if target in (s.name, ALL) else s for s in rig.sensors)
-    )
+    return replace(rig, sensors=tuple(replace(s, **changes) if target in (s.name, ALL) else s for s in rig.sensors))
 
 
 def _commands(evidence, target: str) -> np.ndarray:
@@ -63,7 +61,9 @@ def _sample_time(evidence) -> float:
     return evidence.data.records[0].sample_time
 
 
-def _actuator(name: str, field: str, unit: str, phrase: str, *, targets, starts, low, high, log=True, **options) -> Kind:
+def _actuator(
+    name: str, field: str, unit: str, phrase: str, *, targets, starts, low, high, log=True, **options
+) -> Kind:
     """A kind that sets one figure of an actuator."""
     attribute = {"gain": "gain", "time_constant": "time_constant", "delay": "delay", "limit": "limit"}.get(
         field, "dead_zone"

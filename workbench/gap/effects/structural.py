@@ -248,7 +248,25 @@ AXIAL_LOAD = Kind(
     apply=lambda rig, _, v: resolved(rig, replace(rig.structure, tension=rig.structure.tension + v["tension"])),
     starts=lambda evidence, _: [
         {"tension": share * _buckling(evidence.rig)}
-        for share in (-0.9, -0.6, -0.4, -0.25, -0.15, -0.08, -0.03, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 1.0, 1.5, 2.5, 4.0)
+        for share in (
+            -0.9,
+            -0.6,
+            -0.4,
+            -0.25,
+            -0.15,
+            -0.08,
+            -0.03,
+            0.03,
+            0.08,
+            0.15,
+            0.25,
+            0.4,
+            0.6,
+            1.0,
+            1.5,
+            2.5,
+            4.0,
+        )
     ],
     targets=lambda rig: (None,) if isinstance(rig.structure, Beam) else (),
     phrase="an axial load",
@@ -311,7 +329,24 @@ STIFFNESS_DRIFT = Kind(
     apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
     starts=lambda evidence, _: [
         {"rate": share / _duration(evidence)}
-        for share in (-0.6, -0.4, -0.27, -0.18, -0.12, -0.08, -0.05, -0.02, 0.02, 0.05, 0.08, 0.12, 0.18, 0.27, 0.4, 0.6)
+        for share in (
+            -0.6,
+            -0.4,
+            -0.27,
+            -0.18,
+            -0.12,
+            -0.08,
+            -0.05,
+            -0.02,
+            0.02,
+            0.05,
+            0.08,
+            0.12,
+            0.18,
+            0.27,
+            0.4,
+            0.6,
+        )
     ],
     phrase="a stiffness that drifts in time",
 )

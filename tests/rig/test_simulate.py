@@ -1,0 +1,256 @@
+"""The predictor against python-control, scipy's adaptive integrators, and its own limits."""
+
+import control
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import (
+    AirDrag,
+    BoucWen,
+    Clearance,
+    CoulombFriction,
+    CubicSpring,
+    LinearDamper,
+    LinearSpring,
+    MidplaneStretching,
+    OneSidedStop,
+    PeriodicForce,
+    UserLaw,
+)
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.rig.statespace import state_space
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.supports import PointDamper
+
+DT = 0.1
+
+
+def beam(**options):
+    return Beam(
+        length=10.0,
+        mass_per_length=1.0,
+        bending_stiffness=1.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+        **options,
+    )
+
+
+def rig(elements=(), modes=None, actuators=None, sensors=None, **options):
+    actuators = actuators or (Actuator("F1", 2.0), Actuator("F2", 6.3))
+    sensors = sensors or (Sensor("d", 3.1), Sensor("v", 4.4, "velocity"), Sensor("a", 7.0, "acceleration"))
+    return Rig(modes or beam().modes(6), actuators, sensors, elements, **options)
+
+
+def drive(n=300, size=1.0, seed=0):
+    return size * np.random.default_rng(seed).standard_normal((2, n))
+
+
+def continuous(r, inputs, extra=lambda t, q, v: 0.0, n_extra=0, extra_rate=None, scale=lambda t: 1.0):
+    """Displacements at the sensor 'd' by an adaptive integrator, restarted at each sample."""
+    modes, n = r.modes, r.modes.n_modes
+    b = modes.phi([a.at for a in r.actuators]).T
+    state, out = np.zeros(2 * n + n_extra), []
+    for k in range(inputs.shape[1]):
+        out.append(modes.phi(3.1)[0] @ state[:n])
+        u = inputs[:, k]
+
+        def rate(t, s, u=u):
+            q, v = s[:n], s[n : 2 * n]
+            acc = b @ u - scale(t) * modes.omega**2 * q - modes.damping @ v + extra(t, q, v if not n_extra else s)
+            return np.r_[v, acc, extra_rate(q, v, s[2 * n :]) if n_extra else ()]
+
+        state = solve_ivp(rate, (k * DT, (k + 1) * DT), state, method="DOP853", rtol=1e-10, atol=1e-13).y[:, -1]
+    return np.array(out)
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_linear_rig_against_python_control(damped):
+    modes = (beam(attachments=(PointDamper(3.0, 0.2),)) if damped else beam()).modes(6)
+    r = rig(modes=modes)
+    inputs = drive()
+    system = control.c2d(state_space(modes, r.actuators, r.sensors), DT)
+    peer = control.forced_response(system, inputs=inputs, timepts=DT * np.arange(inputs.shape[1])).outputs
+    mine = simulate(r, inputs, sample_time=DT).outputs
+    assert np.abs(mine - peer).max() < 1e-9 * np.abs(peer).max()
+
+
+def test_actuator_lag_and_fractional_delay():
+    actuators = (Actuator("F1", 2.0, time_constant=0.23), Actuator("F2", 6.3, delay=0.137))
+    r = rig(actuators=actuators)
+    inputs = drive(200)
+    fine = 1000
+    held = np.repeat(inputs, fine, axis=1)
+    h = DT / fine
+    shifted = np.r_[np.zeros(round(0.137 / h)), held[1]][: held.shape[1]]
+    lagged = simulate(rig(actuators=(actuators[0],)), held[:1], sample_time=h).outputs
+    delayed = simulate(rig(actuators=(Actuator("F2", 6.3),)), shifted[None], sample_time=h).outputs
+    peer = (lagged + delayed)[:, ::fine]
+    mine = simulate(r, inputs, sample_time=DT).outputs
+    assert np.abs(mine - peer).max() < 1e-8 * np.abs(peer).max()
+
+
+def test_both_lag_and_delay_in_one_actuator():
+    both = rig(actuators=(Actuator("F1", 2.0, time_constant=0.2, delay=0.15),))
+    inputs = drive(200)[:1]
+    held = np.repeat(inputs, 200, axis=1)
+    shifted = np.r_[np.zeros(300), held[0]][None, : held.shape[1]]
+    peer = simulate(rig(actuators=(Actuator("F1", 2.0, time_constant=0.2),)), shifted, sample_time=DT / 200).outputs
+    mine = simulate(both, inputs, sample_time=DT).outputs
+    assert np.abs(mine - peer[:, ::200]).max() < 1e-8 * np.abs(peer).max()
+
+
+@pytest.mark.parametrize(
+    ("element", "force", "size"),
+    [
+        (CubicSpring(4.0, 0.3), lambda w, v: -0.3 * w**3, 0.3),
+        (Clearance(4.0, 0.2, 0.03), lambda w, v: -0.2 * np.sign(w) * max(abs(w) - 0.03, 0.0), 0.3),
+        (OneSidedStop(4.0, 0.2, 0.03), lambda w, v: -0.2 * max(w - 0.03, 0.0), 0.3),
+        (CoulombFriction(4.0, 0.1, 0.05), lambda w, v: -0.1 * np.tanh(v / 0.05), 0.3),
+        (UserLaw(4.0, lambda w, v, p: -p[0] * w * abs(w), (0.4,)), lambda w, v: -0.4 * w * abs(w), 0.3),
+    ],
+)
+def test_point_laws_against_an_adaptive_integrator(element, force, size):
+    r = rig((element,))
+    shape = r.modes.phi(4.0)[0]
+    inputs = drive(120, size)
+    peer = continuous(r, inputs, lambda t, q, v: shape * force(shape @ q, shape @ v))
+    linear = simulate(rig(), inputs, sample_time=DT).outputs[0]
+    errors = [np.abs(simulate(r, inputs, sample_time=DT, substeps=k).outputs[0] - peer).max() for k in (8, 32)]
+    assert np.abs(linear - peer).max() > 30 * errors[0]
+    assert errors[1] < 1e-4 * np.abs(peer).max() and errors[1] < 0.25 * errors[0]
+
+
+def test_bouc_wen_against_an_adaptive_integrator():
+    k, limit = 0.5, 0.2
+    r = rig((BoucWen(4.0, k, limit),))
+    shape, n = r.modes.phi(4.0)[0], r.modes.n_modes
+
+    def rate(q, v, z):
+        speed = shape @ v
+        return speed - (abs(speed) * z + speed * abs(z)) / (2 * limit)
+
+    inputs = drive(120, 0.3)
+    peer = continuous(r, inputs, lambda t, q, s: -k * s[2 * n] * shape, 1, rate)
+    mine = simulate(r, inputs, sample_time=DT, substeps=32).outputs[0]
+    assert np.abs(mine - peer).max() < 2e-4 * np.abs(peer).max()
+
+
+@pytest.mark.parametrize(("element", "limit"), [(MidplaneStretching(0.4), 1e-5), (AirDrag(0.3), 5e-4)])
+def test_stretching_and_drag_against_an_adaptive_integrator(element, limit):
+    r = rig((element,))
+    points, weights = np.polynomial.legendre.leggauss(200)
+    x, w = 5 * (points + 1), 5 * weights
+    slopes, shapes = r.modes.phi(x, 1), r.modes.phi(x)
+
+    def extra(t, q, v):
+        if isinstance(element, MidplaneStretching):
+            slope = slopes @ q
+            return -0.4 * (w @ slope**2) * (slopes.T @ (w * slope))
+        speed = shapes @ v
+        return -0.3 * shapes.T @ (w * np.abs(speed) * speed)
+
+    inputs = drive(120, 3.0)
+    peer = continuous(r, inputs, extra)
+    linear = simulate(rig(), inputs, sample_time=DT).outputs[0]
+    error = np.abs(simulate(r, inputs, sample_time=DT, substeps=32).outputs[0] - peer).max()
+    assert error < limit * np.abs(peer).max() and np.abs(linear - peer).max() > 30 * error
+
+
+def test_stiffness_drift_against_an_adaptive_integrator():
+    r = rig(stiffness_rate=0.02)
+    inputs = drive(120)
+    peer = continuous(r, inputs, scale=lambda t: 1 + 0.02 * t)
+    mine = simulate(r, inputs, sample_time=DT).outputs[0]
+    assert np.abs(mine - peer).max() < 1e-4 * np.abs(peer).max()
+
+
+def test_periodic_force_exactly():
+    r = rig((PeriodicForce(4.0, 0.13, 0.7, 0.4),))
+    inputs = np.zeros((2, 150))
+    shape = r.modes.phi(4.0)[0]
+    peer = continuous(r, inputs, lambda t, q, v: shape * 0.7 * np.sin(2 * np.pi * 0.13 * t + 0.4))
+    assert np.abs(simulate(r, inputs, sample_time=DT).outputs[0] - peer).max() < 1e-8 * np.abs(peer).max()
+
+
+def test_two_point_elements_and_linear_ones_agree_with_the_structure():
+    stepped = rig((LinearDamper(3.0, 0.2), LinearSpring(7.0, 0.0)))
+    exact = rig(modes=beam(attachments=(PointDamper(3.0, 0.2),)).modes(6))
+    inputs = drive()
+    a = simulate(stepped, inputs, sample_time=DT, substeps=64).outputs
+    b = simulate(exact, inputs, sample_time=DT).outputs
+    assert np.abs(a - b).max() < 2e-4 * np.abs(b).max()
+
+
+@pytest.mark.parametrize(
+    "element",
+    [
+        CubicSpring(4.0, 0.0),
+        Clearance(4.0, 0.0, 0.1),
+        CoulombFriction(4.0, 0.0, 0.1),
+        BoucWen(4.0, 0.0, 0.1),
+        MidplaneStretching(0.0),
+        AirDrag(0.0),
+        PeriodicForce(4.0, 0.1, 0.0, 0.0),
+    ],
+)
+def test_an_element_of_no_strength_changes_nothing(element):
+    inputs = drive(100)
+    a = simulate(rig((element,)), inputs, sample_time=DT, substeps=2).outputs
+    b = simulate(rig(), inputs, sample_time=DT).outputs
+    np.testing.assert_allclose(a, b, atol=1e-9 * np.abs(b).max())
+
+
+def test_sensor_chain():
+    inputs = drive(100)
+    plain = simulate(rig(sensors=(Sensor("d", 3.1),)), inputs, sample_time=DT).outputs[0]
+    top = np.abs(plain).max()
+    changed = Sensor("d", 3.1, gain=1.5, bias=0.1 * top, drift=0.2 * top, limit=0.8 * top)
+    mine = simulate(rig(sensors=(changed,)), inputs, sample_time=DT).outputs[0]
+    expected = np.clip(1.5 * plain + 0.1 * top + 0.2 * top * np.linspace(0, 1, 100), -0.8 * top, 0.8 * top)
+    np.testing.assert_allclose(mine, expected, atol=1e-12)
+
+
+def test_sensor_lag_of_a_ramp_is_exact():
+    from workbench.rig.simulate import sensor_reading
+
+    t = np.arange(50) * DT
+    lagged = sensor_reading(Sensor("d", 1.0, time_constant=0.3), 2.0 * t, DT)
+    np.testing.assert_allclose(lagged, 2.0 * (t - 0.3 * (1 - np.exp(-t / 0.3))), atol=1e-12)
+
+
+def test_mean_rounded_reading():
+    from workbench.rig.simulate import sensor_reading
+
+    sensor = Sensor("d", 1.0, step=1.0, noise_std=0.3)
+    truth = np.linspace(-1, 1, 9)
+    noise = 0.3 * np.random.default_rng(0).standard_normal((200000, 1))
+    sampled = np.round(truth + noise).mean(axis=0)
+    np.testing.assert_allclose(sensor_reading(sensor, truth, DT), sampled, atol=5e-3)
+
+
+def test_inputs_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="Is time last"):
+        simulate(rig(), np.zeros((100, 2)), sample_time=DT)
+
+
+def test_state_space_names_and_lags():
+    system = state_space(
+        beam().modes(2), (Actuator("F1", 2.0, time_constant=0.1),), (Sensor("y", 3.0, time_constant=0.2),)
+    )
+    assert system.input_labels == ["F1"] and system.output_labels == ["y"]
+    assert system.state_labels == ["q1", "q2", "dq1", "dq2", "F1_lag", "y_lag"]
+    plain = state_space(beam().modes(2), (Actuator("F1", 2.0),), (Sensor("y", 3.0),))
+    s = 0.7j
+    np.testing.assert_allclose(system(s), plain(s) / (1 + 0.1 * s) / (1 + 0.2 * s), rtol=1e-12)
+
+
+def test_an_actuator_on_a_support_is_refused():
+    with pytest.raises(ValueError, match="stands on the support"):
+        state_space(beam().modes(2), (Actuator("F1", 0.0),), (Sensor("y", 3.0),))

@@ -1,0 +1,225 @@
+"""Modes against closed forms, transcendental equations, and an independent finite-element program."""
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+from scipy.special import j0, j1, jn_zeros
+
+from workbench.structure.damping import ProportionalDamping, ViscousDamping
+from workbench.structure.member import Bar, Beam
+from workbench.structure.modes import mac
+from workbench.structure.modification import attach
+from workbench.structure.profile import Profile
+from workbench.structure.supports import End, PointDamper, PointMass, PointSpring
+
+
+def uniform(left, right, **options):
+    return Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left=left, right=right, **options)
+
+
+def test_hinged_beam_closed_form():
+    modes = uniform("hinged", "hinged").modes(20)
+    r = np.arange(1, 21)
+    np.testing.assert_allclose(modes.omega, (r * np.pi / 10) ** 2, rtol=1e-9)
+    x = np.linspace(0, 10, 101)
+    exact = np.sqrt(0.2) * np.sin(np.outer(x, r * np.pi / 10))
+    assert np.abs(modes.phi(x) - exact).max() < 1e-7
+    slope = np.sqrt(0.2) * (r * np.pi / 10) * np.cos(np.outer(x, r * np.pi / 10))
+    assert np.abs(modes.phi(x, 1) - slope).max() < 1e-7 * slope.max()
+
+
+def test_tapered_bar_closed_form():
+    bar = Bar(
+        length=1.0,
+        mass_per_length=lambda x: 2 * (1 - x),
+        axial_stiffness=lambda x: 2 * (1 - x),
+        left="fixed",
+        right="free",
+    )
+    modes = bar.modes(20)
+    zeros = jn_zeros(0, 20)
+    np.testing.assert_allclose(modes.omega, zeros, rtol=1e-9)
+    x = np.linspace(0, 1, 101)
+    exact = j0(np.outer(1 - x, zeros)) / j1(zeros)
+    exact *= np.sign(exact[1])
+    assert np.abs(modes.phi(x) - exact).max() < 1e-7 * np.abs(exact).max()
+
+
+@pytest.mark.parametrize(
+    ("ends", "equation", "rigid"),
+    [
+        (("clamped", "free"), lambda b: np.cos(b) * np.cosh(b) + 1, 0),
+        (("clamped", "clamped"), lambda b: np.cos(b) * np.cosh(b) - 1, 0),
+        (("free", "free"), lambda b: np.cos(b) * np.cosh(b) - 1, 2),
+        (("clamped", "hinged"), lambda b: np.tan(b) - np.tanh(b), 0),
+        (("clamped", "sliding"), lambda b: np.tan(b) + np.tanh(b), 0),
+        (("hinged", "free"), lambda b: np.tan(b) - np.tanh(b), 1),
+        (("sliding", "sliding"), lambda b: np.sin(b), 1),
+    ],
+)
+def test_ends_against_transcendental_equations(ends, equation, rigid):
+    modes = uniform(*ends).modes(8)
+    assert (modes.omega[:rigid] == 0).all() and (modes.omega[rigid:] > 0).all()
+    for omega in modes.omega[rigid:]:
+        b = 10 * np.sqrt(omega)
+        step = 1e-6
+        root = brentq(equation, b - step, b + step, xtol=1e-14)
+        assert abs(root / b - 1) < 1e-9
+
+
+def test_rigid_body_modes_are_a_translation_and_a_rotation():
+    modes = uniform("free", "free").modes(3)
+    x = np.array([0.0, 2.5, 10.0])
+    np.testing.assert_allclose(modes.phi(x)[:, 0], np.sqrt(0.1), rtol=1e-9)
+    np.testing.assert_allclose(modes.phi(x)[:, 1], (5 - x) / 5 * modes.phi(0.0)[0, 1], atol=1e-9)
+
+
+def test_elastic_end_against_its_equation():
+    k = 3.0
+    modes = uniform("hinged", End(np.inf, k)).modes(6)
+
+    def equation(b):
+        return b / 10 * (2 * np.sin(b) * np.sinh(b)) + k * (np.sin(b) * np.cosh(b) - np.cos(b) * np.sinh(b))
+
+    for omega in modes.omega:
+        b = 10 * np.sqrt(omega)
+        assert abs(brentq(equation, b - 1e-5, b + 1e-5, xtol=1e-14) / b - 1) < 1e-9
+
+
+def test_axial_load_closed_form():
+    modes = uniform("hinged", "hinged", tension=0.3).modes(10)
+    k = np.arange(1, 11) * np.pi / 10
+    np.testing.assert_allclose(modes.omega, np.sqrt(k**4 + 0.3 * k**2), rtol=1e-9)
+    with pytest.raises(ValueError, match="buckling"):
+        uniform("hinged", "hinged", tension=-0.11).modes(3)
+
+
+def test_cantilever_with_a_tip_mass_and_rotary_inertia():
+    mass, inertia = 2.0, 0.7
+    modes = uniform("clamped", "free", attachments=(PointMass(10.0, mass, inertia),)).modes(5)
+    mu, nu = mass / 10.0, inertia / 1000.0
+
+    def equation(b):
+        c, s, ch, sh = np.cos(b), np.sin(b), np.cosh(b), np.sinh(b)
+        return (
+            1
+            + mu * nu * b**4
+            + (1 - mu * nu * b**4) * c * ch
+            + mu * b * (c * sh - s * ch)
+            - nu * b**3 * (c * sh + s * ch)
+        )
+
+    for omega in modes.omega:
+        b = 10 * np.sqrt(omega)
+        assert abs(brentq(equation, b - 1e-5, b + 1e-5, xtol=1e-14) / b - 1) < 1e-9
+
+
+def test_stepped_bar_matches_its_jump_condition():
+    bar = Bar(
+        length=2.0,
+        mass_per_length=([0, 1, 1, 2], [1, 1, 3, 3]),
+        axial_stiffness=([0, 1, 1, 2], [4, 4, 2, 2]),
+        left="fixed",
+        right="free",
+    )
+
+    def equation(w):
+        a, b = w * np.sqrt(1 / 4), w * np.sqrt(3 / 2)
+        return 4 * a * np.cos(a) * np.cos(b) - 2 * b * np.sin(a) * np.sin(b)
+
+    for omega in bar.modes(12).omega:
+        assert abs(brentq(equation, omega * (1 - 1e-6), omega * (1 + 1e-6), xtol=1e-14) / omega - 1) < 1e-9
+
+
+def test_general_beam_against_scikit_fem():
+    skfem = pytest.importorskip("skfem")
+    from scipy.sparse.linalg import eigsh
+    from skfem.helpers import dd, ddot
+
+    beam = Beam(
+        length=3.0,
+        mass_per_length=lambda x: 1.5 - 0.2 * x,
+        bending_stiffness=lambda x: 2.0 + np.sin(x),
+        left="clamped",
+        right="hinged",
+        attachments=(PointMass(1.2, 0.4), PointSpring(2.1, 30.0)),
+        tension=4.0,
+    )
+    mesh = skfem.MeshLine(np.linspace(0, 3, 301))
+    basis = skfem.Basis(mesh, skfem.ElementLineHermite(), intorder=10)
+    stiff = skfem.BilinearForm(
+        lambda u, v, w: (2.0 + np.sin(w.x[0])) * ddot(dd(u), dd(v)) + 4.0 * u.grad[0] * v.grad[0]
+    ).assemble(basis)
+    mass = skfem.BilinearForm(lambda u, v, w: (1.5 - 0.2 * w.x[0]) * u * v).assemble(basis)
+    stiff, mass = stiff.tolil(), mass.tolil()
+    for at, matrix, value in ((1.2, mass, 0.4), (2.1, stiff, 30.0)):
+        node = int(np.argmin(np.abs(mesh.p[0] - at)))
+        dof = basis.nodal_dofs[0, node]
+        matrix[dof, dof] += value
+    held = [*basis.nodal_dofs[:, int(np.argmin(mesh.p[0]))], basis.nodal_dofs[0, int(np.argmax(mesh.p[0]))]]
+    free = np.setdiff1d(np.arange(basis.N), held)
+    values = eigsh(
+        stiff.tocsc()[np.ix_(free, free)], 6, mass.tocsc()[np.ix_(free, free)], sigma=0, return_eigenvectors=False
+    )
+    np.testing.assert_allclose(beam.modes(6).omega, np.sqrt(np.sort(values)), rtol=2e-6)
+
+
+@pytest.mark.parametrize("ends", [("hinged", "free"), ("clamped", End(2.0, 0.5))])
+def test_modes_are_orthonormal(ends):
+    m = Profile.points([0, 4, 4, 10], [1.0, 2.0, 0.5, 1.5])
+    beam = Beam(
+        length=10.0,
+        mass_per_length=m,
+        bending_stiffness=lambda x: 1 + 0.1 * x,
+        left=ends[0],
+        right=ends[1],
+        attachments=(PointMass(7.0, 0.8, 0.2),),
+    )
+    modes = beam.modes(12)
+    total = 0.8 * modes.phi(7.0).T @ modes.phi(7.0) + 0.2 * modes.phi(7.0, 1).T @ modes.phi(7.0, 1)
+    g, w = np.polynomial.legendre.leggauss(60)
+    for a, b in ((0, 4), (4, 7), (7, 10)):
+        x = a + (b - a) * (g + 1) / 2
+        total = total + modes.phi(x).T @ ((w * (b - a) / 2 * m(x))[:, None] * modes.phi(x))
+    assert np.abs(total - np.eye(12)).max() < 1e-9
+
+
+def test_damping_coefficients():
+    modes = uniform("hinged", "hinged", damping=ProportionalDamping(0.002, 0.1)).modes(5)
+    np.testing.assert_allclose(2 * modes.zeta * modes.omega, 0.002 * modes.omega**2 + 0.1, rtol=1e-12)
+    assert modes.proportional
+    coupled = uniform("hinged", "hinged", attachments=(PointDamper(3.0, 0.4),)).modes(5)
+    shape = coupled.phi(3.0)[0]
+    np.testing.assert_allclose(coupled.damping, 0.4 * np.outer(shape, shape), atol=1e-12)
+    spread = uniform("hinged", "hinged", damping=ViscousDamping(0.6)).modes(5)
+    np.testing.assert_allclose(spread.damping, 0.6 * np.eye(5), atol=1e-9)
+
+
+def test_attachments_on_modes_agree_with_the_structure_solved_anew():
+    parts = (PointSpring(3.3, 0.02), PointDamper(6.1, 0.1))
+    anew = uniform("hinged", "hinged", attachments=parts).modes(4)
+    attached = attach(uniform("hinged", "hinged").modes(60), parts).select(range(4))
+    np.testing.assert_allclose(attached.omega, anew.omega, rtol=1e-6)
+    x = np.linspace(0, 10, 31)
+    assert np.diag(mac(attached.phi(x), anew.phi(x))).min() > 1 - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"mass_per_length": -1.0}, "mass_per_length must be positive"),
+        ({"length": 0.0}, "length"),
+        ({"left": "glued"}, "hinged, clamped, free, sliding"),
+        ({"attachments": (PointMass(11.0, 1.0),)}, "outside"),
+        ({"attachments": (PointMass(1.0, -1.0),)}, "negative mass"),
+    ],
+)
+def test_bad_structures_are_refused(change, words):
+    arguments = dict(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged") | change
+    with pytest.raises(ValueError, match=words):
+        Beam(**arguments)
+
+
+def test_positions_outside_are_refused():
+    with pytest.raises(ValueError, match="outside"):
+        uniform("hinged", "hinged").modes(2).phi(10.5)

@@ -1,0 +1,119 @@
+"""Imports run from the ground floor up, those inside functions too."""
+
+import ast
+from pathlib import Path
+
+import workbench
+
+ROOT = Path(workbench.__file__).parent
+FLOORS = {
+    "structure": 0,
+    "records": 1,
+    "rig": 2,
+    "identification": 3,
+    "design": 3,
+    "gap": 4,
+    "draw": 5,
+    "study": 6,
+    "cli": 7,
+}
+ENGINES = {
+    "casadi": {"design/placement.py"},
+    "matplotlib": {"draw/"},
+    "pyuff": {"records/uff_file.py"},
+    "h5py": {"records/hdf5_file.py"},
+    "typer": {"cli.py"},
+    "rich": {"cli.py"},
+}
+
+
+def modules():
+    for path in sorted(ROOT.rglob("*.py")):
+        yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def imports(tree):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            yield node.module
+
+
+def room(name: str) -> str:
+    return name.split("/")[0].removesuffix(".py")
+
+
+def test_a_room_imports_only_from_floors_below():
+    wrong = []
+    for name, tree in modules():
+        if name == "__init__.py":
+            continue
+        for target in imports(tree):
+            parts = target.split(".")
+            if parts[0] != "workbench" or len(parts) < 2 or parts[1] == room(name):
+                continue
+            if FLOORS[parts[1]] >= FLOORS[room(name)]:
+                wrong.append(f"{name} imports {target}")
+    assert not wrong, wrong
+
+
+def test_no_file_imports_a_rooms_init():
+    wrong = [
+        f"{name} imports {target}"
+        for name, tree in modules()
+        if name != "__init__.py"
+        for target in imports(tree)
+        if target == "workbench"
+        or (
+            target.startswith("workbench.")
+            and (ROOT.parent / target.replace(".", "/")).is_dir()
+            and target != "workbench.records"
+        )
+    ]
+    assert not wrong, wrong
+
+
+def test_no_circle_of_imports():
+    graph = {}
+    for name, tree in modules():
+        module = "workbench." + name.removesuffix(".py").replace("/", ".")
+        graph[module] = {t for t in imports(tree) if t.startswith("workbench.")}
+    done, path = set(), []
+
+    def visit(module):
+        assert module not in path, f"a circle: {' -> '.join([*path[path.index(module) :], module])}"
+        if module in done or module not in graph:
+            return
+        path.append(module)
+        for target in graph[module]:
+            visit(target)
+        path.pop()
+        done.add(module)
+
+    for module in graph:
+        visit(module)
+
+
+def test_each_engine_has_one_door():
+    wrong = [
+        f"{name} imports {engine}"
+        for name, tree in modules()
+        for target in imports(tree)
+        for engine, doors in ENGINES.items()
+        if target.split(".")[0] == engine
+        and not any(name.startswith(door) for door in doors)
+        and not (engine == "matplotlib" and name == "study/outcome.py")
+    ]
+    assert not wrong, wrong
+
+
+def test_only_the_command_prints():
+    wrong = [
+        name
+        for name, tree in modules()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print" and name != "cli.py"
+    ]
+    assert not wrong, wrong
