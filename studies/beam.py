@@ -143,9 +143,9 @@ def report_designs(outcome, truth, modes, laws) -> None:
     outcome.table("designs", rows)
     even, coupled, placed = rows
     outcome.say(
-        f"IMSC at 2, 4, 6, 8 leaves W_R = {even['W_R']:.2e} in the residual modes, {100 * even['W_R'] / -even['W_C']:.1f} %"
-        f" of what it takes out of the controlled ones; coupled LQR {coupled['W_R']:.2e}: at the nodes of mode 5 the two"
-        " are one law."
+        f"IMSC at 2, 4, 6, 8 leaves W_R = {even['W_R']:.2e} in the residual modes,"
+        f" {100 * even['W_R'] / -even['W_C']:.1f} % of what it takes out of the controlled ones; coupled LQR"
+        f" {coupled['W_R']:.2e}: at the nodes of mode 5 the two are one law."
     )
     where = ", ".join(f"{at:.2f}" for at in placed["places"])
     outcome.say(f"Placed at {where}, the same law leaves {placed['W_R']:.2e} for at most 1.5 times the effort.")
@@ -177,7 +177,8 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
     ).max()
     apart /= np.abs(responses["exact modal coordinates"].displacement(x)).max()
     poles = np.linalg.eigvals(loops["through modal filters"].matrix)
-    outcome.say(f"After {FINAL_TIME:g} s the controlled modes keep {100 * left:.1e} % of the energy they would have had.")
+    kept = f"{100 * left:.1e} %"
+    outcome.say(f"After {FINAL_TIME:g} s the controlled modes keep {kept} of the energy they would have had.")
     outcome.check("closed loop on the true beam, largest real part of its poles", poles.real.max(), 0.0)
     outcome.check("energy left in the controlled modes, share of the uncontrolled", left, 0.02)
     outcome.check("filtered against exact feedback, share of the largest displacement", apart, 0.02)

@@ -4,3 +4,66 @@ structure → modes → rig → law → response → work → placement        d
 record    → modes → structure                                       identification: the same types, backwards
 rig + records → gap → effects → a better rig                        diagnosis
 """
+
+from importlib import import_module
+
+# Where each public name lives. A name is imported when it is first used, so that the command starts at once.
+_HOMES = {
+    "structure.profile": ("Profile",),
+    "structure.member": ("Bar", "Beam"),
+    "structure.supports": ("End", "PointDamper", "PointMass", "PointSpring"),
+    "structure.damping": ("ModalDamping", "ProportionalDamping", "ViscousDamping"),
+    "structure.modes": ("Modes", "SampledModes", "mac"),
+    "structure.modification": ("attach",),
+    "records.record": ("Channel", "Record"),
+    "records.files": ("read_record", "write_record"),
+    "records.transfer": ("impulse_record",),
+    "rig.actuators": ("Actuator",),
+    "rig.sensors": ("Sensor",),
+    "rig.elements": (
+        "AirDrag",
+        "BoucWen",
+        "Clearance",
+        "CoulombFriction",
+        "CubicSpring",
+        "LinearDamper",
+        "LinearSpring",
+        "MidplaneStretching",
+        "OneSidedStop",
+        "PeriodicForce",
+        "RandomForce",
+    ),
+    "rig.rig": ("Rig",),
+    "rig.simulate": ("simulate",),
+    "rig.statespace": ("state_space",),
+    "identification.ibrahim": ("stacked_delays", "two_delays"),
+    "identification.refinement": ("Refined", "amplitudes", "refine"),
+    "identification.eigenfunctions": ("KnownEnds", "eigenfunctions"),
+    "identification.distributions": ("Basis", "Distributions", "mass_and_stiffness"),
+    "identification.selfcheck": ("choose_terms", "self_check"),
+    "identification.synthesis": ("free_decay", "struck"),
+    "design.law": ("DesignError", "Law"),
+    "design.imsc": ("imsc", "imsc_poles"),
+    "design.coupled": ("coupled_lqr",),
+    "design.modal_filter": ("ModalFilter", "displacement_filter", "hermite_filter"),
+    "design.closed_loop": ("ClosedLoop", "Response", "close_loop", "impulse_state", "respond"),
+    "design.spillover": ("Spillover", "effort", "finite_spillover", "quadratic_cost", "spillover"),
+    "design.placement": ("Placement", "nodes_of_mode", "place", "placement_task", "scan"),
+    "gap.case": ("read_case",),
+    "gap.diagnose": ("diagnose",),
+    "gap.verdict": ("Verdict",),
+    "draw.plot": ("plot",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = sorted(_HOME_OF)  # noqa: PLE0605
+
+
+def __getattr__(name: str):
+    if name not in _HOME_OF:
+        raise AttributeError(f"workbench has no {name!r}; its names are {', '.join(__all__)}")
+    return getattr(import_module(f"workbench.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,136 @@
+"""One way to draw any result: `plot(result)`."""
+
+from functools import singledispatch
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from workbench.design.closed_loop import Response
+from workbench.design.modal_filter import ModalFilter
+from workbench.design.placement import Placement
+from workbench.design.spillover import Spillover
+from workbench.draw.beam import plot_motion
+from workbench.draw.design import plot_work
+from workbench.draw.gap import plot_where
+from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.gap.verdict import Verdict
+from workbench.identification.refinement import Refined
+from workbench.records.record import Record
+from workbench.structure.modes import Modes, SampledModes
+
+MOST_PANELS = 12
+
+
+@singledispatch
+def plot(result) -> Figure:
+    """A figure of a result: `Record`, `Modes`, `SampledModes`, `Refined`, `Response`, `Spillover`, `Placement`,
+    `ModalFilter` or `Verdict`.
+
+    Raises:
+        TypeError: a type that has no figure.
+    """
+    known = ", ".join(sorted(t.__name__ for t in plot.registry if t is not object))
+    raise TypeError(f"{type(result).__name__} has no figure; these have one: {known}")
+
+
+@plot.register
+def _(result: Record) -> Figure:
+    rows = [*zip(result.input_channels, result.inputs), *zip(result.output_channels, result.outputs)][:MOST_PANELS]
+    figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.3 * len(rows), sharex=True, squeeze=False)
+    for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
+        colour = COLOURS[1] if i < result.n_inputs else COLOURS[0]
+        ax.plot(result.time, values, color=colour, linewidth=0.9)
+        ax.set_ylabel(channel.name + (f"\n[{channel.unit}]" if channel.unit else ""))
+    axes[0, 0].set_title(result.name)
+    axes[-1, 0].set_xlabel("time [s]")
+    return figure
+
+
+@plot.register
+def _(result: Modes) -> Figure:
+    x = np.linspace(0.0, result.length, 401)
+    shapes = result.phi(x)[:, :MOST_PANELS]
+    figure, axes = _panels(shapes.shape[1])
+    for r, ax in enumerate(axes):
+        ax.axhline(0.0, color=GREY, linewidth=0.6)
+        ax.plot(x, shapes[:, r])
+        ax.set_title(_named(r, result.frequencies_hz[r], result.zeta[r]), fontsize=10)
+        ax.set_xlabel("x")
+    return figure
+
+
+@plot.register
+def _(result: SampledModes) -> Figure:
+    shapes = result.shapes[:, :MOST_PANELS]
+    figure, axes = _panels(shapes.shape[1])
+    placed = np.isfinite(result.positions).all()
+    x = result.positions if placed else np.arange(1, result.positions.size + 1)
+    for r, ax in enumerate(axes):
+        ax.axhline(0.0, color=GREY, linewidth=0.6)
+        ax.plot(x, shapes[:, r].real, "o-", label="real")
+        ax.plot(x, shapes[:, r].imag, ".", color=COLOURS[1], label="imaginary")
+        ax.set_title(_named(r, result.frequencies_hz[r], result.zeta[r]), fontsize=10)
+        ax.set_xlabel("x" if placed else "sensor")
+    axes[0].legend(fontsize=8)
+    return figure
+
+
+@plot.register
+def _(result: Refined) -> Figure:
+    figure, axes = new_figure(2, 1, width=9, height=5, sharex=True)
+    modes = np.arange(1, result.modes.n_modes + 1)
+    relative = result.omega_std / result.modes.omega, result.zeta_std / np.maximum(np.abs(result.modes.zeta), 1e-300)
+    for ax, values, title in zip(axes, relative, ("frequency", "damping ratio")):
+        ax.semilogy(modes, values, "o-")
+        ax.set_title(f"standard error of the {title}, relative")
+    axes[1].set(xlabel="mode", xticks=modes)
+    return figure
+
+
+@plot.register
+def _(result: Response) -> Figure:
+    return plot_motion({"displacement": result}, np.linspace(0.0, result.modes.length, 201))
+
+
+@plot.register
+def _(result: Spillover) -> Figure:
+    return plot_work({"this design": result})
+
+
+@plot.register
+def _(result: Placement) -> Figure:
+    figure, ax = new_figure(width=9, height=3.5)
+    numbers = result.positions.size + 1 + np.arange(result.by_mode.size)
+    ax.bar(numbers, result.by_mode)
+    where = ", ".join(f"{x:.3g}" for x in result.positions)
+    ax.set(xlabel="residual mode", ylabel="work spilled, W_r", xticks=numbers)
+    ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
+    return figure
+
+
+@plot.register
+def _(result: ModalFilter) -> Figure:
+    figure, ax = new_figure(width=9, height=4)
+    for r, weights in enumerate(result.displacement):
+        ax.plot(result.positions, weights, "o-", label=f"mode {r + 1}")
+    ax.set(xlabel="x of the sensor", ylabel="weight of its displacement", title="modal filter")
+    ax.legend(ncols=2)
+    return figure
+
+
+@plot.register
+def _(result: Verdict) -> Figure:
+    return plot_where(result)
+
+
+def _panels(count: int):
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure, axes = new_figure(rows, columns, width=10, height=0.6 + 2.1 * rows, squeeze=False, sharex=True)
+    for ax in axes.flat[count:]:
+        ax.set_visible(False)
+    return figure, list(axes.flat[:count])
+
+
+def _named(r: int, frequency_hz: float, zeta: float) -> str:
+    return f"mode {r + 1}: {frequency_hz:.4g} Hz, ζ = {100 * zeta:.2g} %"
