@@ -143,7 +143,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
     units = {p.name: p.unit for p in effect.parameters(nominal)}
     numbers = [
-        " ".join((name.replace("_", " "), _with_deviation(value, effect.deviations.get(name, 0.0)), units[name])).strip()
+        " ".join((name.replace("_", " "), _with_deviation(value, effect.deviations.get(name, 0.0)), units[name]))
         for name, value in effect.values.items()
         if name != "at"
     ]
@@ -151,7 +151,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
     if effect.kind.name == "truncated_modes":
         text += f" ({effect.target} are needed, {nominal.modes.n_modes} are kept)"
     elif numbers:
-        text += f" ({', '.join(numbers)})"
+        text += f" ({', '.join(n.strip() for n in numbers)})"
     if effect.kind.path in ("actuator", "sensor"):
         text += ", all of them" if effect.target == ALL else f", {effect.target}"
     elif effect.kind.name == "support_rotation":

@@ -236,7 +236,7 @@ def _stepper(laws: tuple[Callable, ...]):
 
 def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
     """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
-    points, weights = np.polynomial.legendre.leggauss(max(2 * rig.modes.n_modes + 12, 24))
+    points, weights = np.polynomial.legendre.leggauss(max(3 * rig.modes.n_modes + 12, 30))
     length = rig.modes.length
     return rig.modes.phi(0.5 * length * (points + 1.0), derivative), 0.5 * length * weights
 
