@@ -1,6 +1,7 @@
 """The `workbench` command: thin; it prints, shows progress, and turns bad input into one clear line."""
 
 import json
+import math
 import sys
 from collections.abc import Callable
 from functools import wraps
@@ -13,6 +14,9 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 
 BAD_INPUT, FAILURE = 2, 1
+TURN = 2.0 * math.pi
+
+JsonPath = Annotated[Path | None, typer.Option("--json", help="Write what was found here as JSON.")]
 
 app = typer.Typer(
     add_completion=False,
@@ -109,6 +113,152 @@ def study(
 
 @app.command()
 @_guarded
+def identify(
+    record: Annotated[Path, typer.Argument(help="A ring-down: .csv, .txt, .npz, .mat, .h5, .uff.")],
+    modes: Annotated[int | None, typer.Option(help="How many modes; found by stabilisation unless given.")] = None,
+    sample_rate_hz: Annotated[float | None, typer.Option(help="Where the file tells no time.")] = None,
+    start: Annotated[float | None, typer.Option(help="Time from which the decay is free, s.")] = None,
+    inputs: Annotated[str, typer.Option(help="Names of channels that are inputs, with commas between.")] = "",
+    json_path: JsonPath = None,
+) -> None:
+    """Find the modes of a ring-down, each figure with its standard error.
+
+    Example: workbench identify ringdown.csv --modes 5 --json modes.json
+    """
+    from workbench.records.files import read_record
+    from workbench.study.ring_down import modes_of
+
+    names = tuple(name.strip() for name in inputs.split(",") if name.strip())
+    read = read_record(record, sample_rate_hz=sample_rate_hz, inputs=names).between(start)
+    found = modes_of(read, n_modes=modes)
+    shown = Table("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity", box=None, pad_edge=False)
+    straight = found.modes.phase_collinearity
+    for r, (f, zeta) in enumerate(zip(found.modes.frequencies_hz, found.modes.zeta)):
+        f_std, zeta_std = found.omega_std[r] / TURN, 100 * found.zeta_std[r]
+        row = (f"{f:.6g}", f"{f_std:.1g}", f"{100 * zeta:.4g}", f"{zeta_std:.1g}", f"{straight[r]:.4f}")
+        shown.add_row(str(r + 1), *row)
+    console.print(f"{read.n_outputs} sensors, {read.n_samples} samples at {read.sample_rate_hz:.6g} Hz", style="bold")
+    console.print(shown)
+    if not found.converged:
+        console.print("  the refinement did not settle: ask for other --modes, or a later --start")
+    _write_json(
+        json_path,
+        {
+            "sensors": read.output_names,
+            "frequencies_hz": found.modes.frequencies_hz,
+            "frequencies_std_hz": found.omega_std / TURN,
+            "damping_ratios": found.modes.zeta,
+            "damping_std": found.zeta_std,
+            "shapes_real": found.modes.shapes.real,
+            "shapes_imag": found.modes.shapes.imag,
+            "noise_std": found.noise_std,
+            "converged": found.converged,
+        },
+    )
+
+
+@app.command()
+@_guarded
+def design(
+    rig: Annotated[Path, typer.Argument(help="TOML with [structure], [[input]] and [[output]], as a case has.")],
+    control: Annotated[int | None, typer.Option(help="Modes to control, lowest first; as many as actuators.")] = None,
+    weight: Annotated[float, typer.Option(help="Weight R of force against motion.")] = 1.0,
+    impulse_at: Annotated[float | None, typer.Option(help="Place of a unit blow; the hammer's unless given.")] = None,
+    final_time: Annotated[float | None, typer.Option(help="Time for the work, s; 20 periods of mode 1.")] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Design IMSC beside coupled LQR: cost, effort, peak force, and which residual mode each feeds.
+
+    Example: workbench design case.toml --control 3 --weight 20
+    """
+    from workbench.design.closed_loop import impulse_state
+    from workbench.design.comparison import compare
+    from workbench.design.coupled import coupled_lqr
+    from workbench.design.imsc import imsc
+
+    found = _structure_rig(rig)
+    actuators = [a for a in found.actuators if not a.direct]
+    n = len(actuators) if control is None else control
+    modes, at = found.modes, _blow(found, impulse_at)
+    state = impulse_state(modes, at)
+    state[modes.n_modes + n :] = 0.0
+    laws = [imsc(modes, n, actuators, weight=weight), coupled_lqr(modes, n, actuators, weight=weight)]
+    end = final_time or 20 * TURN / modes.omega[modes.omega > 0][0]
+    rows = compare(modes, laws, state, weight=weight, final_time=end)
+    shown = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "feeds", box=None, pad_edge=False)
+    for row in rows:
+        figures = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
+        feeds = "" if row.most_fed is None else f"mode {row.most_fed + 1}"
+        shown.add_row(row.law.name, *(f"{value:.5g}" for value in figures), feeds)
+    console.print(f"{n} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold")
+    console.print(shown)
+    _write_json(
+        json_path,
+        {
+            "impulse_at": at,
+            "weight": weight,
+            "final_time": end,
+            "laws": [
+                {
+                    "law": r.law.name,
+                    "gain": r.law.gain,
+                    "cost": r.cost,
+                    "effort": r.effort,
+                    "peak_force": r.peak_force,
+                    "work": r.work.by_mode,
+                    "poles_real": r.poles.real,
+                    "poles_imag": r.poles.imag,
+                }
+                for r in rows
+            ],
+        },
+    )
+
+
+@app.command()
+@_guarded
+def place(
+    rig: Annotated[Path, typer.Argument(help="TOML with [structure], [[input]] and [[output]], as a case has.")],
+    control: Annotated[int, typer.Option(help="Modes to control, lowest first, and actuators to place.")],
+    weight: Annotated[float, typer.Option(help="Weight R of force against motion.")] = 1.0,
+    impulse_at: Annotated[float | None, typer.Option(help="Place of a unit blow; the hammer's unless given.")] = None,
+    effort: Annotated[float, typer.Option(help="Effort allowed, as a multiple of evenly spaced actuators'.")] = 1.5,
+    spacing: Annotated[float | None, typer.Option(help="Least distance apart; a twentieth of the length.")] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Place actuators where control spills the least work, under a limit of effort.
+
+    Example: workbench place case.toml --control 4 --weight 20 --effort 1.2
+    """
+    import numpy as np
+
+    from workbench.design.placement import nodes_of_mode, placement_task
+    from workbench.design.placement import place as least_work
+
+    found = _structure_rig(rig)
+    modes, at = found.modes, _blow(found, impulse_at)
+    task = placement_task(modes, control, impulse_at=at, weight=weight)
+    even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
+    apart = modes.length / 20 if spacing is None else spacing
+    rows = [least_work(task, effort_limit=effort * even.effort, spacing=apart), even]
+    nodes = nodes_of_mode(modes, control)
+    if nodes.size == control:
+        rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
+    shown = Table("places", "W_R", "effort", "condition of B", "", box=None, pad_edge=False)
+    for row in rows:
+        where = ", ".join(f"{x:.4g}" for x in row.positions)
+        figures = (row.residual_work, row.effort, row.condition)
+        shown.add_row(where, *(f"{value:.5g}" for value in figures), row.status)
+    console.print(
+        f"{control} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold"
+    )
+    console.print(shown)
+    keys = ("positions", "residual_work", "by_mode", "effort", "condition", "status")
+    _write_json(json_path, {"placements": [{key: getattr(row, key) for key in keys} for row in rows]})
+
+
+@app.command()
+@_guarded
 def diagnose(
     case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
     json_path: Annotated[Path | None, typer.Option("--json", help="Write the verdict here as JSON.")] = None,
@@ -151,6 +301,30 @@ def diagnose(
         json_path.write_text(json.dumps(shown, indent=1, allow_nan=False) + "\n", encoding="utf-8")
         console.print(f"  verdict    {_short(json_path)}", markup=False)
     console.print(f"  page       {_short(target)}", markup=False)
+
+
+def _structure_rig(path: Path):
+    from workbench.gap.case import read_rig
+
+    found = read_rig(path)
+    if found.structure is None:
+        raise ValueError(f"{path}: plain modal data know no places; describe the structure as a beam or a rod")
+    return found
+
+
+def _blow(rig, at: float | None) -> float:
+    hammers = [a.at for a in rig.actuators if a.direct]
+    if at is None and not hammers:
+        raise ValueError("where is the structure struck? give --impulse-at, or an [[input]] of kind hammer")
+    return hammers[0] if at is None else at
+
+
+def _write_json(path: Path | None, content: dict) -> None:
+    from workbench.study.outcome import plain
+
+    if path is not None:
+        path.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        console.print(f"  written to {_short(path)}", markup=False)
 
 
 def _short(path: Path) -> str:

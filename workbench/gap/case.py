@@ -70,24 +70,8 @@ def read_case(folder: str | Path) -> Case:
         raise CaseError(f"{folder} is not a folder; a case is a folder with case.toml and records")
     if not path.is_file():
         raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
-    try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise CaseError(f"{path} cannot be read as TOML: {error}") from error
-    inputs, outputs = _tables(table, "input", path), _tables(table, "output", path)
-    structure = table.get("structure")
-    if not isinstance(structure, dict):
-        raise CaseError(f"{path}: the table [structure] is missing")
-    try:
-        rig = (
-            _modal_rig(structure, inputs, outputs)
-            if structure.get("kind") == "modal"
-            else _member_rig(structure, inputs, outputs)
-        )
-    except CaseError as error:
-        raise CaseError(f"{path}: {error}") from error
-    except (ValueError, TypeError, ArithmeticError) as error:
-        raise CaseError(f"{path}: {error}") from error
+    table = _table(path)
+    rig = _rig(table, path)
     records = [(_read_record(folder, entry, rig, path), _use(entry, path)) for entry in _tables(table, "record", path)]
     fit = tuple(record for record, use in records if use == "fit")
     if not fit:
@@ -100,7 +84,38 @@ def read_case(folder: str | Path) -> Case:
     )
 
 
+def read_rig(path: str | Path) -> Rig:
+    """A rig from a TOML file with [structure], [[input]] and [[output]], as a case has; records are not looked at.
+
+    Raises:
+        CaseError: naming the file, the key, the value, and what would be right.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaseError(f"{path}: there is no such file")
+    return _rig(_table(path), path)
+
+
+def _rig(table: dict, path: Path) -> Rig:
+    inputs, outputs = _tables(table, "input", path), _tables(table, "output", path)
+    structure = table.get("structure")
+    if not isinstance(structure, dict):
+        raise CaseError(f"{path}: the table [structure] is missing")
+    build = _modal_rig if structure.get("kind") == "modal" else _member_rig
+    try:
+        return build(structure, inputs, outputs)
+    except (ValueError, TypeError, ArithmeticError) as error:
+        raise CaseError(f"{path}: {error}") from error
+
+
 # --- tables
+
+
+def _table(path: Path) -> dict:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
+        raise CaseError(f"{path} cannot be read as TOML: {error}") from error
 
 
 def _tables(table: dict, key: str, path: Path) -> list[dict]:

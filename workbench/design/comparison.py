@@ -1,0 +1,72 @@
+"""Several laws on the same structure after the same blow, on one yardstick."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.design.closed_loop import close_loop, respond
+from workbench.design.law import Law
+from workbench.design.spillover import Spillover, effort, finite_spillover, quadratic_cost
+from workbench.structure.modes import Modes, frozen
+
+SHOWN_INSTANTS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What one law does and costs.
+
+    Attributes:
+        law: it.
+        cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt of the controlled modes, over all time.
+        effort: ∫ FᵀF dt over all time.
+        peak_force: largest |F| of any actuator up to the final time.
+        work: in every mode up to the final time.
+        poles: (2 n_modes,) of the loop through exact modal coordinates, rad/s.
+    """
+
+    law: Law
+    cost: float
+    effort: float
+    peak_force: float
+    work: Spillover
+    poles: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "poles", frozen(self.poles, complex))
+
+    @property
+    def most_fed(self) -> int | None:
+        """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
+        residual = self.work.residual
+        return residual[int(np.argmax(self.work.residual_work))] if residual else None
+
+
+def compare(
+    modes: Modes, laws: Sequence[Law], state: np.ndarray, *, weight: float, final_time: float
+) -> tuple[Compared, ...]:
+    """Each law's cost, effort, peak force, work by mode and poles, from the same state (2 n_modes,).
+
+    Args:
+        modes: controlled and residual.
+        laws: to compare; all control the same modes if the costs are to mean the same.
+        state: at t = 0; residual modes at rest make W_r what control alone puts there.
+        weight: R of the cost.
+        final_time: s, of work and peak force.
+    """
+    time = np.linspace(0.0, final_time, SHOWN_INSTANTS)
+    rows = []
+    for law in laws:
+        loop = close_loop(modes, law)
+        rows.append(
+            Compared(
+                law=law,
+                cost=quadratic_cost(modes, law, state, weight),
+                effort=effort(modes, law, state),
+                peak_force=float(np.abs(respond(loop, state, time).forces).max()),
+                work=finite_spillover(loop, state, final_time),
+                poles=np.linalg.eigvals(loop.matrix),
+            )
+        )
+    return tuple(rows)
