@@ -20,10 +20,10 @@ test-slow: $(BIN)/workbench  ## the longer trials
 	$(BIN)/python -m pytest -q -m slow
 
 figures: $(BIN)/workbench  ## every study that makes its own data, with its figures and results
-	for name in $$($(BIN)/workbench study | grep -v 'needs --data' | cut -d' ' -f1); do $(BIN)/workbench study $$name || exit 1; done
+	$(BIN)/workbench study --all
 
 bench: $(BIN)/workbench  ## speeds, as ratios
-	$(BIN)/workbench study design_scaling
+	$(BIN)/workbench study speed
 
 lint: $(BIN)/workbench  ## style
 	$(BIN)/ruff check workbench studies tests

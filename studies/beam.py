@@ -56,9 +56,7 @@ def identified(record):
     """Mass-normalised modes with the uncertainty of each figure."""
     found = refine(record, stacked_delays(record, n_modes=N_MODES))
     ends = KnownEnds.of("beam", length=LENGTH, left="hinged", right="hinged")
-    modes = eigenfunctions(
-        found.modes, length=LENGTH, mass_per_length=MASS, ends=ends, covariance=found.covariance
-    )
+    modes = eigenfunctions(found.modes, length=LENGTH, mass_per_length=MASS, ends=ends, covariance=found.covariance)
     return modes, found
 
 
@@ -97,11 +95,13 @@ def study(outcome, data=None) -> None:
     next(stages)
 
     outcome.figure(
-        "ring_down", plot_ring_down(record, stretch=120.0),
+        "ring_down",
+        plot_ring_down(record, stretch=120.0),
         "What was measured: velocity at eleven places after a blow at x = 7.3. Noise is 1 % of the signal.",
     )
     outcome.figure(
-        "modes", plot_identified(modes, truth, SENSORS, count=6),
+        "modes",
+        plot_identified(modes, truth, SENSORS, count=6),
         "What was found: eigenfunctions through the sensors (dots), over the true ones (grey).",
     )
     report_motion(outcome, truth, modes, laws, x)
@@ -112,11 +112,21 @@ def report_modes(outcome, truth, modes, found, x) -> None:
     damping = np.abs(modes.zeta / truth.zeta - 1)
     same = np.diag(mac(modes.phi(x), truth.phi(x)))
     scale = np.abs((modes.phi(x) * truth.phi(x)).sum(0) / (truth.phi(x) ** 2).sum(0))
-    outcome.table("modes", [
-        {"mode": r + 1, "frequency_hz": modes.frequencies_hz[r], "frequency_std_hz": found.omega_std[r] / (2 * np.pi),
-         "damping": modes.zeta[r], "damping_std": found.zeta_std[r], "mac": same[r], "scale": scale[r]}
-        for r in range(modes.n_modes)
-    ])
+    outcome.table(
+        "modes",
+        [
+            {
+                "mode": r + 1,
+                "frequency_hz": modes.frequencies_hz[r],
+                "frequency_std_hz": found.omega_std[r] / (2 * np.pi),
+                "damping": modes.zeta[r],
+                "damping_std": found.zeta_std[r],
+                "mac": same[r],
+                "scale": scale[r],
+            }
+            for r in range(modes.n_modes)
+        ],
+    )
     off = np.abs(modes.omega - truth.omega) / found.omega_std
     outcome.say(f"All nine modes found: frequencies to {frequency.max():.1e}, damping to {100 * damping.max():.1f} %.")
     outcome.check("frequencies, worst relative error", frequency.max(), 1e-4)
@@ -134,12 +144,18 @@ def report_designs(outcome, truth, modes, laws) -> None:
     for name, law in laws.items():
         work = finite_spillover(close_loop(truth, law), state, FINAL_TIME)
         expected = finite_spillover(close_loop(modes, law), state, FINAL_TIME)
-        rows.append({
-            "law": name, "places": [a.at for a in law.actuators],
-            "cost": quadratic_cost(truth, law, state, FORCE_WEIGHT), "effort": effort(truth, law, state),
-            "W_C": work.controlled_total, "W_r": work.residual_work, "W_R": work.residual_total,
-            "W_R_expected": expected.residual_total,
-        })
+        rows.append(
+            {
+                "law": name,
+                "places": [a.at for a in law.actuators],
+                "cost": quadratic_cost(truth, law, state, FORCE_WEIGHT),
+                "effort": effort(truth, law, state),
+                "W_C": work.controlled_total,
+                "W_r": work.residual_work,
+                "W_R": work.residual_total,
+                "W_R_expected": expected.residual_total,
+            }
+        )
     outcome.table("designs", rows)
     even, coupled, placed = rows
     outcome.say(
@@ -183,6 +199,7 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
     outcome.check("energy left in the controlled modes, share of the uncontrolled", left, 0.02)
     outcome.check("filtered against exact feedback, share of the largest displacement", apart, 0.02)
     outcome.figure(
-        "motion", plot_motion(responses, x),
+        "motion",
+        plot_motion(responses, x),
         "The beam from end to end (upwards) over time (rightwards), without and with control.",
     )

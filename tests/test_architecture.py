@@ -38,7 +38,10 @@ def imports(tree):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute"
-            yield node.module
+            folder = ROOT.parent / node.module.replace(".", "/")
+            for alias in node.names:
+                # `from workbench.room import file` names the file, not the room
+                yield f"{node.module}.{alias.name}" if (folder / f"{alias.name}.py").is_file() else node.module
 
 
 def room(name: str) -> str:

@@ -71,21 +71,33 @@ def study(
         str | None, typer.Argument(help="Name of a study, or path of its script; without it, a list.")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="File or folder that the study works on.")] = None,
+    every: Annotated[bool, typer.Option("--all", help="Run every study that makes its own data.")] = False,
 ) -> None:
     """Run a study, or list them.
 
     Example: workbench study beam_control
     """
-    from workbench.study.catalogue import find_study, list_studies, run_study
+    from workbench.study.catalogue import find_study, list_studies
+
+    if name is None and not every:
+        entries = list_studies()
+        width = max(len(entry.name) for entry in entries)
+        for entry in entries:
+            needs = f" (needs --data: {entry.needs_data})" if entry.needs_data else ""
+            console.print(f"{entry.name:<{width}}  {entry.question}{needs}", markup=False)
+        return
+    chosen = [entry for entry in list_studies() if not entry.needs_data] if every else [find_study(name)]
+    held = [_run(entry, data) for entry in chosen]
+    if not all(held):
+        raise typer.Exit(FAILURE)
+
+
+def _run(found, data: Path | None) -> bool:
+    """Run one study, print what it found, and say whether its checks hold."""
+    from workbench.study.catalogue import run_study
     from workbench.study.outcome import Outcome
 
-    if name is None:
-        table = Table(box=None, show_header=False, pad_edge=False)
-        for entry in list_studies():
-            table.add_row(entry.name, entry.question + (" [needs --data]" if entry.needs_data else ""))
-        console.print(table)
-        return
-    found = find_study(name)
+    root = found.path.resolve().parent.parent
     with _progress() as progress:
 
         def track(iterable, what):
@@ -94,12 +106,12 @@ def study(
         outcome = Outcome(
             name=found.name,
             title=found.question,
-            figures_folder=found.path.resolve().parent.parent / "figures",
+            figures_folder=root / "figures",
             on_say=lambda text: console.print(f"  {text}", markup=False),
             on_track=track,
         )
         console.print(found.question, style="bold", markup=False)
-        result, page = run_study(found, data, outcome, found.path.resolve().parent.parent)
+        result, page = run_study(found, data, outcome, root)
     failed = [check for check in outcome.checks if not check["holds"]]
     console.print(f"  {len(outcome.checks) - len(failed)} of {len(outcome.checks)} checks hold")
     for check in failed:
@@ -107,8 +119,7 @@ def study(
     for _, path, caption in outcome.figures:
         console.print(f"  figure  {_short(path)}  {caption}", markup=False)
     console.print(f"  results {_short(result)}\n  page    {_short(page)}", markup=False)
-    if failed:
-        raise typer.Exit(FAILURE)
+    return not failed
 
 
 @app.command()

@@ -19,7 +19,9 @@ def plot_ring_down(record: Record, *, stretch: float) -> Figure:
     for j, channel in enumerate(shown.output_channels):
         ax.axhline(j, color=GREY, linewidth=0.4)
         ax.plot(shown.time, j + 0.5 * shown.outputs[j] / size, color=COLOURS[0], linewidth=0.9)
-        ax.text(shown.time[-1], j, f"  x = {channel.at:.3g}" if channel.at is not None else f"  {channel.name}", va="center")
+        ax.text(
+            shown.time[-1], j, f"  x = {channel.at:.3g}" if channel.at is not None else f"  {channel.name}", va="center"
+        )
     ax.set(xlabel="time [s]", yticks=[], xlim=(shown.time[0], shown.time[-1]))
     ax.set_title("measured ring-down, one line a sensor")
     return figure
@@ -28,13 +30,17 @@ def plot_ring_down(record: Record, *, stretch: float) -> Figure:
 def plot_identified(found: Modes, truth: Modes, positions: np.ndarray, *, count: int) -> Figure:
     """Identified eigenfunctions over the true ones, with their values at the sensors."""
     columns = 3
-    figure, axes = new_figure(-(-count // columns), columns, width=10, height=4.6, sharex=True, sharey=True, squeeze=False)
+    figure, axes = new_figure(
+        -(-count // columns), columns, width=10, height=4.6, sharex=True, sharey=True, squeeze=False
+    )
     x = np.linspace(0.0, truth.length, 301)
     for r, ax in zip(range(count), axes.flat, strict=False):
         sign = np.sign(found.phi(x)[:, r] @ truth.phi(x)[:, r])
         ax.plot(x, truth.phi(x)[:, r], color=GREY, linewidth=4, alpha=0.5, label="true")
         ax.plot(x, sign * found.phi(x)[:, r], color=COLOURS[0], label="identified")
-        ax.plot(positions, sign * found.phi(positions)[:, r], "o", color=COLOURS[1], markersize=4, label="at the sensors")
+        ax.plot(
+            positions, sign * found.phi(positions)[:, r], "o", color=COLOURS[1], markersize=4, label="at the sensors"
+        )
         ax.set_title(f"mode {r + 1}: {found.frequencies_hz[r]:.4f} Hz, ζ = {100 * found.zeta[r]:.2f} %", fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel("x")
@@ -62,7 +68,9 @@ def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
     limit = max(np.abs(field).max() for field in fields.values())
     for ax, (name, field) in zip(axes[:, 0], fields.items(), strict=True):
         time = responses[name].time
-        image = ax.pcolormesh(time, x, field, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud", rasterized=True)
+        image = ax.pcolormesh(
+            time, x, field, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud", rasterized=True
+        )
         ax.set(ylabel="x", title=name)
         ax.grid(False)
     axes[-1, 0].set_xlabel("time [s]")

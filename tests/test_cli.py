@@ -1,0 +1,137 @@
+"""The command: what it finds on files a user has, its exit codes, and one clear line for bad input."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from workbench.cli import app
+from workbench.identification.synthesis import free_decay, struck
+from workbench.records.files import write_record
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+RIG = """
+[structure]
+kind = "beam"
+length = 10.0
+mass_per_length = 1.0
+bending_stiffness = 1.0
+left = "hinged"
+right = "hinged"
+damping_ratio = 0.0
+modes = 9
+[[input]]
+name = "F1"
+kind = "actuator"
+at = 2.0
+[[input]]
+name = "F2"
+kind = "actuator"
+at = 4.0
+[[input]]
+name = "F3"
+kind = "actuator"
+at = 6.0
+[[input]]
+name = "F4"
+kind = "actuator"
+at = 8.0
+[[input]]
+name = "hammer"
+kind = "hammer"
+at = 6.3
+[[output]]
+name = "y"
+quantity = "displacement"
+at = 3.0
+noise_std = 0.001
+"""
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    return path
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(a) for a in arguments])
+
+
+def test_identify_finds_the_modes_and_their_number(tmp_path):
+    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
+                damping=ModalDamping(0.01))  # fmt: skip
+    decay = struck(beam.modes(4), at=7.3, positions=[1.0, 3.0, 5.5, 8.0])
+    record = free_decay(decay, sample_time=0.5, n_samples=1000, quantity="velocity", noise_std=0.003, seed=3)
+    path, found = write_record(record, tmp_path / "ring.csv"), tmp_path / "found.json"
+    result = run("identify", path, "--json", found)
+    assert result.exit_code == 0, result.output
+    modes = json.loads(found.read_text())
+    exact = (np.arange(1, 5) * np.pi / 10) ** 2 / (2 * np.pi)
+    assert len(modes["frequencies_hz"]) == 4
+    assert (np.abs(modes["frequencies_hz"] - exact) < 5 * np.array(modes["frequencies_std_hz"])).all()
+
+
+def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
+    found = tmp_path / "design.json"
+    result = run("design", rig, "--control", 4, "--weight", 20, "--final-time", 3000, "--json", found)
+    assert result.exit_code == 0, result.output
+    imsc, coupled = json.loads(found.read_text())["laws"]
+    expected = [1.213865e-3, 5.203347e-5, 1.294254e-4, 1.037589e-4]
+    np.testing.assert_allclose(imsc["work"][5:], expected, rtol=1e-5)
+    assert coupled["cost"] <= imsc["cost"] * (1 + 1e-9)
+    assert "mode 6" in result.output
+
+
+def test_place_does_better_than_even_places(rig, tmp_path):
+    found = tmp_path / "places.json"
+    result = run("place", rig, "--control", 4, "--weight", 20, "--json", found)
+    assert result.exit_code == 0, result.output
+    best, even, nodes = json.loads(found.read_text())["placements"]
+    assert best["residual_work"] < min(even["residual_work"], nodes["residual_work"])
+    assert best["effort"] <= 1.5 * even["effort"] * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("identify", "nowhere.csv"), "no such file"),
+        (("identify", "{rig}"), "names no format"),
+        (("design", "nowhere.toml"), "no such file"),
+        (("design", "{rig}", "--control", 5), "5 controlled modes need as many actuators"),
+        (("design", "{rig}", "--weight", -1), "positive"),
+        (("place", "{rig}", "--control", 9), "residual"),
+        (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
+        (("diagnose", "nowhere"), "not a folder"),
+        (("study", "nothing_of_that_name"), "no study is called"),
+        (("study", "ruler"), "needs --data"),
+        (("study", "ruler", "--data", "nowhere.mat"), "no such file"),
+    ],
+)
+def test_bad_input_ends_in_one_line_and_code_2(rig, arguments, words):
+    result = run(*(str(a).format(rig=rig) for a in arguments))
+    assert result.exit_code == 2, result.output
+    assert words in result.output and "Traceback" not in result.output
+    assert len(result.output.strip().splitlines()) <= 2
+
+
+def test_a_study_that_does_not_hold_ends_in_code_1(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies" / "wrong.py").write_text(
+        '"""Is two less than [one]?"""\n\ndef study(outcome, data=None):\n    outcome.check("two", 2.0, 1.0)\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    assert "Is two less than [one]?" in run("study").output
+    result = run("study", "wrong")
+    assert result.exit_code == 1 and "does not hold: two: 2.0 against 1.0" in result.output
+    assert json.loads((tmp_path / "studies/results/wrong.json").read_text())["checks"][0]["holds"] is False
+    assert (tmp_path / "out/wrong.html").is_file()
+
+
+def test_every_command_explains_itself_with_an_example():
+    for name in ("study", "identify", "design", "place", "diagnose"):
+        result = run(name, "--help")
+        assert result.exit_code == 0 and "Example: workbench" in result.output
