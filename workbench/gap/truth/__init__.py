@@ -1,0 +1,1 @@
+"""The truth of a blind trial, by another numerical route than the diagnosis."""

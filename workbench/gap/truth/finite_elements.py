@@ -1,0 +1,175 @@
+"""Modes of a member by Hermite and quadratic finite elements of scikit-fem, sharing nothing with `Structure.modes`."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.linalg import eigsh
+from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, MeshLine
+from skfem.helpers import d, dd
+
+from workbench.structure.member import Bar, Beam, Structure
+from workbench.structure.modes import frozen
+from workbench.structure.supports import HELD
+
+ELEMENTS = 240
+
+
+@dataclass(frozen=True)
+class Alterations:
+    """What a real member has that the nominal one has not.
+
+    Attributes:
+        stiffness_factor: of EI or EA, everywhere.
+        losses: (at, width, loss) of the stiffness, several allowed.
+        masses: (at, mass) in m, kg.
+        springs: (at, stiffness) to ground, in m, N/m.
+        rotational_stiffness: (left, right) in N m/rad, in place of the nominal one; None leaves it.
+        tension: N, added to the nominal one.
+    """
+
+    stiffness_factor: float = 1.0
+    losses: tuple[tuple[float, float, float], ...] = ()
+    masses: tuple[tuple[float, float], ...] = ()
+    springs: tuple[tuple[float, float], ...] = ()
+    rotational_stiffness: tuple[float | None, float | None] = (None, None)
+    tension: float = 0.0
+
+
+AS_NOMINAL = Alterations()
+
+
+@dataclass(frozen=True, eq=False)
+class ElementModes:
+    """Modes at chosen places.
+
+    Attributes:
+        omega: (n_modes,) rad/s.
+        shapes: (n_places, n_modes), mass-normalised.
+        gram: (n_modes, n_modes) ∫ φ_r' φ_s' dx.
+    """
+
+    omega: np.ndarray
+    shapes: np.ndarray
+    gram: np.ndarray
+
+    def __post_init__(self) -> None:
+        for name in ("omega", "shapes", "gram"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+
+def element_modes(
+    member: Structure,
+    places: np.ndarray,
+    n_modes: int,
+    *,
+    altered: Alterations = AS_NOMINAL,
+    elements: int = ELEMENTS,
+) -> ElementModes:
+    """The lowest modes of an altered member, K v = ω² M v, with a node at every place.
+
+    Args:
+        places: (n_places,) where shapes are wanted, m.
+        elements: evenly spaced ones, to which the special places add theirs.
+    """
+    beam = isinstance(member, Beam)
+    special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
+    special += [at + side * width / 2 for at, width, _ in altered.losses for side in (-1, 1)]
+    profile = member.bending_stiffness if beam else member.axial_stiffness
+    special += [*member.mass_per_length.breaks, *profile.breaks, *(part.at for part in member.attachments)]
+    nodes = _nodes(np.array(special, float), member.length, elements)
+    basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
+    stiffness, mass, slopes = _matrices(basis, member, altered)
+    held = _hold_ends(stiffness, basis, member, altered)
+    displacement = basis.nodal_dofs[0]
+    for at, value in (*altered.masses, *_attached(member, "mass")):
+        mass[displacement[_node(nodes, at)], displacement[_node(nodes, at)]] += value
+    for at, value in (*altered.springs, *_attached(member, "stiffness")):
+        stiffness[displacement[_node(nodes, at)], displacement[_node(nodes, at)]] += value
+    free = np.setdiff1d(np.arange(basis.N), held)
+    stiffness, mass = csr_matrix(stiffness)[free][:, free].tocsc(), csr_matrix(mass)[free][:, free].tocsc()
+    # the shift makes the pencil definite with rigid-body modes, and stands far below the first elastic one
+    shift = -1e-3 * _typical(member) ** 2
+    values, vectors = eigsh(stiffness, k=n_modes, M=mass, sigma=shift, which="LM", v0=np.ones(free.size))
+    order = np.argsort(values)
+    full = np.zeros((basis.N, n_modes))
+    full[free] = vectors[:, order]
+    full /= np.sqrt(np.einsum("ir,ir->r", full[free], mass @ full[free]))
+    omega2 = np.where(np.abs(values[order]) < 1e-6 * abs(shift), 0.0, values[order])
+    if (omega2 < 0).any():
+        raise ValueError("the altered member is unstable: it buckles; draw a weaker compression")
+    at_places = full[displacement[[_node(nodes, x) for x in places]]] if len(places) else np.zeros((0, n_modes))
+    return ElementModes(np.sqrt(omega2), at_places, full.T @ (slopes @ full))
+
+
+def _nodes(special: np.ndarray, length: float, elements: int) -> np.ndarray:
+    """Even nodes and the special ones; an even node beside a special one gives way, so no element is a sliver."""
+    special = np.unique(np.r_[0.0, special[(special > 0) & (special < length)], length])
+    special = special[np.r_[True, np.diff(special) > 1e-9 * length]]
+    even = np.linspace(0.0, length, elements + 1)
+    distance = np.abs(even[:, None] - special[None, :]).min(axis=1)
+    return np.sort(np.r_[special, even[distance > 0.3 * length / elements]])
+
+
+def _node(nodes: np.ndarray, at: float) -> int:
+    return int(np.argmin(np.abs(nodes - at)))
+
+
+def _matrices(basis: Basis, member: Structure, altered: Alterations):
+    profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
+
+    def rigidity(x: np.ndarray) -> np.ndarray:
+        values = altered.stiffness_factor * profile(x)
+        for at, width, loss in altered.losses:
+            values = values * np.where(np.abs(x - at) < width / 2, 1.0 - loss, 1.0)
+        return values
+
+    @BilinearForm
+    def bending(u, v, w):
+        return rigidity(w.x[0]) * dd(u)[0, 0] * dd(v)[0, 0]
+
+    @BilinearForm
+    def slope(u, v, w):
+        return d(u)[0] * d(v)[0]
+
+    @BilinearForm
+    def stretching(u, v, w):
+        return rigidity(w.x[0]) * d(u)[0] * d(v)[0]
+
+    @BilinearForm
+    def inertia(u, v, w):
+        return member.mass_per_length(w.x[0]) * u * v
+
+    slopes = slope.assemble(basis)
+    if isinstance(member, Bar):
+        stiffness = stretching.assemble(basis)
+    else:
+        stiffness = bending.assemble(basis) + (member.tension + altered.tension) * slopes
+    return stiffness.tolil(), inertia.assemble(basis).tolil(), slopes
+
+
+def _hold_ends(stiffness, basis: Basis, member: Structure, altered: Alterations) -> list[int]:
+    """Add the springs of the ends, and give back what is held."""
+    held = []
+    for end, rotation, node in zip((member.left, member.right), altered.rotational_stiffness, (0, -1), strict=True):
+        rules = [(basis.nodal_dofs[0][node], end.translation)]
+        if isinstance(member, Beam):
+            rules.append((basis.nodal_dofs[1][node], end.rotation if rotation is None else rotation))
+        for dof, value in rules:
+            if value == HELD:
+                held.append(dof)
+            else:
+                stiffness[dof, dof] += value
+    return held
+
+
+def _attached(member: Structure, name: str) -> list[tuple[float, float]]:
+    return [(part.at, getattr(part, name)) for part in member.attachments if hasattr(part, name)]
+
+
+def _typical(member: Structure) -> float:
+    """A frequency of the size of the first elastic one, rad/s."""
+    order = 2 if isinstance(member, Beam) else 1
+    profile = member.bending_stiffness if order == 2 else member.axial_stiffness
+    x = np.linspace(0.05, 0.95, 19) * member.length
+    return float(np.sqrt(profile(x).mean() / member.mass_per_length(x).mean()) * (np.pi / member.length) ** order)

@@ -1,0 +1,153 @@
+"""Motion of a real structure by the classical Runge-Kutta method in many small steps, sharing nothing with `simulate`.
+
+Steps end where a delayed command changes, so that forces are smooth within each. What is stepped together: modal
+coordinates and rates, the lags of actuators, the hysteretic variables of laws at points.
+"""
+
+import numpy as np
+from numba import njit
+
+DAMPER, CUBIC, CLEARANCE, STOP, FRICTION, BOUC_WEN, QUADRATIC, QUINTIC, CUBIC_DAMPER, SQUEEZE, MAGNET = range(11)
+
+
+@njit(cache=True)
+def law_force(code, p, w, v, z):
+    """Force of a law at a point, from displacement, velocity and hysteretic variable there."""
+    if code == DAMPER:
+        return -p[0] * v
+    if code == CUBIC:
+        return -p[0] * w**3
+    if code == CLEARANCE:
+        return -p[0] * (max(w - p[1], 0.0) + min(w + p[1], 0.0))
+    if code == STOP:
+        return -p[0] * max(w - p[1], 0.0)
+    if code == FRICTION:
+        return -p[0] * np.tanh(v / p[1])
+    if code == BOUC_WEN:
+        return -p[0] * z
+    if code == QUADRATIC:
+        return -p[0] * w * abs(w)
+    if code == QUINTIC:
+        return -p[0] * w**5
+    if code == CUBIC_DAMPER:
+        return -p[0] * v**3
+    if code == SQUEEZE:
+        return -p[0] * w * w * v
+    return p[0] * w / (1.0 + (w / p[1]) ** 2) ** 2
+
+
+@njit(cache=True)
+def _rates(t, y, dy, system, targets, held):
+    """dy/dt under the forces that the actuators head for and the modal forces held over the interval."""
+    structure, (lags, shapes), (tones, tone_shapes), (laws, law_shapes), (drag, field) = system
+    omega2, damping, gram, stretching, rate = structure
+    m, n = shapes.shape
+    factor = 1.0 + rate * t
+    for i in range(n):
+        dy[i] = y[n + i]
+        dy[n + i] = -factor * omega2[i] * y[i] - damping[i] * y[n + i] + held[i]
+    for j in range(m):
+        force = targets[j]
+        if lags[j] > 0.0:
+            force = y[2 * n + j]
+            dy[2 * n + j] = (targets[j] - force) / lags[j]
+        if force != 0.0:
+            for i in range(n):
+                dy[n + i] += shapes[j, i] * force
+    for j in range(tones.shape[0]):
+        force = tones[j, 0] * np.sin(tones[j, 1] * t + tones[j, 2])
+        for i in range(n):
+            dy[n + i] += tone_shapes[j, i] * force
+    for j in range(laws.shape[0]):
+        w = 0.0
+        v = 0.0
+        for i in range(n):
+            w += law_shapes[j, i] * y[i]
+            v += law_shapes[j, i] * y[n + i]
+        z = y[2 * n + m + j]
+        dy[2 * n + m + j] = v - (abs(v) * z + v * abs(z)) / (2.0 * laws[j, 2]) if laws[j, 0] == BOUC_WEN else 0.0
+        force = law_force(int(laws[j, 0]), laws[j, 1:], w, v, z)
+        for i in range(n):
+            dy[n + i] += law_shapes[j, i] * force
+    if stretching > 0.0:
+        pull = gram @ y[:n]
+        tension = stretching * np.dot(pull, y[:n])
+        for i in range(n):
+            dy[n + i] -= tension * pull[i]
+    if drag > 0.0:
+        for k in range(field.shape[0]):
+            v = 0.0
+            for i in range(n):
+                v += field[k, i] * y[n + i]
+            force = -drag * field[k, n] * abs(v) * v
+            for i in range(n):
+                dy[n + i] += field[k, i] * force
+
+
+@njit(cache=True)
+def integrate(system, drive, commands, feedback, held, sample_time, edges, steps):
+    """Modal motion at the samples, from rest.
+
+    Args:
+        system: the structure (omega2 (n,), damping (n,), gram (n, n), stretching, stiffness rate); the actuators
+            (lags (m,), shapes (m, n)); tones (n_tones, 3) of amplitude, rad/s, phase, and shapes; laws (n_laws, 4)
+            of code and parameters, and shapes; air drag: coefficient, and shapes and weights (n_points, n + 1).
+        drive: mix (m, m), what each actuator gets of every command, and a table (m, 5): gain, dead zone, limit, delay,
+            curvature (u + curvature u |u| of the command, before the gain).
+        commands: (m, n_samples); lowered by the feedback, in place.
+        feedback: (m, n) command taken away per modal rate at each sample.
+        held: (n_samples, n) unmeasured modal forces, over each interval.
+        sample_time: s.
+        edges: fractions of a sample interval where its pieces end, the last one 1.
+        steps: in each piece.
+
+    Returns:
+        displacement, velocity, acceleration, each (n_samples, n).
+    """
+    mix, table = drive
+    dt = sample_time
+    m, n_samples = commands.shape
+    n = held.shape[1]
+    size = 2 * n + m + system[3][0].shape[0]
+    y, trial = np.zeros(size), np.zeros(size)
+    k1, k2, k3, k4 = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    out = np.zeros((3, n_samples, n))
+    aims = np.zeros((m, n_samples))
+    targets = np.zeros(m)
+    for k in range(n_samples):
+        for j in range(m):
+            for i in range(n):
+                commands[j, k] -= feedback[j, i] * y[n + i]
+        for j in range(m):
+            u = 0.0
+            for i in range(m):
+                u += mix[j, i] * commands[i, k]
+            u += table[j, 4] * u * abs(u)
+            u *= table[j, 0]
+            u = np.sign(u) * max(abs(u) - table[j, 1], 0.0)
+            aims[j, k] = min(max(u, -table[j, 2]), table[j, 2])
+        start = 0.0
+        for piece in range(edges.size):
+            middle = k + 0.5 * (start + edges[piece])
+            for j in range(m):
+                index = int(np.floor(middle - table[j, 3] / dt))
+                targets[j] = aims[j, index] if index >= 0 else 0.0
+            h = (edges[piece] - start) * dt / steps[piece]
+            for step in range(steps[piece]):
+                t = (k + start) * dt + step * h
+                _rates(t, y, k1, system, targets, held[k])
+                if piece == 0 and step == 0:
+                    out[0, k], out[1, k], out[2, k] = y[:n], y[n : 2 * n], k1[n : 2 * n]
+                for i in range(size):
+                    trial[i] = y[i] + 0.5 * h * k1[i]
+                _rates(t + 0.5 * h, trial, k2, system, targets, held[k])
+                for i in range(size):
+                    trial[i] = y[i] + 0.5 * h * k2[i]
+                _rates(t + 0.5 * h, trial, k3, system, targets, held[k])
+                for i in range(size):
+                    trial[i] = y[i] + h * k3[i]
+                _rates(t + h, trial, k4, system, targets, held[k])
+                for i in range(size):
+                    y[i] += h * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]) / 6.0
+            start = edges[piece]
+    return out[0], out[1], out[2]
