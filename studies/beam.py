@@ -86,14 +86,6 @@ def study(outcome, data=None) -> None:
     next(stages)
     x = np.linspace(0.0, LENGTH, 201)
     report_modes(outcome, truth, modes, found, x)
-
-    laws = designs(modes)
-    next(stages)
-    model = state_space(modes, laws["IMSC"].actuators, [Sensor(f"y{j + 1}", at) for j, at in enumerate(SENSORS)])
-    outcome.say(f"The model: {model.nstates} states, {model.ninputs} actuators, {model.noutputs} sensors.")
-    report_designs(outcome, truth, modes, laws)
-    next(stages)
-
     outcome.figure(
         "ring_down",
         plot_ring_down(record, stretch=120.0),
@@ -104,6 +96,14 @@ def study(outcome, data=None) -> None:
         plot_identified(modes, truth, SENSORS, count=6),
         "What was found: eigenfunctions through the sensors (dots), over the true ones (grey).",
     )
+
+    laws = designs(modes)
+    next(stages)
+    model = state_space(modes, laws["IMSC"].actuators, [Sensor(f"y{j + 1}", at) for j, at in enumerate(SENSORS)])
+    outcome.say(f"The model: {model.nstates} states, {model.ninputs} actuators, {model.noutputs} sensors.")
+    report_designs(outcome, truth, modes, laws)
+    next(stages)
+
     report_motion(outcome, truth, modes, laws, x)
 
 

@@ -102,12 +102,24 @@ def study_page(outcome: Outcome, folder: Path) -> Path:
         title=outcome.title or outcome.name,
         lines=outcome.lines,
         figures=[(path, caption) for _, path, caption in outcome.figures],
-        tables=[("Checks", ("what", "value", "limit", ""), checks)] if checks else (),
+        tables=[*_rows_of(outcome.tables), *([("Checks", ("what", "value", "limit", ""), checks)] if checks else ())],
         made_by=f"workbench study {outcome.name}",
     )
 
 
+def _rows_of(tables: dict) -> list[tuple]:
+    """Those tables that are rows of named figures; what else a study keeps is in its JSON."""
+    found = []
+    for name, table in tables.items():
+        if isinstance(table, list) and table and all(isinstance(row, dict) for row in table):
+            heads = tuple(table[0])
+            found.append((name.replace("_", " "), heads, [[row.get(head, "") for head in heads] for row in table]))
+    return found
+
+
 def _cell(value):
+    if isinstance(value, list):
+        return ", ".join(str(_cell(item)) for item in value)
     if isinstance(value, bool):
         return value
     return f"{value:.6g}" if isinstance(value, float) else str(value)
