@@ -63,7 +63,9 @@ def test_damped_modes_are_designed_with_their_damping():
     law = imsc(damped, 4, actuators(2.0, 4.0, 6.0, 8.0), weight=20.0)
     b = damped.phi([2.0, 4.0, 6.0, 8.0]).T
     a = np.block([[np.zeros((4, 4)), np.eye(4)], [-np.diag(damped.omega**2), -damped.damping]])
-    peer = control.lqr(a, np.vstack([np.zeros((4, 4)), np.eye(4)]), np.diag([*damped.omega**2, 1, 1, 1, 1]), 20 * np.eye(4))[0]
+    peer = control.lqr(
+        a, np.vstack([np.zeros((4, 4)), np.eye(4)]), np.diag([*damped.omega**2, 1, 1, 1, 1]), 20 * np.eye(4)
+    )[0]
     np.testing.assert_allclose(b @ law.gain, peer, atol=1e-8)
 
 

@@ -45,7 +45,9 @@ def test_work_in_equals_energy_gained(filtered):
     loop = close_loop(modes(), chosen, filter_)
     for final in (0.3, 7.0, 60.0):
         gained = energy_gained(loop, state, final)
-        np.testing.assert_allclose(finite_spillover(loop, state, final).by_mode, gained, atol=1e-9 * np.abs(gained).max())
+        np.testing.assert_allclose(
+            finite_spillover(loop, state, final).by_mode, gained, atol=1e-9 * np.abs(gained).max()
+        )
 
 
 def test_work_with_damping_against_quadrature():
