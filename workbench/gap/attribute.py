@@ -11,6 +11,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.containment import simpler_forms
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import HOPELESS, Fit, cost_of, fit
@@ -138,6 +139,8 @@ def _search(rig, seen, data, catalogue, report, pool) -> Attribution:
     if found is None:
         pairs = _pairs(search, singles)
         found = _decide_pairs(search, start, singles, pairs)
+        if found[0] != "explained":
+            found = _with_nominal(search, start) or found
     outcome, best, random, rivals = found
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
@@ -354,6 +357,24 @@ def _pairs(search: _Search, singles: list[Fit]) -> list[Fit]:
         if search.explains(_finished(search, pairs[0])):
             break
     return pairs
+
+
+def _with_nominal(search: _Search, start: Fit):
+    """An outcome with the nominal figures freed, alone or with one effect; None if that explains nothing either.
+
+    The nominal figures are trusted first, because freed they can bend to much; they are freed where no set explains
+    the records without.
+    """
+    figures = Effect(NOMINAL_FIGURES, None, {p.name: 1.0 for p in NOMINAL_FIGURES.parameters(search.rig, None)})
+    freed = fit(search.rig, (figures,), search.data, iterations=8)
+    if search.explains(freed):
+        return "explained", freed, None, ()
+    if freed.cost > 0.7 * start.cost:
+        return None
+    evidence = Evidence.of(apply_all(search.rig, freed.effects), search.data, 20)
+    joined = _extend(search, freed.effects, evidence, 0.95, 0.99, finalists=2)
+    finished = fit(search.rig, joined[0].effects, search.data.finer(8), iterations=6)
+    return ("explained", finished, None, ()) if search.explains(finished) else None
 
 
 def _decide_pairs(search: _Search, start: Fit, singles: list[Fit], pairs: list[Fit]):

@@ -71,6 +71,10 @@ class _Problem:
             for (_, p), z in zip(self.parameters, self.start, strict=True)
         ]
         self.steps = np.array(floor)
+        # a believed value is one more measurement: of itself, by its own standard deviation
+        self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
+        self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
+        self.centre = np.array([self.parameters[j][1].to_free(1.0) for j in self.believed])
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
@@ -79,7 +83,10 @@ class _Problem:
         return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
 
     def residual(self, free: np.ndarray) -> np.ndarray | None:
-        return _finite_residual(self.rig, self.at(free), self.data)
+        residual = _finite_residual(self.rig, self.at(free), self.data)
+        if residual is None or not self.believed:
+            return residual
+        return np.r_[residual, (free[self.believed] - self.centre) / self.prior_std]
 
     def jacobian(self, free: np.ndarray, residual: np.ndarray) -> np.ndarray:
         columns = []
@@ -154,6 +161,7 @@ def _reach(problem: _Problem) -> np.ndarray:
 
 
 def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, status: str) -> Fit:
+    residual = residual[: problem.data.n_values]
     cost = float(residual @ residual) / residual.size
     deviations = np.zeros(free.size)
     if free.size and np.trace(normal) > 0:

@@ -20,6 +20,7 @@ class Parameter:
         low, high: bounds, in the unit.
         logarithmic: fitted as its logarithm; for what is positive by nature.
         scale: a typical size, which makes the steps of a fit comparable.
+        prior_std: where the value at the start is believed, how far its free coordinate may stray.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Parameter:
     high: float
     logarithmic: bool = False
     scale: float = 1.0
+    prior_std: float | None = None
 
     def to_free(self, value: float) -> float:
         """From the unit to the coordinate of the fit."""
@@ -56,6 +58,7 @@ class Kind:
         targets: rig -> what it can act on: input or output names, "all", an end; (None,) where there is no choice.
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
+        last: whether it acts on the modes that all other effects have made.
     """
 
     name: str
@@ -66,6 +69,7 @@ class Kind:
     targets: Callable[[Rig], tuple] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
+    last: bool = False
 
     @property
     def words(self) -> str:
@@ -101,7 +105,7 @@ class Effect:
 
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
-    """The rig with every effect in it, in order."""
-    for effect in effects:
+    """The rig with every effect in it, in order, those that come last at the end."""
+    for effect in sorted(effects, key=lambda e: e.kind.last):
         rig = effect.apply(rig)
     return rig
