@@ -103,6 +103,7 @@ def _assembled(path, time, signals, header, sample_rate_hz, inputs) -> Record:
         try:
             header = json.loads(header) if isinstance(header, str) else header
             known = {_key(c["kind"], c["name"]): c for c in header["channels"]}
+            header = {"name": str(header["name"])} | {k: float(header[k]) for k in ("start_time", "sample_time")}
         except (ValueError, KeyError, TypeError) as error:
             raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error
     lengths = {name: np.size(values) for name, values in signals.items()}
@@ -154,8 +155,6 @@ def _plain(key: str) -> str:
 
 
 def _sampling(path, time, n_samples: int, header, sample_rate_hz) -> tuple[float, float]:
-    if header and time is not None and np.size(time) == n_samples:
-        return float(header["start_time"]), float(header["sample_time"])
     if time is None:
         if sample_rate_hz is None:
             raise RecordFileError(f"{path} tells no time; give sample_rate_hz")
@@ -178,4 +177,12 @@ def _sampling(path, time, n_samples: int, header, sample_rate_hz) -> tuple[float
         )
     if sample_rate_hz is not None and abs(sample_rate_hz * step - 1.0) > UNIFORM:
         raise RecordFileError(f"{path} is sampled at {1 / step:g} Hz, not at {sample_rate_hz:g} Hz")
-    return float(time[0]), float((time[-1] - time[0]) / (n_samples - 1))
+    if header is None:
+        return float(time[0]), float((time[-1] - time[0]) / (n_samples - 1))
+    start, told = header["start_time"], header["sample_time"]
+    if not (abs(told - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
+        raise RecordFileError(
+            f"{path}: its description says a start at {start:g} s and steps of {told:g} s, its times {time[0]:g} s and"
+            f" {step:g} s; mend or remove the description"
+        )
+    return start, told
