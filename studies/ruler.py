@@ -24,7 +24,7 @@ NEEDS_DATA = "ruler.mat, the measured transfer functions"
 
 POSITIONS = np.linspace(0.003, 0.983, 10)
 BAND_HZ = 800.0
-# These settings were chosen from 25 (decimation 5 to 12, 30 to 150 delays), and the choice matters: 5 of the 25 find all
+# These settings were chosen from 25 (decimation 5 to 12, 30 to 150 delays), and the choice matters: 5 find all
 # eight modes, the rest miss one to three; the fifth MAC lies between 0.944 and 0.954, and of those 5 only this one has
 # it above 0.95.
 DECIMATION, DELAYS, ORDERS = 6, 150, range(6, 25)
