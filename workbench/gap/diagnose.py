@@ -2,14 +2,18 @@
 
 from collections.abc import Callable, Sequence
 
-from workbench.gap.attribute import attribute
+from workbench.gap.attribute import Attribution, attribute
+from workbench.gap.check import check_records, readiness
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Kind, apply_all
+from workbench.gap.experiment import Experiment, next_experiment
 from workbench.gap.locate import locate
 from workbench.gap.shrinkage import measure
 from workbench.gap.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
+
+RIVAL = 0.01  # probability from which a rival is worth an experiment
 
 
 def diagnose(
@@ -36,12 +40,13 @@ def diagnose(
         workers: threads.
 
     Raises:
-        ValueError: records that do not fit the rig, or sensors without noise_std.
+        ValueError: records that do not fit the rig or cannot be of it, or sensors without noise_std.
     """
     for record in (*records, *validation):
         _check(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
+    check_records(rig, records)
     found = attribute(rig, records, catalogue=catalogue, report=report, workers=workers)
     corrected = apply_all(rig, found.best.effects)
     effects = found.best.effects if found.outcome in ("none", "explained") else ()
@@ -55,6 +60,8 @@ def diagnose(
         corrected=corrected,
         nominal=rig,
         attribution=found,
+        readiness=readiness(rig, found.data, catalogue=catalogue),
+        experiment=_next(rig, found),
         notes=_notes(found),
     )
 
@@ -72,7 +79,15 @@ def _check(rig: Rig, record: Record) -> None:
             )
 
 
-def _notes(found) -> tuple[str, ...]:
+def _next(rig: Rig, found: Attribution) -> Experiment | None:
+    """The experiment that would separate the best set from its likeliest rival."""
+    for rival, probability in found.rivals:
+        if found.outcome == "explained" and probability > RIVAL:
+            return next_experiment(rig, found.best, rival, found.data)
+    return None
+
+
+def _notes(found: Attribution) -> tuple[str, ...]:
     names = {effect.kind.name for effect in found.best.effects}
     notes = []
     if "random_disturbance" in names:

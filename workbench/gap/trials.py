@@ -21,7 +21,7 @@ from workbench.rig.rig import Rig
 NONE, UNKNOWN = "none", "unknown"
 KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
-MOST_BENCHES = 40
+MOST_BENCHES, MOST_DRAWS = 40, 8
 VISIBLE = 0.02
 SEEN = 0.03  # each effect of a pair must alter the response by this much beside the other
 
@@ -56,7 +56,7 @@ def make_trial(
         raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
     rng = np.random.default_rng(seed)
     reason = ""
-    for _ in range(MOST_BENCHES):
+    for _ in range(MOST_BENCHES if rig is None else MOST_DRAWS):
         try:
             bench = draw_bench(rng) if rig is None else fitted_bench(rig, rng)
             tests = experiments(bench, rng)
@@ -119,7 +119,11 @@ def _case(
         figures[test] = {
             "gap": _gap(measured, _predicted(nominal, sent, bench)),
             "noise_floor": _gap(np.array([[s.noise_std] for s in bench.rig.sensors]), 0.0, measured),
-            "true_model": _gap(measured, _predicted(real, sent, bench)),
+            # without random forces the motion is what the exact model predicts
+            "true_model": _gap(
+                measured,
+                _predicted(real, sent, bench) if real.plant.noises else real.readings(moved, bench.sample_time),
+            ),
         }
     _check_visible(figures, effects)
     told = [{"kind": UNKNOWN, "outside": e["kind"]} if e["kind"] in OUTSIDE else e for e in effects]
@@ -191,9 +195,15 @@ def write_trials(
     seed: int,
     *,
     rig: Rig | None = None,
+    kinds: Sequence[Sequence[str]] | None = None,
     report: Callable[[str, float], None] = lambda text, share: None,
 ) -> None:
     """Write n cases as folders, and their labels as one JSON file elsewhere.
+
+    Args:
+        rig: nominal, of all cases; None draws one a case. Kinds that it cannot show give way to others.
+        kinds: what each case hides; None draws them, see `draw_kinds`.
+        report: told (what, share done).
 
     Raises:
         ValueError: labels that would lie in the folder that the diagnosis reads.
@@ -202,9 +212,9 @@ def write_trials(
     if labels.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
     told = {}
-    for i, kinds in enumerate(draw_kinds(n, seed, rig=rig)):
+    for i, hidden in enumerate(draw_kinds(n, seed, rig=rig) if kinds is None else kinds):
         name = f"case-{i + 1:03d}"
-        case, told[name] = _first_possible(seed, i, kinds, rig, name)
+        case, told[name] = _first_possible(seed, i, tuple(hidden), rig, name)
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)

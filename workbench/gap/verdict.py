@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.gap.attribute import Attribution
+from workbench.gap.check import Readiness
 from workbench.gap.effects.effect import ALL, Effect
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
+from workbench.gap.experiment import Experiment
 from workbench.gap.locate import Where
 from workbench.gap.shrinkage import Shrinkage
 from workbench.rig.rig import Rig
@@ -26,6 +28,8 @@ class Verdict:
         corrected: the rig with the effects in it.
         nominal: the rig as it was handed in.
         attribution: the whole search.
+        readiness: what the records could tell before anything was fitted.
+        experiment: what to measure next, where rivals remain.
         notes: what else a reader should know.
     """
 
@@ -38,6 +42,8 @@ class Verdict:
     corrected: Rig
     nominal: Rig
     attribution: Attribution
+    readiness: Readiness
+    experiment: Experiment | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -95,6 +101,11 @@ class Verdict:
                 "nominal": _rounded(self.attribution.nominal_cost),
                 "corrected": _rounded(self.attribution.best.cost),
             },
+            "check": {
+                "invisible": list(self.readiness.invisible),
+                "alike": [list(pair[:2]) for pair in self.readiness.alike],
+            },
+            "next_experiment": None if self.experiment is None else self.experiment.sentence,
             "notes": list(self.notes),
         }
 

@@ -54,7 +54,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path) -> Path:
         path,
         title=f"Diagnosis of {verdict.case}",
         lead=verdict.sentence,
-        lines=verdict.notes,
+        lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
         figures=[(_png(figure), caption) for figure, caption in figures],
         tables=[table for table in tables if table[2]],
         made_by=f"workbench diagnose {verdict.case}",
@@ -65,3 +65,17 @@ def _png(figure) -> bytes:
     buffer = BytesIO()
     figure.savefig(buffer, format="png")
     return buffer.getvalue()
+
+
+def _could_show(verdict: Verdict) -> str:
+    """What the records could and could not tell, in a line."""
+    hidden, alike = verdict.readiness.invisible, verdict.readiness.alike
+    text = (
+        f"Before any fit: these records could show all but {len(hidden)} of {len(verdict.readiness.strengths)} effects"
+    )
+    if hidden:
+        text += f" (not {', '.join(hidden[:6])}{', …' if len(hidden) > 6 else ''})"
+    if alike:
+        text += f"; at small strength they could not tell {alike[0][0]} from {alike[0][1]}"
+        text += f", nor {len(alike) - 1} pairs more" if len(alike) > 1 else ""
+    return text + "."
