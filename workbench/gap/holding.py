@@ -1,0 +1,71 @@
+"""Holding blind trials: make cases with sealed labels, diagnose them, score them."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from workbench.gap.case import read_case
+from workbench.gap.diagnose import diagnose
+from workbench.gap.scoring import Tally, score, tally
+from workbench.gap.trials import write_trials
+from workbench.rig.rig import Rig
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Blind trials as they were held.
+
+    Attributes:
+        verdicts: by case, as JSON.
+        labels: by case.
+        scores: by case.
+        tally: of all scores.
+    """
+
+    verdicts: dict[str, dict]
+    labels: dict[str, dict]
+    scores: dict[str, dict]
+    tally: Tally
+
+
+def hold_trials(
+    n: int,
+    seed: int,
+    *,
+    rig: Rig | None = None,
+    kinds: Sequence[Sequence[str]] | None = None,
+    diagnose_case: Callable[[Path], dict] | None = None,
+    report: Callable[[str, float], None] = lambda text, share: None,
+) -> Trials:
+    """Make n blind cases, diagnose each, and only then open the labels and score.
+
+    The labels are read into memory and their file deleted before the first diagnosis; a diagnosis is handed a folder
+    that holds cases alone.
+
+    Args:
+        rig: the user's own nominal rig; None draws one a case.
+        kinds: what the cases hide, one entry a case; None draws them.
+        diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
+        report: told (what, share done).
+    """
+    with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
+        sealed = Path(vault) / "labels.json"
+        write_trials(cases, sealed, n, seed, rig=rig, kinds=kinds, report=lambda t, s: report(f"making {t}", 0.1 * s))
+        labels = json.loads(sealed.read_text(encoding="utf-8"))
+        sealed.unlink()
+        verdicts, scores = {}, {}
+        for i, folder in enumerate(sorted(Path(cases).iterdir())):
+            report(f"diagnosing {folder.name}", 0.1 + 0.9 * i / n)
+            verdicts[folder.name] = (diagnose_case or verdict_on)(folder)
+        for folder in sorted(Path(cases).iterdir()):
+            length = read_case(folder).rig.modes.length
+            scores[folder.name] = score(verdicts[folder.name], labels[folder.name], length=length)
+    return Trials(verdicts, labels, scores, tally(scores.values()))
+
+
+def verdict_on(folder: Path) -> dict:
+    """The verdict on a case folder, as JSON."""
+    case = read_case(folder)
+    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name).to_json()
