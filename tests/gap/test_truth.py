@@ -253,6 +253,17 @@ def test_sensors_lose_lag_gain_bias_noise_limit_and_step_in_that_order(rig):
         np.testing.assert_allclose(row, 0.05 * np.round(exact / 0.05), atol=1e-9)
 
 
+def test_the_mean_of_rounded_readings_is_their_mean(rig):
+    sensors = tuple(replace(s, step=0.05, noise_std=0.01) for s in rig.sensors)
+    rooted = replace(Plant.of(rig), sensors=sensors).rooted()
+    ramp = np.outer(np.linspace(0.0, 0.2, 40), np.ones(4))
+    rng = np.random.default_rng(0)
+    many = np.mean([rooted.readings((ramp, ramp, ramp), DT, rng) for _ in range(4000)], axis=0)
+    mean = rooted.readings((ramp, ramp, ramp), DT)
+    np.testing.assert_allclose(mean, many, atol=6.0 * 0.05 / np.sqrt(12.0 * 4000))
+    assert np.abs(mean - rooted.truth((ramp, ramp, ramp))).max() > 0.005, "rounding must matter"
+
+
 def test_modes_beyond_the_nominal_ones_take_its_damping(rig):
     truncated = {"kind": "truncated_modes", "kept": 4, "needed": 7}
     shown = hide(Plant.of(rig), [truncated, {"kind": "modal_damping", "factor": 2.0}])

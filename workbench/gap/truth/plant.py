@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from workbench.gap.truth import motion
 from workbench.gap.truth.finite_elements import Alterations, ElementModes, element_modes
@@ -150,7 +151,7 @@ class RootedPlant:
     def readings(
         self, moved: tuple[np.ndarray, ...], sample_time: float, rng: np.random.Generator | None = None
     ) -> np.ndarray:
-        """What the sensors read, (n_outputs, n_samples); without `rng` free of noise and not rounded."""
+        """What the sensors read, (n_outputs, n_samples); without `rng` the mean of what rounding makes of noise."""
         y = self.truth(moved)
         for law in self.plant.reading_laws:
             y = law(y, sample_time)
@@ -161,7 +162,11 @@ class RootedPlant:
             if rng is not None:
                 row = row + sensor.noise_std * rng.standard_normal(row.size)
             row = np.clip(row, -sensor.limit, sensor.limit)
-            rows.append(sensor.step * np.round(row / sensor.step) if rng is not None and sensor.step > 0 else row)
+            if sensor.step > 0:
+                mean = rng is None and sensor.noise_std > 0
+                rounded = sensor.step * np.round(row / sensor.step)
+                row = _mean_rounded(row, sensor.step, sensor.noise_std) if mean else rounded
+            rows.append(row)
         return np.array(rows)
 
 
@@ -190,6 +195,15 @@ def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
         behind = out[k - 1] - y[k - 1] + slope * time_constant
         out[k] = y[k] - slope * time_constant + behind * fade
     return out
+
+
+def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:
+    """The mean of round((y + noise) / step) step: every half step that noise carries a reading across counts one."""
+    nearest = np.round(y / step)
+    reach = np.arange(int(np.ceil(8.0 * noise_std / step)) + 1)[:, None] + 0.5
+    above = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
+    below = ndtr(((nearest - reach) * step - y) / noise_std).sum(axis=0)
+    return step * (nearest + above - below)
 
 
 def with_ports(plant: Plant, side: str, name: str, **changes) -> Plant:
