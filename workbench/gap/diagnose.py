@@ -25,6 +25,7 @@ def diagnose(
     name: str = "case",
     report: Callable[[str, float], None] = lambda text, share: None,
     workers: int = 2,
+    settle: float = 0.0,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -38,6 +39,8 @@ def diagnose(
         name: of the case.
         report: told (what, share done) as the search proceeds.
         workers: threads.
+        settle: seconds at the start of each record that are simulated but not counted, where a record does not start
+            at rest.
 
     Raises:
         ValueError: records that do not fit the rig or cannot be of it, or sensors without noise_std.
@@ -47,7 +50,7 @@ def diagnose(
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_records(rig, records)
-    found = attribute(rig, records, catalogue=catalogue, report=report, workers=workers)
+    found = attribute(rig, records, catalogue=catalogue, report=report, workers=workers, settle=settle)
     corrected = apply_all(rig, found.best.effects)
     effects = found.best.effects if found.outcome in ("none", "explained") else ()
     return Verdict(
@@ -56,7 +59,7 @@ def diagnose(
         effects=found.best.effects,
         alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in found.rivals),
         where=locate(found.evidence, effects),
-        shrinkage=measure(rig, corrected, validation),
+        shrinkage=measure(rig, corrected, validation, settle=settle),
         corrected=corrected,
         nominal=rig,
         attribution=found,

@@ -68,7 +68,7 @@ def fit_random_force(
         places: positions to start from, m.
         size: a typical force, N.
     """
-    model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
+    model = sampled_model(rig.modes, rig.sensors, data.noise, data.counted[0].sample_time)
     residuals, length = list(residuals), rig.modes.length
     quick = residuals[:2]
 
@@ -112,7 +112,7 @@ def fit_random_force(
         cost=float((found.fun - noise_part) / n_values),
         chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
         rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
-        follows=max(_followed(f, r.inputs) for f, r in zip(forces, data.records, strict=True)),
+        follows=max(_followed(f, r.inputs) for f, r in zip(forces, data.counted, strict=True)),
     )
 
 

@@ -57,7 +57,7 @@ class Evidence:
         """Simulate the rig on the fit records."""
         motions = data.motions(rig)
         predictions = data.predictions(rig)
-        residuals = tuple(r.outputs - p for r, p in zip(data.records, predictions, strict=True))
+        residuals = tuple(r.outputs - p for r, p in zip(data.counted, predictions, strict=True))
         return cls(rig, data, motions, residuals, n_places)
 
     @property
@@ -67,13 +67,13 @@ class Evidence:
     @cached_property
     def force_rms(self) -> float:
         """Root mean square of the inputs that are not at rest, N."""
-        squares = [row[row != 0] ** 2 for record in self.data.records for row in record.inputs if np.any(row)]
+        squares = [row[row != 0] ** 2 for record in self.data.counted for row in record.inputs if np.any(row)]
         return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 1.0
 
     @cached_property
     def model(self) -> SampledModel:
         noise = self.data.noise
-        return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.records[0].sample_time)
+        return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
 
     def filter_at(self, x: float, size: float, memory: float) -> ForceFilter:
         """The filter for an unknown force at x of process standard deviation `size`, N."""

@@ -57,7 +57,7 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData) -> Experimen
         for inputs in choices:
             for level in LEVELS:
                 trial = _varied(record, inputs, level)
-                rate = _separation(rig, best, rival, FitData((trial,), data.noise, data.substeps))
+                rate = _separation(rig, best, rival, replace(data, records=(trial,)))
                 seconds = SEPARATED / rate if rate > 0 else np.inf
                 if seconds < chosen.seconds:
                     chosen = Experiment(record.name, inputs, level, float(seconds), names)

@@ -53,15 +53,15 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
     data = evidence.data
     scaled = [
         r / record.outputs.std(axis=1, keepdims=True)
-        for record, r in zip(data.records, evidence.residuals, strict=True)
+        for record, r in zip(data.counted, evidence.residuals, strict=True)
     ]
-    floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.records]
+    floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.counted]
     excess = np.array([(s**2).mean(axis=1) - f for s, f in zip(scaled, floors, strict=True)])
     by_sensor = np.maximum(excess, 0.0).sum(axis=0)
     mode_shares = _mode_shares(evidence, scaled)
     profile = evidence.profile
     at, at_std, point_share = _place(evidence, profile)
-    levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.records])
+    levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     return Where(
         path=_path(evidence, excess, effects),
@@ -70,7 +70,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
         mode_shares=mode_shares,
         sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
         time_shares=np.array([_by_eighths(s) for s in scaled]),
-        record_names=tuple(record.name for record in data.records),
+        record_names=tuple(record.name for record in data.counted),
         record_gaps=gaps,
         input_levels=levels,
         linear_share=_linear_share(data, scaled),
@@ -85,7 +85,7 @@ def _mode_shares(evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
     frequencies = evidence.rig.modes.frequencies_hz
     edges = np.r_[0.0, np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0)), np.inf]
     power = np.zeros(frequencies.size)
-    for record, s in zip(evidence.data.records, scaled, strict=True):
+    for record, s in zip(evidence.data.counted, scaled, strict=True):
         spectrum = (np.abs(np.fft.rfft(s, axis=1)) ** 2).sum(axis=0) / s.shape[1]
         grid = np.fft.rfftfreq(s.shape[1], record.sample_time)
         band = np.clip(np.searchsorted(edges, grid, side="right") - 1, 0, frequencies.size - 1)
@@ -103,7 +103,7 @@ def _by_eighths(scaled: np.ndarray) -> np.ndarray:
 def _linear_share(data: FitData, scaled: list[np.ndarray]) -> float:
     """Multiple coherence of the residual with the inputs, averaged over power."""
     coherent = total = 0.0
-    for record, s in zip(data.records, scaled, strict=True):
+    for record, s in zip(data.counted, scaled, strict=True):
         active = [row for row in record.inputs if np.any(row)]
         length = min(256, record.n_samples // 4)
         if not active or length < 16:
@@ -136,7 +136,7 @@ def _place(evidence: Evidence, profile: np.ndarray) -> tuple[float, float, float
             spread = max(spread * 0.0, float((places[1] - places[0]) / np.sqrt(-bend)))
     # the likelihood cannot tell more than the grid and the model of the force allow
     spread = max(spread, 0.1 * float(np.diff(places).mean()) if places.size > 1 else 0.0)
-    n_samples = sum(record.n_samples for record in data.records)
+    n_samples = sum(record.n_samples for record in data.counted)
     chi2 = sum(float(np.sum((r / data.noise[:, None]) ** 2)) for r in evidence.residuals)
     none = -0.5 * (chi2 + n_samples * np.sum(np.log(data.noise**2)))
     floor = -0.5 * n_samples * (data.noise.size + np.sum(np.log(data.noise**2)))
@@ -154,7 +154,7 @@ def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> 
     if power.max() > 0.97 * power.sum():
         return "sensor"
     direct = {a.name for a in evidence.rig.actuators if a.direct}
-    for record, row in zip(evidence.data.records, excess, strict=True):
+    for record, row in zip(evidence.data.counted, excess, strict=True):
         active = {n for n, values in zip(record.input_names, record.inputs, strict=True) if np.any(values)}
         if active and active <= direct:
             floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).mean()
@@ -170,5 +170,5 @@ def _amplitude_dependent(effects: Sequence[Effect], excess: np.ndarray, data: Fi
     if effects:
         return any(effect.kind.nonlinear for effect in effects)
     gaps = np.sqrt(np.maximum(excess.mean(axis=1), 0.0))
-    floors = np.array([np.sqrt(((data.noise / r.outputs.std(axis=1)) ** 2).mean()) for r in data.records])
+    floors = np.array([np.sqrt(((data.noise / r.outputs.std(axis=1)) ** 2).mean()) for r in data.counted])
     return bool((gaps + floors).max() > 2.0 * (gaps + floors).min() and gaps.max() > 2.0 * floors.max())

@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import cached_property
 from threading import Lock
 
 import numpy as np
@@ -21,26 +22,36 @@ class FitData:
         records: measured, all with the rig's inputs and outputs.
         noise: (n_outputs,) standard deviation of each sensor's noise, rounding included.
         substeps: of a sample, for rigs that are not linear.
+        lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
+            rest that the simulation assumes to the motion it really had.
     """
 
     records: tuple[Record, ...]
     noise: np.ndarray
     substeps: int = 4
-    _memory: OrderedDict = field(default_factory=OrderedDict, repr=False)
-    _lock: Lock = field(default_factory=Lock, repr=False)
+    lead: int = 0
+    _memory: OrderedDict = field(default_factory=OrderedDict, repr=False, init=False)
+    _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 
     @property
     def n_values(self) -> int:
         """Number of measured values."""
-        return sum(record.outputs.size for record in self.records)
+        return sum(record.outputs.size for record in self.counted)
 
     def only(self, names: tuple[str, ...]) -> "FitData":
         """The same yardstick on some of the records."""
-        return FitData(tuple(r for r in self.records if r.name in names), self.noise, self.substeps)
+        return FitData(tuple(r for r in self.records if r.name in names), self.noise, self.substeps, self.lead)
 
     def finer(self, substeps: int) -> "FitData":
         """The same yardstick with finer substeps."""
-        return FitData(self.records, self.noise, substeps)
+        return FitData(self.records, self.noise, substeps, self.lead)
+
+    @cached_property
+    def counted(self) -> tuple[Record, ...]:
+        """The records without their lead."""
+        if self.lead == 0:
+            return self.records
+        return tuple(record.between(record.time[min(self.lead, record.n_samples - 1)]) for record in self.records)
 
     def motions(self, rig: Rig) -> tuple[Motion, ...]:
         """The rig's motion on each record; the last few are remembered, since a sensor's fault does not change it."""
@@ -50,7 +61,8 @@ class FitData:
                 self._memory.move_to_end(key)
                 return self._memory[key][1]
         motions = tuple(
-            move(rig, record.inputs, sample_time=record.sample_time, substeps=self.substeps) for record in self.records
+            move(rig, record.inputs, sample_time=record.sample_time, substeps=self.substeps).after(self.lead)
+            for record in self.records
         )
         with self._lock:
             self._memory[key] = (rig.modes, motions)
@@ -62,21 +74,21 @@ class FitData:
         """(n_outputs, n_samples) a record."""
         return tuple(
             read(rig, motion, sample_time=record.sample_time)
-            for record, motion in zip(self.records, self.motions(rig), strict=True)
+            for record, motion in zip(self.counted, self.motions(rig), strict=True)
         )
 
     def residual(self, rig: Rig) -> np.ndarray:
         """(measured - predicted) / noise, all records joined: (n_values,)."""
         scaled = [
             ((record.outputs - prediction) / self.noise[:, None]).ravel()
-            for record, prediction in zip(self.records, self.predictions(rig), strict=True)
+            for record, prediction in zip(self.counted, self.predictions(rig), strict=True)
         ]
         return np.concatenate(scaled)
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""
         rows, start = [], 0
-        for record in self.records:
+        for record in self.counted:
             size = record.outputs.size
             rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
             start += size

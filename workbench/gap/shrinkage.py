@@ -32,7 +32,7 @@ class Shrinkage:
 
 
 def measure(
-    nominal: Rig, corrected: Rig, records: Sequence[Record], *, seed: int = 0, substeps: int = 8
+    nominal: Rig, corrected: Rig, records: Sequence[Record], *, seed: int = 0, substeps: int = 8, settle: float = 0.0
 ) -> Shrinkage | None:
     """Gaps of both rigs on validation records, with the interval from resampled blocks; None without records.
 
@@ -43,24 +43,20 @@ def measure(
         return None
     before, after, floor, blocks = {}, {}, {}, []
     for record in records:
-        scale = record.outputs.std(axis=1, keepdims=True)
+        lead = round(settle / record.sample_time)
+        measured = record.outputs[:, lead:]
+        scale = measured.std(axis=1, keepdims=True)
         scale = np.where(scale > 0, scale, 1.0)
-        errors = [
-            (
-                (
-                    record.outputs
-                    - simulate(rig, record.inputs, sample_time=record.sample_time, substeps=substeps).outputs
-                )
-                / scale
-            )
-            ** 2
+        predicted = [
+            simulate(rig, record.inputs, sample_time=record.sample_time, substeps=substeps).outputs[:, lead:]
             for rig in (nominal, corrected)
         ]
+        errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
         floor[record.name] = float(np.sqrt((noise**2).mean()))
         length = _block_length(nominal, record)
-        for start in range(0, record.n_samples, length):
+        for start in range(0, measured.shape[1], length):
             piece = slice(start, start + length)
             blocks.append([errors[0][:, piece].mean(), errors[1][:, piece].mean(), (noise**2).mean()])
     table = np.array(blocks)

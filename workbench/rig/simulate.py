@@ -63,6 +63,12 @@ class Motion:
     velocity: np.ndarray
     acceleration: np.ndarray
 
+    def after(self, lead: int) -> "Motion":
+        """The motion without its first `lead` samples."""
+        if lead == 0:
+            return self
+        return Motion(self.displacement[:, lead:], self.velocity[:, lead:], self.acceleration[:, lead:])
+
 
 def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, name: str = "simulated") -> Record:
     """The record that the rig gives from rest under inputs held over each sample interval, without noise.
