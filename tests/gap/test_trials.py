@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from workbench.gap.case import read_case
+from workbench.gap.case import Case, KnownPlaces, read_case
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.holding import hold_trials
@@ -19,11 +19,12 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar
+from workbench.structure.modes import Modes
 
 QUICK = (
     ("clearance",),
     ("coulomb_friction",),
-    ("actuator_delay",),
+    ("truncated_modes",),
     ("stiffness_drift", "sensor_gain"),
     (),
 )
@@ -96,18 +97,43 @@ def test_a_seed_makes_a_case():
     np.testing.assert_array_equal(first[0].fit[0].outputs, again[0].fit[0].outputs)
 
 
+ON_MODAL_DATA = ("point_mass", "cubic_spring", "actuator_gain", "sensor_misplacement", "modulus_error")
+
+
+@pytest.mark.parametrize("kind", ON_MODAL_DATA)
+def test_trials_on_plain_modal_data_use_its_levels_and_places(kind):
+    rng = np.random.default_rng(1)
+    shapes = KnownPlaces(("F1", "F2", "d1", "d2", "d3"), rng.standard_normal((5, 3)))
+    modes = Modes(omega=np.array([3.0, 7.0, 16.0]), damping=np.full(3, 0.01), shapes=shapes, length=4.0)
+    sensors = tuple(Sensor(f"d{i + 1}", 2.0 + i, noise_std=2e-4) for i in range(3))
+    rig = Rig(modes, (Actuator("F1", 0.0), Actuator("F2", 1.0)), sensors)
+    inputs = 0.3 * rng.standard_normal((2, 600))
+    mine = Case("mine", rig, (simulate(rig, inputs, sample_time=0.05, name="high"),), ())
+    case, label = make_trial(6, kinds=(kind,), like=mine)
+    (told,) = label["effects"]
+    assert told.get("at", 0.0) in (0.0, 1.0, 2.0, 3.0, 4.0)
+    high = next(r for r in case.fit if r.name == "high")
+    np.testing.assert_allclose(np.sqrt(np.mean(high.inputs**2, axis=1)), np.sqrt(np.mean(inputs**2, axis=1)).max())
+    assert high.sample_time == 0.05 and [s.noise_std for s in case.rig.sensors] == [2e-4] * 3
+    rig = apply_all(case.rig, [_effect(told)])
+    predicted = simulate(rig, high.inputs, sample_time=0.05, substeps=16).outputs
+    assert np.sqrt(np.mean((high.outputs - predicted) ** 2)) == pytest.approx(2e-4, rel=0.05)
+
+
 def test_an_unknown_kind_is_refused():
     with pytest.raises(ValueError, match="gremlin"):
         make_trial(1, kinds=("gremlin",))
 
 
-def test_a_rig_that_cannot_show_a_kind_says_so():
+def test_a_bench_that_cannot_show_a_kind_says_so():
     damping = ModalDamping(0.01)
     rod = Bar(length=1.0, mass_per_length=1.0, axial_stiffness=1.0, left="fixed", right="free", damping=damping)
-    sensors = (Sensor("d1", 1.0, noise_std=1.0),)
+    sensors = (Sensor("d1", 1.0, noise_std=1e-3),)
     rig = Rig(rod.modes(4), (Actuator("F1", 0.4), Actuator("F2", 0.9)), sensors, structure=rod)
-    with pytest.raises(ValueError, match="axial_load came about on this rig"):
-        make_trial(2, kinds=("axial_load",), rig=rig)
+    inputs = np.random.default_rng(0).standard_normal((2, 500))
+    like = Case("rod", rig, (simulate(rig, inputs, sample_time=0.05, name="high"),), ())
+    with pytest.raises(ValueError, match="axial_load came about on this bench"):
+        make_trial(2, kinds=("axial_load",), like=like)
 
 
 def test_of_sixty_forty_hide_one_ten_a_pair_five_none_five_something_else():

@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from workbench.gap.case import read_case
+from workbench.gap.case import Case, read_case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.scoring import Tally, score, tally
 from workbench.gap.trials import write_trials
-from workbench.rig.rig import Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +33,7 @@ def hold_trials(
     n: int,
     seed: int,
     *,
-    rig: Rig | None = None,
+    like: Case | None = None,
     kinds: Sequence[Sequence[str]] | None = None,
     diagnose_case: Callable[[Path], dict] | None = None,
     report: Callable[[str, float], None] = lambda text, share: None,
@@ -45,14 +44,14 @@ def hold_trials(
     that holds cases alone.
 
     Args:
-        rig: the user's own nominal rig; None draws one a case.
+        like: the user's own case, whose nominal rig, levels, band and noise are taken; None draws benches.
         kinds: what the cases hide, one entry a case; None draws them.
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
         report: told (what, share done).
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
         sealed = Path(vault) / "labels.json"
-        write_trials(cases, sealed, n, seed, rig=rig, kinds=kinds, report=lambda t, s: report(f"making {t}", 0.1 * s))
+        write_trials(cases, sealed, n, seed, like=like, kinds=kinds, report=lambda t, s: report(f"making {t}", 0.1 * s))
         labels = json.loads(sealed.read_text(encoding="utf-8"))
         sealed.unlink()
         verdicts, scores = {}, {}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.gap.case import Case
-from workbench.gap.truth.benches import Bench, draw_bench, experiments, fitted_bench, tested
+from workbench.gap.truth.benches import Bench, bench_of, draw_bench, experiments, tested
 from workbench.gap.truth.chance import draw_effect
 from workbench.gap.truth.draws import DRAWS
 from workbench.gap.truth.hidden import HIDE, OUTSIDE, hide
@@ -16,7 +16,6 @@ from workbench.gap.truth.plant import Plant, RootedPlant
 from workbench.gap.truth.scene import Scene, Unsuitable
 from workbench.gap.writing import write_case
 from workbench.records.record import Channel, Record
-from workbench.rig.rig import Rig
 
 NONE, UNKNOWN = "none", "unknown"
 KINDS = tuple(HIDE)
@@ -35,36 +34,36 @@ TWINS = (
 
 
 def make_trial(
-    seed: int, *, kinds: Sequence[str] = (), rig: Rig | None = None, name: str = "case"
+    seed: int, *, kinds: Sequence[str] = (), like: Case | None = None, name: str = "case"
 ) -> tuple[Case, dict]:
     """A case that hides effects of the given kinds, and its label in the words of the case format.
 
     Args:
         seed: the same seed makes the same case.
         kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
-        rig: nominal, with its structure; None draws one.
+        like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
         name: of the case.
 
     Returns:
         The case; {"title", "snr_db", "effects", "records": {name: {"gap", "noise_floor", "true_model"}}}.
 
     Raises:
-        ValueError: an unknown kind, or kinds that the rig cannot show.
+        ValueError: an unknown kind, or kinds that the bench cannot show.
     """
     unknown = [kind for kind in kinds if kind not in DRAWS]
     if unknown:
         raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
     rng = np.random.default_rng(seed)
     reason = ""
-    for _ in range(MOST_BENCHES if rig is None else MOST_DRAWS):
+    for _ in range(MOST_BENCHES if like is None else MOST_DRAWS):
         try:
-            bench = draw_bench(rng) if rig is None else fitted_bench(rig, rng)
+            bench = draw_bench(rng) if like is None else bench_of(like)
             tests = experiments(bench, rng)
             bench, effects = _draw_effects(bench, tests["mid"], kinds, rng)
             return _case(bench, tests, effects, rng, name)
         except Unsuitable as error:
             reason = str(error)
-    raise ValueError(f"no case with {' and '.join(kinds)} came about on this rig; the last draw: {reason}")
+    raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
 
 
 def _draw_effects(
@@ -85,6 +84,8 @@ def _draw_effects(
 def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict]:
     """The nominal model gives up modes: the rig is left with few, the structure shows what it had."""
     modes = bench.rig.modes
+    if bench.rig.structure is None or modes.n_modes < 6:
+        raise Unsuitable("truncation needs a beam or a rod with six modes or more")
     kept = int(rng.integers(3, max(modes.n_modes - 4, 4)))
     rig = replace(bench.rig, modes=modes.select(slice(kept)))
     return replace(bench, rig=rig), {"kind": "truncated_modes", "kept": kept, "needed": modes.n_modes}
@@ -162,10 +163,10 @@ def _record(bench: Bench, name: str, inputs: np.ndarray, outputs: np.ndarray) ->
     )
 
 
-def draw_kinds(n: int, seed: int, *, rig: Rig | None = None) -> list[tuple[str, ...]]:
+def draw_kinds(n: int, seed: int, *, like: Case | None = None) -> list[tuple[str, ...]]:
     """Kinds for n trials: of every 60, 40 of one effect, 10 pairs, 5 of none and 5 from outside the vocabulary."""
     rng = np.random.default_rng(seed)
-    pool = list(KINDS) if rig is None else [k for k in KINDS if k != "truncated_modes"]
+    pool = list(KINDS) if like is None else [k for k in KINDS if k != "truncated_modes"]
     singles = [(str(kind),) for _ in range(n // len(pool) + 1) for kind in rng.permutation(pool)]
     drawn = []
     for i in range(n):
@@ -194,14 +195,15 @@ def write_trials(
     n: int,
     seed: int,
     *,
-    rig: Rig | None = None,
+    like: Case | None = None,
     kinds: Sequence[Sequence[str]] | None = None,
     report: Callable[[str, float], None] = lambda text, share: None,
 ) -> None:
     """Write n cases as folders, and their labels as one JSON file elsewhere.
 
     Args:
-        rig: nominal, of all cases; None draws one a case. Kinds that it cannot show give way to others.
+        like: a case whose rig and records all are like; None draws a bench a case. Kinds that a bench cannot show
+            give way to others.
         kinds: what each case hides; None draws them, see `draw_kinds`.
         report: told (what, share done).
 
@@ -212,23 +214,23 @@ def write_trials(
     if labels.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
     told = {}
-    for i, hidden in enumerate(draw_kinds(n, seed, rig=rig) if kinds is None else kinds):
+    for i, hidden in enumerate(draw_kinds(n, seed, like=like) if kinds is None else kinds):
         name = f"case-{i + 1:03d}"
-        case, told[name] = _first_possible(seed, i, tuple(hidden), rig, name)
+        case, told[name] = _first_possible(seed, i, tuple(hidden), like, name)
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
     labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _first_possible(seed: int, i: int, kinds: tuple[str, ...], rig: Rig | None, name: str) -> tuple[Case, dict]:
+def _first_possible(seed: int, i: int, kinds: tuple[str, ...], like: Case | None, name: str) -> tuple[Case, dict]:
     """The trial, or with kinds that this rig cannot show, one of kinds that it can."""
     rng = np.random.default_rng([seed, i])
     for _ in range(100):
         try:
-            return make_trial(int(rng.integers(2**31)), kinds=kinds, rig=rig, name=name)
+            return make_trial(int(rng.integers(2**31)), kinds=kinds, like=like, name=name)
         except ValueError:
             kinds = tuple(
                 str(k) for k in rng.choice([k for k in KINDS if k != "truncated_modes"], len(kinds), replace=False)
             )
-    raise ValueError("this rig shows none of the effects; are its sensors and levels right?")
+    raise ValueError("this bench shows none of the effects; are its sensors and levels right?")

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.gap.case import Case
 from workbench.gap.truth.plant import Plant, RootedPlant, coloured_noise
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -25,7 +26,7 @@ class Bench:
         sample_time: s.
         band_hz: excitation reaches up to here.
         level: rms of the high level, N.
-        snr_db: of each sensor in the low record of the nominal structure.
+        snr_db: of each sensor in the low record of the nominal structure; None where the noise was given.
         feedback: of the closed loop, N s/m; None for no such record.
     """
 
@@ -33,7 +34,7 @@ class Bench:
     sample_time: float
     band_hz: float
     level: float
-    snr_db: float
+    snr_db: float | None
     feedback: float | None
 
 
@@ -52,11 +53,32 @@ def draw_bench(rng: np.random.Generator) -> Bench:
     actuators.append(Actuator("hammer", strike, direct=True))
     modes = structure.modes(int(rng.integers(12, 17)), tolerance=1e-9)
     rig = Rig(modes, tuple(actuators), sensors, structure=structure)
-    return fitted_bench(rig, rng)
+    return _suited(rig, rng)
 
 
-def fitted_bench(rig: Rig, rng: np.random.Generator) -> Bench:
-    """A bench for a rig of the user's own: levels, band and noise that suit it."""
+def bench_of(case: Case) -> Bench:
+    """The bench that a case was tested on: its rig and noise, and from its records to fit the sample time, the band
+    that holds 95 % of the loudest actuator's power, and the level of the loudest record.
+
+    Raises:
+        ValueError: records in which no actuator acts.
+    """
+    rows = [j for j, a in enumerate(case.rig.actuators) if not a.direct]
+    if not rows:
+        raise ValueError("every input of the case is a hammer; a trial needs an actuator to command")
+    level = {record: np.sqrt(np.mean(record.inputs[rows] ** 2, axis=1)).max() for record in case.fit}
+    loudest = max(level, key=level.get)
+    if not level[loudest] > 0:
+        raise ValueError("no actuator acts in any record to fit; a trial takes its level and band from there")
+    row = rows[int(np.argmax(np.mean(loudest.inputs[rows] ** 2, axis=1)))]
+    power = np.cumsum(np.abs(np.fft.rfft(loudest.inputs[row] - loudest.inputs[row].mean())) ** 2)
+    frequency = np.fft.rfftfreq(loudest.n_samples, loudest.sample_time)
+    band = float(frequency[np.searchsorted(power, 0.95 * power[-1])])
+    return Bench(case.rig, loudest.sample_time, band, float(level[loudest]), None, None)
+
+
+def _suited(rig: Rig, rng: np.random.Generator) -> Bench:
+    """A bench with sample time, band, level and noise that suit a rig."""
     top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
     band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
     bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, float(rng.choice([30.0, 40.0, 50.0])), None)

@@ -63,6 +63,15 @@ def _magnet(scene, w, v, peak, rng):
     return lambda s: {"stiffness": 0.1 * s * _stiff(scene), "reach": reach}
 
 
+def _member_only(draw: Draw) -> Draw:
+    def only(scene, rng):
+        if scene.bench.rig.structure is None:
+            raise Unsuitable("plain modal data cannot show this")
+        return draw(scene, rng)
+
+    return only
+
+
 def _loss(scene, rng):
     length = scene.bench.rig.modes.length
     width = round(float(rng.uniform(0.05, 0.2)) * length, 4)
@@ -132,9 +141,8 @@ def _damper(scene, rng):
 
 def _mass(scene, rng):
     at = scene.place(rng)
-    length = scene.bench.rig.modes.length
-    total = length * float(np.mean(scene.bench.rig.structure.mass_per_length(np.linspace(0.01, 0.99, 99) * length)))
-    return lambda s: {"at": at, "mass": 0.01 * s * total}
+    shape = float(np.abs(scene.bench.rig.modes.phi(at)[0]).max())
+    return lambda s: {"at": at, "mass": 0.01 * s / shape**2}
 
 
 def _drive(
@@ -178,6 +186,9 @@ def _moved_sensor(scene, rng):
 
 def _moved_port(scene, rng, side, ports):
     port, length = ports[rng.integers(len(ports))], scene.bench.rig.modes.length
+    known = getattr(scene.bench.rig.modes.shapes, "places", None)
+    if known is not None:
+        return {side: port.name, "at": float(rng.choice(known[known != port.at]))}
     step = _sign(rng) * float(rng.uniform(0.03, 0.25)) * length
     at = port.at + step if 0.02 * length < port.at + step < length else port.at - step
     if not 0.02 * length < at < length:
@@ -273,14 +284,14 @@ def _spikes(scene, rng):
 DRAWS: dict[str, Draw] = {
     "modulus_error": _factor("factor", 0.02),
     "point_mass": _mass,
-    "local_stiffness_loss": _loss,
+    "local_stiffness_loss": _member_only(_loss),
     "support_rotation": _support,
     "axial_load": _axial,
     "ground_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.05 * s * _stiff(c)}),
     "truncated_modes": _truncation,
     "modal_damping": _factor("factor", 0.3),
     "point_damper": _damper,
-    "air_drag": _drag,
+    "air_drag": _member_only(_drag),
     "cubic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.1 * s * _stiff(c) / w**2}),
     "midplane_stretching": _beam_only(_stretching),
     "clearance": _at_point(_clearance),

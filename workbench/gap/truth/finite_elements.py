@@ -3,13 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import eigsh
 from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, MeshLine
 from skfem.helpers import d, dd
 
 from workbench.structure.member import Bar, Beam, Structure
-from workbench.structure.modes import frozen
+from workbench.structure.modes import Modes, frozen
 from workbench.structure.supports import HELD
 
 ELEMENTS = 240
@@ -100,6 +101,25 @@ def element_modes(
         raise ValueError("the altered member is unstable: it buckles; draw a weaker compression")
     at_places = full[displacement[[_node(nodes, x) for x in places]]] if len(places) else np.zeros((0, n_modes))
     return ElementModes(np.sqrt(omega2), at_places, full.T @ (slopes @ full))
+
+
+def modal_modes(nominal: Modes, places: np.ndarray, *, altered: Alterations = AS_NOMINAL) -> ElementModes:
+    """The modes of plain modal data once altered: the nominal ones as a basis, without a member behind them.
+
+    (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v.
+
+    Raises:
+        ValueError: alterations that only a member can have.
+    """
+    if altered.losses or altered.tension or altered.rotational_stiffness != (None, None):
+        raise ValueError("plain modal data know no local stiffness, tension or rotation; describe a beam or a rod")
+    stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
+    for matrix, parts in ((stiffness, altered.springs), (mass, altered.masses)):
+        for at, value in parts:
+            matrix += value * np.outer(nominal.phi(at)[0], nominal.phi(at)[0])
+    values, vectors = eigh(stiffness, mass)
+    shapes = nominal.phi(places) @ vectors if len(places) else np.zeros((0, nominal.n_modes))
+    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros_like(mass))
 
 
 def _nodes(special: np.ndarray, length: float, elements: int) -> np.ndarray:

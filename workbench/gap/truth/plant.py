@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from workbench.gap.truth import motion
-from workbench.gap.truth.finite_elements import Alterations, ElementModes, element_modes
+from workbench.gap.truth.finite_elements import Alterations, ElementModes, element_modes, modal_modes
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 
@@ -58,7 +58,7 @@ class Plant:
     def rooted(self) -> "RootedPlant":
         """The plant with its modes solved."""
         gauss, weights = np.polynomial.legendre.leggauss(DRAG_POINTS)
-        length = self.nominal.structure.length
+        length = self.nominal.modes.length
         field_places = 0.5 * length * (gauss + 1.0) if self.drag else np.zeros(0)
         groups = [
             [a.at for a in self.actuators],
@@ -69,7 +69,10 @@ class Plant:
             field_places,
         ]
         places = np.array([x for group in groups for x in group], float)
-        modes = element_modes(self.nominal.structure, places, self.n_modes, altered=self.altered)
+        if self.nominal.structure is None:
+            modes = modal_modes(self.nominal.modes, places, altered=self.altered)
+        else:
+            modes = element_modes(self.nominal.structure, places, self.n_modes, altered=self.altered)
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
         return RootedPlant(self, modes, *shapes[:5], np.c_[shapes[5], 0.5 * length * weights[: len(field_places)]])
 

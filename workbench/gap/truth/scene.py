@@ -47,10 +47,11 @@ class Scene:
 
     def place(self, rng: np.random.Generator) -> float:
         """A place that moves: at least a third of what the liveliest does."""
-        length = self.bench.rig.modes.length
-        grid = np.linspace(0.05, 1.0, 96) * length
+        length, known = self.bench.rig.modes.length, getattr(self.bench.rig.modes.shapes, "places", None)
+        grid = np.linspace(0.05, 1.0, 96) * length if known is None else known
         rms = np.sqrt(np.mean((self.bench.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
-        return round(float(rng.choice(grid[rms > rms.max() / 3]) - rng.uniform(0.0, 0.01) * length), 4)
+        at = float(rng.choice(grid[rms > rms.max() / 3]))
+        return at if known is not None else round(at - float(rng.uniform(0.0, 0.01)) * length, 4)
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
         """Noise-free gap between a plant and the nominal one, or another, at the middle level."""
