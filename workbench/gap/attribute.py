@@ -88,6 +88,7 @@ def attribute(
     report: Callable[[str, float], None] = lambda text, share: None,
     workers: int = 2,
     settle: float = 0.0,
+    free_nominal: bool = False,
 ) -> Attribution:
     """Find the effects that turn the residual of a rig on its fit records into noise.
 
@@ -102,6 +103,8 @@ def attribute(
         report: told (what, share done) as the search proceeds.
         workers: threads.
         settle: seconds at the start of each record that are simulated but not counted.
+        free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
+            a little off; otherwise they are freed only where no set explains the records without.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     if not (noise > 0).all():
@@ -110,7 +113,7 @@ def attribute(
     plain = FitData(tuple(records), noise, lead=round(settle / records[0].sample_time))
     seen, data = _plain_to_see(rig, plain)
     with ThreadPoolExecutor(workers) as pool:
-        return _search(rig, seen, data, catalogue, report, pool)
+        return _search(rig, seen, data, catalogue, report, pool, free_nominal)
 
 
 def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
@@ -130,15 +133,21 @@ def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]
     return tuple(seen), replace(data, noise=noise)
 
 
-def _search(rig, seen, data, catalogue, report, pool) -> Attribution:
+def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attribution:
     base = apply_all(rig, seen)
     nominal = data.by_channel(data.residual(rig))
     start = Fit(seen, cost_of(base, (), data), data.by_channel(data.residual(base)), 0, "read off the records")
     search = _Search(base, data, _quick(data, start), catalogue, report, pool, nominal)
     report("looking for the missing force", 0.02)
     evidence = Evidence.of(base, data)
-    singles = _extend(search, (), evidence, 0.05, 0.45, finalists=8)
+    if free_nominal:
+        start = fit(search.rig, (_figures(search),), search.data, iterations=15)
+        evidence = Evidence.of(apply_all(search.rig, start.effects), data)
+    singles = _extend(search, start.effects if free_nominal else (), evidence, 0.05, 0.45, finalists=8)
     found = _decide(search, start, singles)
+    if found is None and free_nominal:
+        best, rivals = _ranked(search, [_finished(search, f) for f in singles[:3]])
+        found = _unexplained(start, best, rivals)
     if found is None:
         pairs = _pairs(search, singles)
         found = _decide_pairs(search, start, singles, pairs)
@@ -401,8 +410,7 @@ def _with_nominal(search: _Search, start: Fit):
     The nominal figures are trusted first, because freed they can bend to much; they are freed where no set explains
     the records without.
     """
-    figures = Effect(NOMINAL_FIGURES, None, {p.name: 1.0 for p in NOMINAL_FIGURES.parameters(search.rig, None)})
-    freed = fit(search.rig, (figures,), search.data, iterations=8)
+    freed = fit(search.rig, (_figures(search),), search.data, iterations=8)
     if search.explains(freed):
         return "explained", freed, None, ()
     if freed.cost > 0.7 * start.cost:
@@ -411,6 +419,17 @@ def _with_nominal(search: _Search, start: Fit):
     joined = _extend(search, freed.effects, evidence, 0.95, 0.99, finalists=2)
     finished = fit(search.rig, joined[0].effects, search.data.finer(8), iterations=6)
     return ("explained", finished, None, ()) if search.explains(finished) else None
+
+
+def _figures(search: _Search) -> Effect:
+    """The nominal figures as they were handed in."""
+    return Effect(NOMINAL_FIGURES, None, {p.name: 1.0 for p in NOMINAL_FIGURES.parameters(search.rig, None)})
+
+
+def _unexplained(start: Fit, best: Fit, rivals):
+    """The outcome where no set reaches the noise floor: in part, or not at all."""
+    closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
+    return ("part" if closed > 0.5 else "unknown"), best, None, rivals
 
 
 def _decide_pairs(search: _Search, start: Fit, singles: list[Fit], pairs: list[Fit]):
@@ -430,5 +449,4 @@ def _decide_pairs(search: _Search, start: Fit, singles: list[Fit], pairs: list[F
         if random is not None and random[1].holds:
             return "explained", random[0], random[1], ()
     best, rivals = _ranked(search, finished or singles[:1])
-    closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
-    return ("part" if closed > 0.5 else "unknown"), best, None, rivals
+    return _unexplained(start, best, rivals)

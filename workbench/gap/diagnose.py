@@ -26,6 +26,7 @@ def diagnose(
     report: Callable[[str, float], None] = lambda text, share: None,
     workers: int = 2,
     settle: float = 0.0,
+    free_nominal: bool = False,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -41,6 +42,7 @@ def diagnose(
         workers: threads.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
+        free_nominal: fit the nominal frequencies, damping and modal mass along with every candidate from the first.
 
     Raises:
         ValueError: records that do not fit the rig or cannot be of it, or sensors without noise_std.
@@ -50,7 +52,15 @@ def diagnose(
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_records(rig, records)
-    found = attribute(rig, records, catalogue=catalogue, report=report, workers=workers, settle=settle)
+    found = attribute(
+        rig,
+        records,
+        catalogue=catalogue,
+        report=report,
+        workers=workers,
+        settle=settle,
+        free_nominal=free_nominal,
+    )
     corrected = apply_all(rig, found.best.effects)
     effects = found.best.effects if found.outcome in ("none", "explained") else ()
     return Verdict(

@@ -123,7 +123,7 @@ class Evidence:
                 left, top, right = profile[i - 1 : i + 2]
                 bend = left - 2.0 * top + right
                 if bend < 0:
-                    x += 0.5 * (left - right) / bend * (places[1] - places[0])
+                    x += np.clip(0.5 * (left - right) / bend, -1.0, 1.0) * (places[1] - places[0])
             refined.append(float(x))
         return tuple(refined)
 

@@ -7,6 +7,7 @@ import numpy as np
 from workbench.gap.attribute import Attribution
 from workbench.gap.check import Readiness
 from workbench.gap.effects.effect import ALL, Effect
+from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
 from workbench.gap.experiment import Experiment
 from workbench.gap.locate import Where
@@ -49,13 +50,19 @@ class Verdict:
     @property
     def _told(self) -> tuple[Effect, ...]:
         """The effects, rounding or clipping of every sensor told once."""
-        told = list(self.effects)
+        told = [e for e in self.effects if e.kind is not NOMINAL_FIGURES] or list(self.effects)
         for kind, field in ((SENSOR_QUANTISATION, "step"), (SENSOR_CLIPPING, "limit")):
             same = [e for e in told if e.kind is kind]
             if len(same) == len(self.nominal.sensors) > 1:
                 told = [e for e in told if e.kind is not kind]
                 told.insert(0, Effect(kind, ALL, {field: float(np.median([e.values[field] for e in same]))}))
         return tuple(told)
+
+    @property
+    def nominal_figures(self) -> dict[str, float]:
+        """Factors on the nominal figures that were fitted along with the effects; empty where none were."""
+        freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES]
+        return _rounded_all(freed[0].values) if freed else {}
 
     @property
     def sentence(self) -> str:
@@ -106,6 +113,7 @@ class Verdict:
                 "alike": [list(pair[:2]) for pair in self.readiness.alike],
             },
             "next_experiment": None if self.experiment is None else self.experiment.sentence,
+            "nominal_figures": self.nominal_figures,
             "notes": list(self.notes),
         }
 

@@ -1,4 +1,4 @@
-"""Nominal figures that are merely a little off: each mode's frequency and damping, held near what was handed in."""
+"""Nominal figures that are merely a little off: frequencies, damping, modal mass; held near what was handed in."""
 
 from dataclasses import replace
 
@@ -7,13 +7,26 @@ import numpy as np
 from workbench.gap.effects.effect import Kind, Parameter
 from workbench.rig.rig import Rig
 
-FREQUENCY_STD, DAMPING_STD = 0.01, 0.25
+FREQUENCY_STD, DAMPING_STD, MASS_STD = 0.01, 0.25, 0.02
 
 
 def _names(n_modes: int) -> list[tuple[str, float, float]]:
     """(name, standard deviation of its logarithm, largest factor) of every figure."""
     figures = [(f"frequency_{r + 1}", FREQUENCY_STD, 1.06) for r in range(n_modes)]
-    return figures + [(f"damping_{r + 1}", DAMPING_STD, 3.0) for r in range(n_modes)]
+    figures += [(f"damping_{r + 1}", DAMPING_STD, 3.0) for r in range(n_modes)]
+    return [*figures, ("modal_mass", MASS_STD, 1.2)]
+
+
+class Rescaled:
+    """Shapes times a factor, with what else the shapes know."""
+
+    def __init__(self, shapes, factor: float):
+        self.shapes, self.factor = shapes, factor
+        if hasattr(shapes, "places"):
+            self.places = shapes.places
+
+    def __call__(self, x: np.ndarray, derivative: int) -> np.ndarray:
+        return self.factor * self.shapes(x, derivative)
 
 
 def _adjusted(rig: Rig, _, values: dict[str, float]) -> Rig:
@@ -23,7 +36,11 @@ def _adjusted(rig: Rig, _, values: dict[str, float]) -> Rig:
     frequency[:n] = [values[f"frequency_{r + 1}"] for r in range(n)]
     damping[:n] = [values[f"damping_{r + 1}"] for r in range(n)]
     scale = np.sqrt(frequency * damping)
-    changed = replace(modes, omega=modes.omega * frequency, damping=modes.damping * np.outer(scale, scale))
+    shapes, root = modes.shapes, np.sqrt(values["modal_mass"])
+    scaled = shapes if root == 1 else Rescaled(shapes, 1.0 / root)
+    changed = replace(
+        modes, omega=modes.omega * frequency, damping=modes.damping * np.outer(scale, scale), shapes=scaled
+    )
     return replace(rig, modes=changed)
 
 

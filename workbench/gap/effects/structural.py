@@ -180,7 +180,7 @@ def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
 def _loss_starts(evidence, _):
     length = evidence.length
     for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
-        for loss in (0.15, 0.45):
+        for loss in (0.03, 0.15, 0.45):
             yield {"at": x * length, "width": 0.1 * length, "loss": loss}
 
 
