@@ -355,7 +355,7 @@ def _decide(search: _Search, start: Fit, singles: list[Fit]):
         return "none", start, None, ()
     finished = [_finished(search, f) for f in good[:4]]
     explaining = [f for f in finished if search.explains(f)]
-    near = [f for f in finished[:2] if f.cost - 1.0 < NEAR * (start.cost - 1.0)]
+    near = [f for f in finished[:2] if _near(search, f, NEAR)]
     if not explaining and near:
         explaining = [f for f in search.pool.map(lambda f: _relocated(search, f), near) if search.explains(f)]
     if explaining:
@@ -387,21 +387,43 @@ def _random(search: _Search, given: Fit) -> tuple[Fit, RandomForceFit] | None:
 
 
 def _pairs(search: _Search, singles: list[Fit]) -> list[Fit]:
-    """The best few single effects, each with a second one."""
+    """The best few single effects, each with a second one; stops at the first pair that explains the records."""
     firsts = _spread_over_kinds(singles, 2)[:5]
     pairs: list[Fit] = []
     for i, first in enumerate(firsts):
-        rig = apply_all(search.rig, first.effects)
-        evidence = Evidence.of(rig, search.data, 20)
-        begin = 0.5 + 0.45 * i / len(firsts)
-        pairs += _extend(search, first.effects, evidence, begin, begin + 0.45 / len(firsts), finalists=3)
+        begin = 0.5 + 0.4 * i / len(firsts)
+        pairs += _joined(search, first.effects, begin, begin + 0.4 / len(firsts), finalists=3 if i else 5)
         pairs.sort(key=lambda f: f.cost)
         best = _finished(search, pairs[0])
-        if not search.explains(best) and best.cost - 1.0 < 0.2 * NEAR * (search.nominal.mean() - 1.0):
+        if not search.explains(best) and _near(search, best, 0.2 * NEAR):
             best = _relocated(search, best)
         if search.explains(best):
             return [best, *pairs]
-    return pairs
+    return _exchanged(search, pairs)
+
+
+def _joined(search: _Search, given: tuple[Effect, ...], begin: float, end: float, *, finalists: int) -> list[Fit]:
+    evidence = Evidence.of(apply_all(search.rig, given), search.data, 20)
+    return _extend(search, given, evidence, begin, end, finalists=finalists)
+
+
+def _near(search: _Search, candidate: Fit, share: float) -> bool:
+    """Whether little of the gap's power is left."""
+    return candidate.cost - 1.0 < share * (search.nominal.mean() - 1.0)
+
+
+def _exchanged(search: _Search, pairs: list[Fit]) -> list[Fit]:
+    """The pairs, and those that come of keeping one half of a near miss and looking for the other half anew.
+
+    In a near miss the right half has nearly its right numbers, better ones than it had alone.
+    """
+    best = pairs[0]
+    if not _near(search, best, NEAR):
+        return pairs
+    for i in range(len(best.effects)):
+        kept = best.effects[:i] + best.effects[i + 1 :]
+        pairs = pairs + _joined(search, kept, 0.9, 0.94, finalists=4)
+    return sorted(pairs, key=lambda f: f.cost)
 
 
 def _with_nominal(search: _Search, start: Fit):
