@@ -314,6 +314,47 @@ def diagnose(
     console.print(f"  page       {_short(target)}", markup=False)
 
 
+@app.command()
+@_guarded
+def trial(
+    case: Annotated[Path, typer.Argument(help="Case folder: its rig, sensors, levels and noise are taken.")],
+    cases: Annotated[int, typer.Option(help="How many blind cases to make, diagnose and score.")] = 30,
+    seed: Annotated[int, typer.Option(help="The same seed makes the same cases.")] = 0,
+    json_path: Annotated[Path | None, typer.Option("--json", help="Write labels, verdicts and scores here.")] = None,
+    picture: Annotated[Path, typer.Option(help="Where the confusion matrix is drawn.")] = Path("out/trial.png"),
+) -> None:
+    """Say how far a diagnosis can be trusted on your own rig: blind cases made, diagnosed and scored.
+
+    Example: workbench trial cases/arm --cases 40
+    """
+    from workbench.draw.trials import plot_confusion
+    from workbench.gap.case import read_case
+    from workbench.gap.holding import hold_trials
+
+    if cases < 1:
+        raise ValueError(f"--cases must be at least 1; got {cases}")
+    found = read_case(case)
+    with _progress() as progress:
+        task = progress.add_task("making cases", total=1.0)
+        held = hold_trials(
+            cases,
+            seed,
+            like=found,
+            report=lambda text, share: progress.update(task, description=text, completed=share),
+        )
+    for family, (right, of) in held.tally.shares.items():
+        console.print(f"  {family:<8} {right} of {of} named rightly")
+    console.print(f"  places   {held.tally.misplaced} of {held.tally.placed} more than 2 % of the length off")
+    for name, one in held.scores.items():
+        if not one["kinds"]:
+            console.print(f"  {name}: hidden {one['hidden']}, told {one['told']}", markup=False)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plot_confusion(held.tally).savefig(picture)
+    if json_path is not None:
+        _write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})
+    console.print(f"  picture  {_short(picture)}", markup=False)
+
+
 def _structure_rig(path: Path):
     from workbench.gap.case import read_rig
 
