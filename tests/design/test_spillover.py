@@ -109,3 +109,8 @@ def test_filter_with_uneven_sensors_and_uneven_mass():
 def test_filter_refuses_sensors_out_of_order():
     with pytest.raises(ValueError, match="increasing"):
         hermite_filter(modes(2), [0.0, 5.0, 3.0], 1.0)
+
+
+def test_sensors_that_cannot_see_a_mode_are_named():
+    with pytest.raises(ValueError, match="cannot see mode 2"):
+        displacement_filter(modes(2), [5.0], 1.0)

@@ -93,7 +93,7 @@ def test_frequency_beyond_the_sample_rate_is_a_question_of_branch(branch):
     dt = 0.1
     omega = (branch + 0.4) * np.pi / dt
     modes = SampledModes([omega], [0.002], [[1.0], [0.3 - 0.1j]], [0.0, 1.0])
-    found = stacked_delays(free_decay(modes, sample_time=dt, n_samples=120), n_modes=1, branch=branch)
+    found = stacked_delays(free_decay(modes, sample_time=dt, n_samples=120, aliases=True), n_modes=1, branch=branch)
     assert found.omega[0] == pytest.approx(omega, rel=1e-10)
     assert found.zeta[0] == pytest.approx(0.002, rel=1e-8)
     assert mac(found.shapes, modes.shapes)[0, 0] > 1 - 1e-12
@@ -121,3 +121,9 @@ def test_refusals(bar_modes):
         stacked_delays(record, n_modes=20)
     with pytest.raises(ValueError, match="same outputs"):
         stacked_delays([record, record.only(["y1"])], n_modes=1)
+
+
+def test_a_mode_beyond_half_the_sample_rate_is_named():
+    modes = SampledModes(omega=[3.0, 40.0], zeta=[0.01, 0.01], shapes=np.ones((1, 2)), positions=[0.0])
+    with pytest.raises(ValueError, match=r"mode 2 at .* Hz lies beyond half the sample rate"):
+        free_decay(modes, sample_time=0.1, n_samples=100)

@@ -49,6 +49,7 @@ def free_decay(
     start_time: float = 0.0,
     noise_std: float = 0.0,
     seed: int | np.random.Generator = 0,
+    aliases: bool = False,
 ) -> Record:
     """The record y_j(t) = d^k/dt^k Re Σ_r s_jr e^{λ_r t}, k = 0, 1, 2 for displacement, velocity, acceleration.
 
@@ -60,10 +61,18 @@ def free_decay(
         start_time: time of the first sample, s.
         noise_std: standard deviation of white noise added, in the unit of the quantity.
         seed: of that noise.
+        aliases: let modes beyond half the sample rate fold over, as they do in a record without a filter.
 
     Raises:
-        ValueError: a quantity that is not a motion of a point.
+        ValueError: a quantity that is not a motion of a point, or a mode beyond half the sample rate.
     """
+    half_rate = 0.5 / sample_time
+    beyond = np.flatnonzero(modes.frequencies_hz > half_rate)
+    if beyond.size and not aliases:
+        raise ValueError(
+            f"mode {beyond[0] + 1} at {modes.frequencies_hz[beyond[0]]:g} Hz lies beyond half the sample rate,"
+            f" {half_rate:g} Hz; sample faster, leave it out, or ask for aliases"
+        )
     if quantity not in TIME_DERIVATIVE:
         raise ValueError(f"a free decay is of {', '.join(TIME_DERIVATIVE)}; got {quantity!r}")
     time = start_time + sample_time * np.arange(n_samples)
