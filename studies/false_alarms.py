@@ -1,0 +1,27 @@
+"""How often does the diagnosis see an effect where none hides? A hundred cases with nothing but sensor noise."""
+
+from pathlib import Path
+
+from joblib import Parallel, delayed
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.trials import make_trial
+
+CASES, SEED = 100, 40000
+
+
+def told(seed: int) -> list[str]:
+    """Kinds of the effects that the diagnosis names on a case that hides none."""
+    case, _ = make_trial(seed)
+    verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1).to_json()
+    return [effect["kind"] for effect in verdict["effects"]]
+
+
+def study(outcome, data: Path | None = None) -> None:
+    seeds = range(SEED, SEED + CASES)
+    results = Parallel(n_jobs=2, return_as="generator")(delayed(told)(seed) for seed in seeds)
+    alarms = {seed: kinds for seed, kinds in zip(outcome.track(seeds, "cases"), results, strict=True) if kinds}
+    outcome.table("cases", CASES)
+    outcome.table("alarms", alarms)
+    outcome.check(f"false alarms in {CASES} cases", len(alarms), CASES // 100)
+    outcome.say(f"{len(alarms)} false alarms in {CASES} cases that hide nothing")
