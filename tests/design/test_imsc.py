@@ -106,3 +106,11 @@ def test_designs_that_cannot_be_are_refused(act, words):
 def test_errors_of_design_have_one_type():
     with pytest.raises(DesignError):
         imsc(modes(), 3, actuators(2.0), weight=1.0)
+
+
+@pytest.mark.parametrize("gain", [1e-12, 1.0])
+def test_a_mode_nobody_moves_is_told_whatever_the_units(gain):
+    weak = [Actuator("F1", 5.0, gain=gain), Actuator("F2", 3.0, gain=gain)]
+    assert imsc(modes(), 2, weak, weight=1.0).gain.shape == (2, 4)
+    with pytest.raises(DesignError, match="no actuator moves mode 2"):
+        imsc(modes(), [1], weak[:1], weight=1.0)

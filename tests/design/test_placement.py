@@ -69,3 +69,13 @@ def test_limits_that_conflict_are_named(task):
         place(task, effort_limit=1e-3, spacing=0.5, starts=1)
     with pytest.raises(DesignError, match="no residual mode"):
         placement_task(task.modes, 9, impulse_at=6.3, weight=20.0)
+
+
+def test_a_heavy_structure_is_placed_like_a_light_one(task):
+    """The test of a singular B once was not relative, so every placement on a heavy structure was thrown out."""
+    heavy = Beam(length=10.0, mass_per_length=1e8, bending_stiffness=1e8, left="hinged", right="hinged").modes(9)
+    twin = placement_task(heavy, 4, impulse_at=6.3, weight=20.0, impulse=1e8)
+    limits = [1.5 * t.evaluate([2, 4, 6, 8])[2] for t in (task, twin)]
+    light, same = (scan(t, effort_limit=e, spacing=0.5, n_places=16)[0] for t, e in zip((task, twin), limits))
+    np.testing.assert_allclose(same.positions, light.positions, atol=1e-12)
+    assert same.residual_work == pytest.approx(1e8 * light.residual_work, rel=1e-6)

@@ -10,6 +10,7 @@ from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, frozen
 
 SINGULAR = 1e8
+UNMOVED = 1e-9
 
 
 class DesignError(ValueError):
@@ -82,8 +83,9 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
                     " move one by more than 1e-6 of the length"
                 )
     b = input_matrix(modes, actuators)[list(controlled)]
+    possible = _largest_participation(modes, actuators)
     for row, r in zip(b, controlled, strict=True):
-        if np.abs(row).max() < 1e-9 / np.sqrt(modes.length):
+        if np.abs(row).max() < UNMOVED * possible[r]:
             raise DesignError(f"no actuator moves mode {r + 1}: all stand at its nodes; move one")
     condition = np.linalg.cond(b)
     if condition > SINGULAR:
@@ -92,3 +94,13 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
             f" {', '.join(f'{a.at:g}' for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
         )
     return b
+
+
+def _largest_participation(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
+    """The most that the best of the actuators could do for each mode from any place, (n_modes,)."""
+    grid = np.linspace(0.0, modes.length, 8 * modes.n_modes + 9)
+    most = np.zeros(modes.n_modes)
+    for actuator in actuators:
+        shapes = modes.phi(grid, 1 if actuator.kind == "moment" else 0)
+        most = np.maximum(most, abs(actuator.gain) * np.abs(shapes).max(axis=0))
+    return most

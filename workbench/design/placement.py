@@ -22,6 +22,7 @@ from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, frozen
 
 SPLINE_DEGREE = 7
+SINGULAR_SHARE = 1e-14
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +208,8 @@ def batch_work(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.
     """
     n = task.n_controlled
     b = shapes[:, :, :n].transpose(0, 2, 1)
-    singular = np.abs(np.linalg.det(b)) < 1e-14
+    # Hadamard: |det B| against the product of its row lengths, so that mass and units do not matter
+    singular = np.abs(np.linalg.det(b)) <= SINGULAR_SHARE * np.linalg.norm(b, axis=2).prod(axis=1)
     b = np.where(singular[:, None, None], np.eye(n), b)
     inverse = np.linalg.inv(b)
     spread = shapes[:, :, n:].transpose(0, 2, 1) @ inverse

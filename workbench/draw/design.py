@@ -10,6 +10,8 @@ from workbench.design.placement import Placement
 from workbench.design.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
 
+SHOWN_SHARE = 1e-5
+
 
 def plot_displacements(
     responses: dict[str, Response], positions: dict[str, Sequence[float]], times: Sequence[float], x: np.ndarray
@@ -39,19 +41,20 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     first = next(iter(spillovers.values()))
     modes = np.array(first.residual) + 1
     width = 0.8 / len(spillovers)
+    total = max(work.residual_total for work in spillovers.values())
+    least = SHOWN_SHARE * total
     for i, (name, work) in enumerate(spillovers.items()):
-        values = np.maximum(work.residual_work, 1e-12)
-        ax.bar(
-            modes + (i - 0.5 * (len(spillovers) - 1)) * width,
-            values,
-            width,
-            label=f"{name}: W_R = {work.residual_total:.3g}",
-        )
-    ax.set(
-        yscale="log", xlabel="residual mode", ylabel="work spilled into the mode, W_r", xticks=modes, ylim=(1e-6, None)
-    )
+        at = modes + (i - 0.5 * (len(spillovers) - 1)) * width
+        values = np.maximum(work.residual_work, 0.1 * least)
+        bars = ax.bar(at, values, width, label=f"{name}: W_R = {work.residual_total:.3g}")
+        for x, value in zip(at, work.residual_work, strict=True):
+            if value < least:
+                ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())
+    ax.set(yscale="log", xlabel="residual mode", ylabel="work spilled into the mode, W_r", xticks=modes)
+    # room above the bars for the legend
+    ax.set_ylim(least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
     ax.set_title("control spillover: the energy that control leaves in the modes it does not control")
-    ax.legend()
+    ax.legend(loc="upper right")
     return figure
 
 
@@ -99,16 +102,20 @@ def plot_filter_errors(counts: Sequence[int], errors: np.ndarray) -> Figure:
 
 
 def plot_comparison(rows: Sequence[dict]) -> Figure:
-    """Cost, effort and spillover of several designs as ratios to the first."""
+    """Cost, effort and spillover of several designs as ratios to the first, on a logarithmic scale."""
     figure, ax = new_figure(1, 1, width=9, height=4)
     keys = ("cost", "effort", "W_R")
     width = 0.8 / len(rows)
+    ratios = np.array([[row[key] / rows[0][key] for key in keys] for row in rows])
+    least = 10.0 ** np.floor(np.log10(ratios.min()) - 0.3)
     for i, row in enumerate(rows):
-        values = [row[key] / rows[0][key] for key in keys]
-        ax.bar(np.arange(len(keys)) + (i - 0.5 * (len(rows) - 1)) * width, values, width, label=row["law"])
+        at = np.arange(len(keys)) + (i - 0.5 * (len(rows) - 1)) * width
+        # bars stand on the bottom of the picture: on a logarithmic scale there is no zero to stand on
+        bars = ax.bar(at, ratios[i] - least, width, bottom=least, label=row["law"])
+        ax.bar_label(bars, [f"{ratio:.3g}" for ratio in ratios[i]], padding=2)
+    ax.set(yscale="log", ylim=(least, 4.0 * ratios.max()), ylabel=f"ratio to {rows[0]['law']} (less is better)")
     ax.set_xticks(np.arange(len(keys)), ["quadratic cost", "actuator effort", "spillover W_R"])
     ax.axhline(1.0, color=GREY, linewidth=0.8)
-    ax.set_ylabel(f"ratio to {rows[0]['law']}")
-    ax.set_title("two ways to control the same modes with the same actuators")
-    ax.legend()
+    ax.set_title("two ways to control the same modes with the same actuators, weighed on the actuator forces")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
