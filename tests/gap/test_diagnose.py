@@ -1,0 +1,119 @@
+"""The diagnosis on cases made by finite elements: named, quantified, honest; and an effect of the user's own."""
+
+import numpy as np
+import pytest
+
+from workbench.gap.check import RecordsError
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect, Kind, Parameter
+from workbench.gap.effects.nonlinear import with_element
+from workbench.gap.effects.structural import place_parameter
+from workbench.gap.fit import fit
+from workbench.gap.prediction import FitData
+from workbench.gap.trials import make_trial
+from workbench.rig.elements import UserLaw
+from workbench.rig.rig import Rig
+
+
+def verdict_on(case, **options):
+    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, **options)
+
+
+def test_a_hidden_contact_is_named_placed_and_closed():
+    case, label = make_trial(11, kinds=("one_sided_stop",))
+    verdict, hidden = verdict_on(case), label["effects"][0]
+    shown = verdict.to_json()
+    assert [e["kind"] for e in shown["effects"]] == ["one_sided_stop"] and verdict.outcome == "explained"
+    told = shown["effects"][0]
+    assert told["at"] == pytest.approx(hidden["at"], abs=0.02 * case.rig.modes.length)
+    assert told["parameters"]["gap"] == pytest.approx(hidden["gap"], rel=0.05)
+    assert verdict.shrinkage.overall > 0.95 and shown["where"]["path"] == "structure"
+    assert verdict.shrinkage.ci95[0] <= verdict.shrinkage.overall <= verdict.shrinkage.ci95[1]
+    assert shown["where"]["amplitude_dependent"]
+
+
+def test_nothing_hidden_nothing_told():
+    case, _ = make_trial(12)
+    verdict = verdict_on(case)
+    assert verdict.outcome == "none" and verdict.to_json()["effects"] == []
+
+
+def quadratic(w, v, p):
+    return -p[0] * w * abs(w)
+
+
+def test_an_effect_of_the_users_own_joins_the_catalogue():
+    mine = Kind(
+        name="quadratic_spring",
+        path="structure",
+        nonlinear=True,
+        parameters=lambda rig, _: (place_parameter(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)),
+        apply=lambda rig, _, v: with_element(rig, UserLaw(v["at"], quadratic, (v["stiffness"],))),
+        starts=lambda evidence, _: [{"at": p.at, "stiffness": k} for p in evidence.at_peaks for k in (0.01, 0.1, 1.0)],
+    )
+    case, _ = make_trial(13)
+    true = Effect(mine, None, {"at": 0.37 * case.rig.modes.length, "stiffness": 0.2})
+    noise = np.array([s.noise_std for s in case.rig.sensors])
+    plain = FitData(case.fit, noise, substeps=16)
+    rng = np.random.default_rng(0)
+    from dataclasses import replace
+
+    hidden = [
+        replace(r, outputs=p + noise[:, None] * rng.standard_normal(p.shape))
+        for r, p in zip(case.fit, plain.predictions(true.apply(case.rig)), strict=True)
+    ]
+    start = Effect(mine, None, {"at": 0.4 * case.rig.modes.length, "stiffness": 0.05})
+    found = fit(case.rig, (start,), FitData(tuple(hidden), noise, substeps=8))
+    assert found.cost < 1.02
+    assert found.effects[0].values["stiffness"] == pytest.approx(0.2, rel=0.05)
+    assert mine.name not in {kind.name for kind in CATALOGUE}
+
+
+def test_standard_deviations_are_true():
+    """Fits of many noisy copies scatter as one fit says they do."""
+    from dataclasses import replace
+
+    case, _ = make_trial(14)
+    spring = kind_named("ground_spring")
+    true = Effect(spring, None, {"at": 0.3 * case.rig.modes.length, "stiffness": 0.02 * case.rig.modes.omega[1] ** 2})
+    noise = np.array([s.noise_std for s in case.rig.sensors])
+    data = FitData(case.fit[:2], noise)
+    clean = data.predictions(true.apply(case.rig))
+    errors = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        noisy = [
+            replace(r, outputs=p + noise[:, None] * rng.standard_normal(p.shape))
+            for r, p in zip(data.records, clean, strict=True)
+        ]
+        found = fit(case.rig, (true,), FitData(tuple(noisy), noise)).effects[0]
+        errors.append([(found.values[n] - true.values[n]) / found.deviations[n] for n in ("at", "stiffness")])
+    spread = np.std(errors, axis=0)
+    assert (spread > 0.6).all() and (spread < 1.5).all()
+
+
+def test_validation_records_never_reach_the_search():
+    """Spoilt validation records change the shrinkage and nothing else."""
+    from dataclasses import replace
+
+    case, _ = make_trial(11, kinds=("actuator_gain",))
+    spoilt = tuple(replace(r, outputs=r.outputs * 3.0) for r in case.validation)
+    catalogue = tuple(kind_named(n) for n in ("actuator_gain", "modal_damping"))
+    honest = diagnose(case.rig, case.fit, validation=case.validation, catalogue=catalogue)
+    other = diagnose(case.rig, case.fit, validation=spoilt, catalogue=catalogue)
+    assert honest.effects[0].values == other.effects[0].values
+    assert honest.shrinkage.overall > other.shrinkage.overall
+
+
+def test_records_that_cannot_be_of_the_rig_are_refused():
+    from dataclasses import replace
+
+    case, _ = make_trial(12)
+    turned = [replace(r, outputs=r.outputs * np.r_[-1.0, np.ones(r.n_outputs - 1)][:, None]) for r in case.fit]
+    with pytest.raises(RecordsError, match="wrong sign"):
+        diagnose(case.rig, turned)
+    with pytest.raises(ValueError, match="in that order"):
+        diagnose(Rig(case.rig.modes, case.rig.actuators, case.rig.sensors[1:]), case.fit)
+    with pytest.raises(ValueError, match="at least one record"):
+        diagnose(case.rig, ())
