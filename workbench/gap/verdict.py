@@ -7,6 +7,7 @@ import numpy as np
 from workbench.gap.attribute import Attribution
 from workbench.gap.check import Readiness
 from workbench.gap.effects.effect import ALL, Effect
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
 from workbench.gap.experiment import Experiment
@@ -71,7 +72,9 @@ class Verdict:
             return "There is no gap beyond the noise of the sensors."
         words = " and ".join(_described(effect, self.nominal) for effect in self._told)
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
-        if self.outcome == "explained":
+        if any(effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION) for effect in self.effects):
+            text = f"{words} account{'s' if len(self._told) == 1 else ''} for the gap, part of which nothing can predict."
+        elif self.outcome == "explained":
             text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
             near = [label for label, probability in self.alternatives if probability > 0.01]
             text += f"; {' and '.join(near)} cannot be excluded." if near else "."

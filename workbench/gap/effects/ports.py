@@ -7,7 +7,10 @@ import numpy as np
 
 from workbench.gap.effects.effect import ALL, Kind, Parameter
 from workbench.gap.effects.structural import known_places, place_parameter
+from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
+
+OF_THE_SENSOR = "unit of the sensor"
 
 # --- targets and changes
 
@@ -191,7 +194,9 @@ def _sensor(name: str, field: str, phrase: str, starts: Callable, unit: str = ""
     def parameters(rig: Rig, target) -> tuple[Parameter, ...]:
         noise = max((s.noise_std for s in rig.sensors if target in (s.name, ALL)), default=1.0)
         scale = 0.1 if field == "gain" else max(noise, 1e-300)
-        return (Parameter(field, unit, low, high, logarithmic=log, scale=scale),)
+        quantity = next((s.quantity for s in rig.sensors if target in (s.name, ALL)), "")
+        shown = QUANTITIES.get(quantity, "") if unit == OF_THE_SENSOR else unit
+        return (Parameter(field, shown, low, high, logarithmic=log, scale=scale),)
 
     return Kind(
         name=name,
@@ -220,7 +225,7 @@ SENSOR_BIAS = _sensor(
     "bias",
     "a sensor bias",
     lambda evidence, target: [{"bias": _mean_residual(evidence, target)}],
-    "sensor's",
+    OF_THE_SENSOR,
 )
 
 SENSOR_DRIFT = _sensor(
@@ -228,7 +233,7 @@ SENSOR_DRIFT = _sensor(
     "drift_over_record",
     "a sensor drift",
     lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
-    "sensor's",
+    OF_THE_SENSOR,
 )
 
 SENSOR_LAG = _sensor(
@@ -286,7 +291,7 @@ SENSOR_CLIPPING = _sensor(
     "limit",
     "clipping of a sensor",
     _clipping_starts,
-    "sensor's",
+    OF_THE_SENSOR,
     log=True,
     low=1e-300,
     nonlinear=True,
@@ -303,7 +308,7 @@ SENSOR_QUANTISATION = _sensor(
     "step",
     "rounding of a sensor",
     _rounding_starts,
-    "sensor's",
+    OF_THE_SENSOR,
     log=True,
     low=1e-300,
     nonlinear=True,
