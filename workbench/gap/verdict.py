@@ -73,7 +73,8 @@ class Verdict:
         words = " and ".join(_described(effect, self.nominal) for effect in self._told)
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if any(effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION) for effect in self.effects):
-            text = f"{words} account{'s' if len(self._told) == 1 else ''} for the gap, part of which nothing can predict."
+            verb = "accounts" if len(self._told) == 1 else "account"
+            text = f"{words} {verb} for the gap, part of which nothing can predict."
         elif self.outcome == "explained":
             text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
             near = [label for label, probability in self.alternatives if probability > 0.01]
