@@ -111,6 +111,10 @@ def test_filter_refuses_sensors_out_of_order():
         hermite_filter(modes(2), [0.0, 5.0, 3.0], 1.0)
 
 
-def test_sensors_that_cannot_see_a_mode_are_named():
+def test_a_loop_through_sensors_that_cannot_see_a_mode_names_it():
+    found = modes(2)
+    filter_ = displacement_filter(found, [5.0], 1.0)
+    assert abs(filter_.seen(found)[1, 1]) < 1e-12
+    law = imsc(found, 2, [Actuator("a", 2.0), Actuator("b", 3.0)], weight=1.0)
     with pytest.raises(ValueError, match="cannot see mode 2"):
-        displacement_filter(modes(2), [5.0], 1.0)
+        close_loop(found, law, filter_)

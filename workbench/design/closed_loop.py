@@ -11,6 +11,8 @@ from workbench.design.modal_filter import ModalFilter
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, frozen
 
+UNSEEN = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
@@ -76,6 +78,9 @@ def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> Cl
     Args:
         modes: all modes, controlled and residual.
         filter_: rows are the controlled modes, in the law's order; rates are read through the same weights.
+
+    Raises:
+        ValueError: a filter of another number of modes, or one whose sensors cannot see a controlled mode.
     """
     n = modes.n_modes
     if filter_ is None:
@@ -85,6 +90,12 @@ def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> Cl
         seen = filter_.seen(modes)
         if seen.shape[0] != law.n_controlled:
             raise ValueError(f"the filter gives {seen.shape[0]} modes; the law controls {law.n_controlled}")
+        strength = np.abs(seen[np.arange(law.n_controlled), list(law.controlled)])
+        if strength.min() < UNSEEN:
+            raise ValueError(
+                f"the filter's sensors at {', '.join(f'{x:g}' for x in filter_.positions)} cannot see mode"
+                f" {law.controlled[strength.argmin()] + 1}: they all stand at its nodes; move or add a sensor"
+            )
     estimate = np.kron(np.eye(2), seen)
     feedback = -law.gain @ estimate
     b = input_matrix(modes, law.actuators)

@@ -13,7 +13,6 @@ from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import ProfileLike, as_profile
 
 GAUSS_POINTS = 24
-UNSEEN = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +56,7 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         mass_per_length: kg/m.
 
     Raises:
-        ValueError: fewer than two sensors, positions that do not increase, or sensors that cannot see a mode.
+        ValueError: fewer than two sensors, or positions that do not increase.
     """
     x = _checked(positions, 2)
     mass = as_profile(mass_per_length)
@@ -75,7 +74,7 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         displacement[:, i + 1] += right
         slope[:, i] += left_slope
         slope[:, i + 1] += right_slope
-    return _seeing(ModalFilter(x, displacement, slope), modes)
+    return ModalFilter(x, displacement, slope)
 
 
 def displacement_filter(
@@ -89,7 +88,7 @@ def displacement_filter(
         degree: of the spline, lowered where there are too few sensors for it.
 
     Raises:
-        ValueError: fewer than two readings, positions that do not increase, or sensors that cannot see a mode.
+        ValueError: fewer than two readings, or positions that do not increase.
     """
     x = _checked(positions, 1)
     held = [at for at, derivative in modes.essential if derivative == 0 and np.abs(x - at).min() > 1e-9 * modes.length]
@@ -100,7 +99,7 @@ def displacement_filter(
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
     weights = _spline_weights(modes, splines, as_profile(mass_per_length))
-    return _seeing(ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0))), modes)
+    return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)))
 
 
 def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:
@@ -113,17 +112,6 @@ def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:
         density = modes.phi(at) * (mass(at) * weights * 0.5 * (b - a))[:, None]
         total = total + density.T @ splines(at)
     return total
-
-
-def _seeing(filter_: ModalFilter, modes: Modes) -> ModalFilter:
-    """The filter, refused where its sensors cannot see one of its own modes."""
-    strength = np.abs(np.diag(filter_.seen(modes)))
-    if strength.min() < UNSEEN:
-        raise ValueError(
-            f"the sensors at {', '.join(f'{x:g}' for x in filter_.positions)} cannot see mode {strength.argmin() + 1}:"
-            " they all stand at its nodes; move or add a sensor"
-        )
-    return filter_
 
 
 def _checked(positions: ArrayLike, least: int) -> np.ndarray:

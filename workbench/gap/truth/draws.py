@@ -271,7 +271,9 @@ def _hum(scene, rng):
     row, frequency = int(rng.integers(len(scene.bench.rig.sensors))), float(rng.uniform(0.2, 2.0)) * scene.bench.band_hz
     rms = float(scene.outputs[row].std())
     return lambda s: {
-        "output": scene.bench.rig.sensors[row].name, "frequency": frequency, "amplitude": 0.3 * s * rms,
+        "output": scene.bench.rig.sensors[row].name,
+        "frequency": frequency,
+        "amplitude": 0.3 * s * rms,
     }
 
 
