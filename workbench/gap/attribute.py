@@ -57,6 +57,7 @@ class _Search:
     rig: Rig
     data: FitData
     quick: FitData
+    first: FitData
     catalogue: tuple[Kind, ...]
     report: Callable[[str, float], None]
     pool: ThreadPoolExecutor
@@ -137,7 +138,9 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     base = apply_all(rig, seen)
     nominal = data.by_channel(data.residual(rig))
     start = Fit(seen, cost_of(base, (), data), data.by_channel(data.residual(base)), 0, "read off the records")
-    search = _Search(base, data, _quick(data, start), catalogue, report, pool, nominal)
+    telling = _telling(data, start)
+    quick, first = data.only(telling), data.only(telling[:1]).stepped(2)
+    search = _Search(base, data, quick, first, catalogue, report, pool, nominal)
     report("looking for the missing force", 0.02)
     evidence = Evidence.of(base, data)
     if free_nominal:
@@ -146,7 +149,7 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     singles = _extend(search, start.effects if free_nominal else (), evidence, 0.05, 0.45, finalists=8)
     found = _decide(search, start, singles)
     if found is None and free_nominal:
-        best, rivals = _ranked(search, [_finished(search, f) for f in singles[:3]])
+        best, rivals = _ranked(search, list(search.pool.map(lambda f: _finished(search, f), singles[:3])))
         found = _unexplained(start, best, rivals)
     if found is None:
         pairs = _pairs(search, singles)
@@ -170,13 +173,13 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     )
 
 
-def _quick(data: FitData, start: Fit) -> FitData:
-    """The two records that say most: the largest residual against the noise, and against the signal."""
+def _telling(data: FitData, start: Fit) -> tuple[str, ...]:
+    """The names of the two records that say most: the largest residual against the noise, and against the signal."""
     by_record = start.cost_by_channel.mean(axis=1)
     scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.counted])
     order = [int(np.argmax(by_record)), *np.argsort(-(by_record - 1.0) / scale)]
     chosen = list(dict.fromkeys(int(i) for i in order))[:2]
-    return data.only(tuple(data.records[i].name for i in chosen))
+    return tuple(data.records[i].name for i in chosen)
 
 
 # --- one more effect
@@ -208,7 +211,10 @@ def _extend(search: _Search, given: tuple[Effect, ...], evidence: Evidence, begi
     chosen = _spread_over_kinds(quick_fits, 3)
     close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
     chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
-    full = list(search.pool.map(lambda f: fit(search.rig, f.effects, search.data), chosen))
+    full = list(search.pool.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), chosen))
+    full.sort(key=lambda f: f.cost)
+    running = [f for i, f in enumerate(full) if i < 3 or f.cost < 2.0 * full[0].cost]
+    full[: len(running)] = search.pool.map(lambda f: fit(search.rig, f.effects, search.data), running)
     search.report("all records", end)
     return sorted(full, key=lambda f: f.cost)
 
@@ -246,9 +252,9 @@ def _repeats(kind: Kind, target, given: Sequence[Effect]) -> bool:
 
 
 def _started(search: _Search, rig: Rig, evidence: Evidence, kind: Kind, target) -> list[tuple[float, Effect]]:
-    """The two best starts of a kind on the quick records, with their costs."""
+    """The two best starts of a kind on the most telling record, coarsely stepped, with their costs."""
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
-    costs = [cost_of(rig, (effect,), search.quick) for effect in starts]
+    costs = [cost_of(rig, (effect,), search.first) for effect in starts]
     order = [i for i in np.argsort(costs) if costs[i] < HOPELESS]
     # a lone start is of an effect that is linear in its number: its cost says nothing yet
     return [(-1.0 if len(starts) == 1 else costs[i], starts[i]) for i in order[:2]]
@@ -282,7 +288,7 @@ def _quick_fit(search: _Search, given: tuple[Effect, ...], started: list[tuple[f
 
 def _finished(search: _Search, candidate: Fit) -> Fit:
     """The same set on all records with finer substeps, to the end."""
-    return fit(search.rig, candidate.effects, search.data.finer(8), iterations=12, tolerance=1e-7)
+    return fit(search.rig, candidate.effects, search.data.stepped(8), iterations=12, tolerance=1e-7)
 
 
 def _relocated(search: _Search, candidate: Fit) -> Fit:
@@ -320,7 +326,7 @@ def _simplest(search: _Search, candidate: Fit) -> Fit:
         for i, effect in enumerate(candidate.effects):
             for simpler in simpler_forms(effect, search.rig):
                 effects = (*candidate.effects[:i], simpler, *candidate.effects[i + 1 :])
-                trial = fit(search.rig, effects, search.data.finer(8), iterations=12, tolerance=1e-7)
+                trial = fit(search.rig, effects, search.data.stepped(8), iterations=12, tolerance=1e-7)
                 extra = max(candidate.n_parameters - trial.n_parameters, 1)
                 if search.explains(trial) and not search.surely_better(candidate, trial.cost, extra):
                     candidate, improved = trial, True
@@ -353,7 +359,7 @@ def _decide(search: _Search, start: Fit, singles: list[Fit]):
     good = [f for f in singles if search.worthwhile(f, start.cost)]
     if search.explains(start) and not good:
         return "none", start, None, ()
-    finished = [_finished(search, f) for f in good[:4]]
+    finished = list(search.pool.map(lambda f: _finished(search, f), good[:4]))
     explaining = [f for f in finished if search.explains(f)]
     near = [f for f in finished[:2] if _near(search, f, NEAR)]
     if not explaining and near:
@@ -439,7 +445,7 @@ def _with_nominal(search: _Search, start: Fit):
         return None
     evidence = Evidence.of(apply_all(search.rig, freed.effects), search.data, 20)
     joined = _extend(search, freed.effects, evidence, 0.95, 0.99, finalists=2)
-    finished = fit(search.rig, joined[0].effects, search.data.finer(8), iterations=6)
+    finished = fit(search.rig, joined[0].effects, search.data.stepped(8), iterations=6)
     return ("explained", finished, None, ()) if search.explains(finished) else None
 
 
@@ -458,7 +464,9 @@ def _decide_pairs(search: _Search, start: Fit, singles: list[Fit], pairs: list[F
     distinct: dict[tuple, Fit] = {}
     for candidate in pairs:
         distinct.setdefault(candidate.key, candidate)
-    finished = sorted((_finished(search, f) for f in list(distinct.values())[:4]), key=lambda f: f.cost)
+    finished = sorted(
+        search.pool.map(lambda f: _finished(search, f), list(distinct.values())[:4]), key=lambda f: f.cost
+    )
     explaining = [f for f in finished if search.explains(f)]
     if not explaining:
         finished[:2] = search.pool.map(lambda f: _relocated(search, f), finished[:2])

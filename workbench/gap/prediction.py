@@ -42,8 +42,8 @@ class FitData:
         """The same yardstick on some of the records."""
         return FitData(tuple(r for r in self.records if r.name in names), self.noise, self.substeps, self.lead)
 
-    def finer(self, substeps: int) -> "FitData":
-        """The same yardstick with finer substeps."""
+    def stepped(self, substeps: int) -> "FitData":
+        """The same yardstick with other substeps."""
         return FitData(self.records, self.noise, substeps, self.lead)
 
     @cached_property

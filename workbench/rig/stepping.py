@@ -58,39 +58,45 @@ def _moments(pole, h, e):
 
 @njit(cache=True, nogil=True)
 def _yield_update(z, dw, limit):
-    """Bouc-Wen z after a monotone travel dw: exact, since the law does not depend on the speed."""
+    """Bouc-Wen z after a monotone travel dw, and dz/d(dw): exact, since the law does not depend on the speed."""
     s = 1.0 if dw >= 0 else -1.0
     left = abs(dw)
     z = s * z
     if z < 0.0:
         if left <= -z:
-            return s * (z + left)
+            return s * (z + left), 1.0
         left += z
         z = 0.0
-    return s * (limit - (limit - z) * math.exp(-left / limit))
+    remaining = (limit - z) * math.exp(-left / limit)
+    return s * (limit - remaining), remaining / limit
 
 
 @njit(cache=True, nogil=True)
 def element_force(kind, p, w, v, z, w_old):
+    """The force of an element, and its derivatives with respect to w and v."""
     if kind == LINEAR_SPRING:
-        return -p[0] * w
+        return -p[0] * w, -p[0], 0.0
     if kind == LINEAR_DAMPER:
-        return -p[0] * v
+        return -p[0] * v, 0.0, -p[0]
     if kind == CUBIC:
-        return -p[0] * w * w * w
+        return -p[0] * w * w * w, -3.0 * p[0] * w * w, 0.0
     if kind == CLEARANCE:
         if w > p[1]:
-            return -p[0] * (w - p[1])
+            return -p[0] * (w - p[1]), -p[0], 0.0
         if w < -p[1]:
-            return -p[0] * (w + p[1])
-        return 0.0
+            return -p[0] * (w + p[1]), -p[0], 0.0
+        return 0.0, 0.0, 0.0
     if kind == ONE_SIDED:
-        return -p[0] * (w - p[1]) if w > p[1] else 0.0
+        return (-p[0] * (w - p[1]), -p[0], 0.0) if w > p[1] else (0.0, 0.0, 0.0)
     if kind == FRICTION:
-        return -p[0] * math.tanh(v / p[1])
+        level = math.tanh(v / p[1])
+        return -p[0] * level, 0.0, -p[0] / p[1] * (1.0 - level * level)
     if kind == BOUC_WEN:
-        return -p[0] * _yield_update(z, w - w_old, p[1])
-    return user_law(w, v, p)
+        pulled, slope = _yield_update(z, w - w_old, p[1])
+        return -p[0] * pulled, -p[0] * slope, 0.0
+    force = user_law(w, v, p)
+    dw, dv = 1e-6 * abs(w) + 1e-12, 1e-6 * abs(v) + 1e-12
+    return force, (user_law(w + dw, v, p) - force) / dw, (user_law(w, v + dv, p) - force) / dv
 
 
 @njit(cache=True, nogil=True)
@@ -99,17 +105,15 @@ def solve_element(kind, p, w0, v0, aw, av, z, w_old, start):
     f = start
     low, high = -math.inf, math.inf
     for _ in range(40):
-        value = element_force(kind, p, w0 + aw * f, v0 + av * f, z, w_old)
+        value, by_w, by_v = element_force(kind, p, w0 + aw * f, v0 + av * f, z, w_old)
         g = f - value
-        if abs(g) <= 1e-13 * (abs(f) + abs(value)) + 1e-300:
+        if abs(g) <= 1e-10 * (abs(f) + abs(value)) + 1e-300:
             break
         if g > 0:
             high = f
         else:
             low = f
-        step = 1e-6 * (abs(f) + abs(g))
-        beside = element_force(kind, p, w0 + aw * (f + step), v0 + av * (f + step), z, w_old)
-        slope = 1.0 - (beside - value) / step
+        slope = 1.0 - by_w * aw - by_v * av
         f_new = f - g / slope if slope > 0.1 else value
         if not (low < f_new < high):
             if low > -math.inf and high < math.inf:
@@ -156,6 +160,7 @@ def step_record(
     old, new, spread = np.zeros(n), np.zeros(n), np.zeros(n)
     spread_old, drive = np.zeros(n), np.zeros(n)
     point, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
+    w_free, v_free = np.zeros(n_elements), np.zeros(n_elements)
     aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
     distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
     changed = np.empty(n)
@@ -200,13 +205,16 @@ def step_record(
                         kinds[0], parameters[0], w0, v0, aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
                     )
                 else:
+                    for i in range(n_elements):
+                        w0, v0 = 0.0, 0.0
+                        for r in range(n):
+                            w0 += shapes[i, r] * (base_q[r] + e[r, 0, 3] * spread[r])
+                            v0 += shapes[i, r] * (base_v[r] + e[r, 1, 3] * spread[r])
+                        w_free[i], v_free[i] = w0, v0
                     for _ in range(12 if n_elements > 1 else 0):
                         largest = 0.0
                         for i in range(n_elements):
-                            w0, v0 = 0.0, 0.0
-                            for r in range(n):
-                                w0 += shapes[i, r] * (base_q[r] + e[r, 0, 3] * spread[r])
-                                v0 += shapes[i, r] * (base_v[r] + e[r, 1, 3] * spread[r])
+                            w0, v0 = w_free[i], v_free[i]
                             for j in range(n_elements):
                                 if j != i:
                                     w0 += aw[i, j] * point[j]
@@ -262,7 +270,7 @@ def step_record(
                 for r in range(n):
                     w += shapes[i, r] * q[r]
                 if kinds[i] == BOUC_WEN:
-                    z[i] = _yield_update(z[i], w - w_old[i], parameters[i, 1])
+                    z[i], _ = _yield_update(z[i], w - w_old[i], parameters[i, 1])
                 w_old[i] = w
 
 
