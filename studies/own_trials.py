@@ -10,7 +10,9 @@ CASES, SEED = 240, 1981
 
 def study(outcome, data: Path | None = None) -> None:
     shown = iter(outcome.track(range(CASES), "cases"))
-    held = hold_trials(CASES, SEED, report=lambda text, share: next(shown, None) if "diagnosing" in text else None)
+    held = hold_trials(
+        CASES, SEED, jobs=2, report=lambda text, share: next(shown, None) if "diagnosed" in text else None
+    )
 
     closed = []
     for name, one in held.scores.items():

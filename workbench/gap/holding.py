@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from joblib import Parallel, delayed
+
 from workbench.gap.case import Case, read_case
 from workbench.gap.diagnose import diagnose
 from workbench.gap.scoring import Tally, score, tally
@@ -36,6 +38,7 @@ def hold_trials(
     like: Case | None = None,
     kinds: Sequence[Sequence[str]] | None = None,
     diagnose_case: Callable[[Path], dict] | None = None,
+    jobs: int = 1,
     report: Callable[[str, float], None] = lambda text, share: None,
 ) -> Trials:
     """Make n blind cases, diagnose each, and only then open the labels and score.
@@ -47,6 +50,7 @@ def hold_trials(
         like: the user's own case, whose nominal rig, levels, band and noise are taken; None draws benches.
         kinds: what the cases hide, one entry a case; None draws them.
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
+        jobs: cases diagnosed at a time, each in a process of its own.
         report: told (what, share done).
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
@@ -55,16 +59,18 @@ def hold_trials(
         labels = json.loads(sealed.read_text(encoding="utf-8"))
         sealed.unlink()
         verdicts, scores = {}, {}
-        for i, folder in enumerate(sorted(Path(cases).iterdir())):
-            report(f"diagnosing {folder.name}", 0.1 + 0.9 * i / n)
-            verdicts[folder.name] = (diagnose_case or verdict_on)(folder)
-        for folder in sorted(Path(cases).iterdir()):
+        folders = sorted(Path(cases).iterdir())
+        found = Parallel(n_jobs=jobs, return_as="generator")(delayed(diagnose_case or verdict_on)(f) for f in folders)
+        for i, (folder, verdict) in enumerate(zip(folders, found, strict=True)):
+            verdicts[folder.name] = verdict
+            report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
+        for folder in folders:
             length = read_case(folder).rig.modes.length
             scores[folder.name] = score(verdicts[folder.name], labels[folder.name], length=length)
     return Trials(verdicts, labels, scores, tally(scores.values()))
 
 
 def verdict_on(folder: Path) -> dict:
-    """The verdict on a case folder, as JSON."""
+    """The verdict on a case folder, as JSON, by one thread."""
     case = read_case(folder)
-    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name).to_json()
+    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1).to_json()
