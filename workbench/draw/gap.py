@@ -128,5 +128,5 @@ def plot_rivals(verdict: Verdict) -> Figure:
         xlabel="mean square residual, in units of the noise",
         title="each effect alone, fitted as well as it can be",
     )
-    ax.legend(loc="lower right")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
