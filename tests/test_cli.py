@@ -131,6 +131,34 @@ def test_a_study_that_does_not_hold_ends_in_code_1(tmp_path, monkeypatch):
     assert (tmp_path / "out/wrong.html").is_file()
 
 
+MANY = """'Is a third of two an error?'
+
+def third(at):
+    if at == 2:
+        raise ArithmeticError("two")
+    return {"third": at / 3}
+
+def study(outcome, data=None):
+    found = outcome.run([{"at": 1}, {"at": 2}], third, workers=1)
+    outcome.check("third", found[0]["third"], 0.5)
+"""
+
+
+def test_cases_that_fail_are_reported_at_the_end_beside_the_others(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies/many.py").write_text(MANY)
+    monkeypatch.chdir(tmp_path)
+    result = run("study", "studies/many.py")
+    assert result.exit_code == 1 and "1 of 2 cases failed" in result.output
+    assert "{'at': 2}: ArithmeticError: two" in result.output and "1 of 1 checks hold" in result.output
+    rows = (tmp_path / "out/many-cases.csv").read_text().splitlines()
+    assert rows[0].startswith("at,third,seed,error,seconds") and rows[1].startswith("1,0.3333333333333333,,,")
+    [kept] = (tmp_path / "out/cache").rglob("*.json")
+    monkeypatch.setattr("workbench.study.engines.CONNECT_SECONDS", 0.5)
+    away = run("study", "many", "--scheduler", "tcp://127.0.0.1:1")
+    assert away.exit_code == 2 and "no Dask scheduler answers" in away.output and kept.is_file()
+
+
 def test_every_command_explains_itself_with_an_example():
     for name in ("study", "identify", "design", "place", "diagnose"):
         result = run(name, "--help")

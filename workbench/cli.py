@@ -72,6 +72,7 @@ def study(
     ] = None,
     data: Annotated[Path | None, typer.Option(help="File or folder that the study works on.")] = None,
     every: Annotated[bool, typer.Option("--all", help="Run every study that makes its own data.")] = False,
+    scheduler: Annotated[str | None, typer.Option(help="Dask scheduler that takes the cases: tcp://HOST:PORT.")] = None,
 ) -> None:
     """Run a study, or list them.
 
@@ -87,18 +88,19 @@ def study(
             console.print(f"{entry.name:<{width}}  {entry.question}{needs}", markup=False)
         return
     chosen = [entry for entry in list_studies() if not entry.needs_data] if every else [find_study(name)]
-    held = [_run(entry, data) for entry in chosen]
+    held = [_run(entry, data, scheduler) for entry in chosen]
     if not all(held):
         raise typer.Exit(FAILURE)
 
 
-def _run(found, data: Path | None) -> bool:
+def _run(found, data: Path | None, scheduler: str | None) -> bool:
     """Run one study, print what it found, and say whether its checks hold."""
     from workbench.study.catalogue import run_study
     from workbench.study.outcome import Outcome
 
     root = found.path.resolve().parent.parent
     with _progress() as progress:
+        cases = progress.add_task("cases", total=1.0, visible=False)
 
         def track(iterable, what):
             yield from progress.track(iterable, description=what, total=len(iterable))
@@ -109,6 +111,9 @@ def _run(found, data: Path | None) -> bool:
             figures_folder=root / "figures",
             on_say=lambda text: console.print(f"  {text}", markup=False),
             on_track=track,
+            on_report=lambda text, share: progress.update(cases, description=text, completed=share, visible=True),
+            cache=root / "out" / "cache",
+            scheduler=scheduler,
         )
         console.print(found.question, style="bold", markup=False)
         result, page = run_study(found, data, outcome, root)
@@ -116,10 +121,16 @@ def _run(found, data: Path | None) -> bool:
     console.print(f"  {len(outcome.checks) - len(failed)} of {len(outcome.checks)} checks hold")
     for check in failed:
         console.print(f"  does not hold: {check['name']}: {check['value']} against {check['limit']}", markup=False)
+    broken = {name: found.failed for name, found in outcome.runs.items() if found.failed}
+    for name, results in broken.items():
+        console.print(f"  {len(results)} of {len(outcome.runs[name])} {name} failed; the first:", markup=False)
+        console.print(f"    {dict(results[0].parameters)}: {results[0].error}", markup=False)
+    for name in outcome.runs:
+        console.print(f"  table   {_short(root / 'out' / f'{found.name}-{name}.csv')}", markup=False)
     for _, path, caption in outcome.figures:
         console.print(f"  figure  {_short(path)}  {caption}", markup=False)
     console.print(f"  results {_short(result)}\n  page    {_short(page)}", markup=False)
-    return not failed
+    return not failed and not broken
 
 
 @app.command()

@@ -5,12 +5,9 @@ import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
 
+from workbench.study.cases import StudyError
 from workbench.study.outcome import Outcome
 from workbench.study.page import study_page
-
-
-class StudyError(ValueError):
-    """A study that is not there, or lacks what it needs."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,10 @@ def find_study(name: str) -> StudyFile:
 
 
 def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
-    """Run a study; write its JSON (studies/results) and its page (out); return both paths.
+    """Run a study; write its JSON (studies/results), its page and the tables of its runs (out).
+
+    Returns:
+        The paths of the JSON and of the page.
 
     Raises:
         StudyError: data that are needed and not given, or not there.
@@ -93,4 +93,5 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.study(outcome, data)
+    outcome.write_runs(root / "out")
     return outcome.write(study.path.parent / "results"), study_page(outcome, root / "out")

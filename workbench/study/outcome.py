@@ -1,14 +1,15 @@
 """What a study found: lines, tables, checks and figures, kept as it goes and written as JSON and a page."""
 
 import json
-import platform
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+
+from workbench.study.results import Results
+from workbench.study.runner import CACHE, run
 
 DIGITS = 10
 
@@ -21,7 +22,9 @@ class Outcome:
         name: of the study.
         title: the question it answers.
         figures_folder: where figures are saved.
-        on_say, on_track: told each line, and each iterable to show progress for.
+        on_say, on_track, on_report: told each line, each iterable to show progress for, and how far a run is.
+        cache: folder where results of cases are kept.
+        scheduler: address of a Dask scheduler that takes the cases of every run; None for processes here.
     """
 
     name: str
@@ -29,10 +32,14 @@ class Outcome:
     figures_folder: Path = Path("figures")
     on_say: object = None
     on_track: object = None
+    on_report: Callable[[str, float], None] | None = None
+    cache: Path = CACHE
+    scheduler: str | None = None
     lines: list[str] = field(default_factory=list)
     tables: dict = field(default_factory=dict)
     checks: list[dict] = field(default_factory=list)
     figures: list[tuple[str, Path, str]] = field(default_factory=list)
+    runs: dict[str, Results] = field(default_factory=dict)
 
     def say(self, text: str) -> None:
         """A line of what was found."""
@@ -62,6 +69,12 @@ class Outcome:
         """The same iterable, with its progress shown."""
         return iter(iterable) if self.on_track is None else self.on_track(iterable, what)
 
+    def run(self, cases: Iterable[Mapping], function: Callable, name: str = "cases", **options) -> Results:
+        """The function at every case, as `study.run` does it; the table is kept under its name."""
+        options = {"cache": self.cache, "scheduler": self.scheduler, "report": self.on_report, **options}
+        self.runs[name] = run(cases, function, **options)
+        return self.runs[name]
+
     @property
     def holds(self) -> bool:
         return all(check["holds"] for check in self.checks)
@@ -77,6 +90,10 @@ class Outcome:
         path.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         return path
 
+    def write_runs(self, folder: Path) -> list[Path]:
+        """Write the table of each run as folder/STUDY-name.csv."""
+        return [found.write(folder / f"{self.name}-{name}.csv") for name, found in self.runs.items()]
+
 
 def plain(value):
     """Numbers to ten digits, arrays to lists, keys to text: what JSON holds, the same from run to run."""
@@ -91,15 +108,3 @@ def plain(value):
     if isinstance(value, float | np.floating):
         return float(f"{value:.{DIGITS}g}") if np.isfinite(value) else None
     return value
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    names = ("modal-workbench", "numpy", "scipy", "control", "casadi", "numba")
-    found = {"python": platform.python_version()}
-    for name in names:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from jinja2 import Environment
 
-from workbench.study.outcome import Outcome, versions
+from workbench.study.outcome import Outcome
+from workbench.study.versions import versions
 
 TEMPLATE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">

@@ -1,0 +1,136 @@
+"""A function is another one exactly when its result could be."""
+
+import functools
+import importlib.util
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from workbench.structure.member import Beam
+from workbench.study.cases import StudyError
+from workbench.study.fingerprint import fingerprint
+
+SOURCE = """
+import numpy as np
+from dataclasses import dataclass, field
+
+SCALE = 2.0
+
+@dataclass(frozen=True)
+class Box:
+    size: float = 3.0
+    names: list = field(default_factory=list)
+
+    def volume(self):
+        return self.size**3 * SCALE
+
+def inner(x):
+    return np.sin(x) + Box().volume()
+
+def unused(x):
+    return 1
+
+def function(x, power=2):
+    '''Says something.'''
+    # why
+    return {"y": [inner(v) ** power for v in (x, 1.0)], "kind": x in {"a", "b", "c"}}
+"""
+
+
+def loaded(tmp_path, source, name="mine"):
+    path = tmp_path / f"{name}.py"
+    path.write_text(source)
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module.function
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "same"),
+    [
+        ("", "", True),
+        ("# why", "# because\n    # of this", True),
+        ("return 1", "return 2", True),
+        ("return np.sin(x) +", "return np.cos(x) +", False),
+        ("SCALE = 2.0", "SCALE = 2.5", False),
+        ("SCALE = 2.0", "SCALE = 2", False),
+        ("size: float = 3.0", "size: float = 4.0", False),
+        ("default_factory=list", "default_factory=dict", False),
+        ("self.size**3", "self.size**2", False),
+        ("power=2", "power=3", False),
+        ("(x, 1.0)", "(x, 1.5)", False),
+        ("import numpy as np", "import math as np", False),
+    ],
+)
+def test_it_follows_what_the_function_reaches(tmp_path, old, new, same):
+    first = fingerprint(loaded(tmp_path, SOURCE))
+    assert (fingerprint(loaded(tmp_path, SOURCE.replace(old, new))) == first) is same
+
+
+def test_it_follows_the_users_own_modules(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "helpers_of_mine.py").write_text("def help(x):\n    return x\n")
+    for source in (
+        "import helpers_of_mine\ndef function(x):\n    return helpers_of_mine.help(x)\n",
+        "def function(x):\n    from helpers_of_mine import help\n    return help(x)\n",
+    ):
+        prints = []
+        for body in ("return x", "return 2 * x"):
+            (tmp_path / "helpers_of_mine.py").write_text(f"def help(x):\n    {body}\n")
+            sys.modules.pop("helpers_of_mine", None)
+            prints.append(fingerprint(loaded(tmp_path, source)))
+        assert prints[0] != prints[1]
+
+
+def test_it_follows_closures_parts_and_methods():
+    def outer(held):
+        return lambda x: x * held
+
+    assert fingerprint(outer(1.0)) == fingerprint(outer(1.0)) != fingerprint(outer(2.0))
+    assert fingerprint(outer(np.ones(3))) != fingerprint(outer(np.ones((3, 1))))
+    assert fingerprint(outer({"a": 1})) != fingerprint(outer({"a": 2}))
+    plain = {"mass_per_length": 1.0, "bending_stiffness": 1.0, "left": "hinged", "right": "hinged"}
+    beams = [Beam(length=length, **plain) for length in (1.0, 2.0, 1.0)]
+    prints = [fingerprint(outer(beam)) for beam in beams]
+    assert prints[0] == prints[2] != prints[1]
+    modes = [beam.modes(3).select([0, 1]) for beam in beams]
+    prints = [fingerprint(outer(m)) for m in modes]
+    assert prints[0] == prints[2] != prints[1]
+    assert fingerprint(functools.partial(outer, held=1)) != fingerprint(functools.partial(outer, held=2))
+    assert fingerprint(functools.lru_cache(outer(1))) != fingerprint(functools.lru_cache(outer(2)))
+
+
+def test_it_is_the_same_in_another_process(tmp_path):
+    mine = fingerprint(loaded(tmp_path, SOURCE))
+    script = (
+        "import sys, importlib.util as u; s = u.spec_from_file_location('mine', sys.argv[1]);"
+        "m = u.module_from_spec(s); sys.modules['mine'] = m; s.loader.exec_module(m);"
+        "from workbench.study.fingerprint import fingerprint; print(fingerprint(m.function))"
+    )
+    told = subprocess.run([sys.executable, "-c", script, tmp_path / "mine.py"], capture_output=True, text=True)
+    assert told.stdout.strip() == mine, told.stderr
+
+
+def test_what_may_differ_from_run_to_run_is_refused(tmp_path):
+    generator = np.random.default_rng(0)
+    with pytest.raises(StudyError, match=r"generator, seen by .* is a random generator.*parameter `seed`"):
+        fingerprint(lambda x: generator.normal())
+    with open(tmp_path / "file", "w") as file, pytest.raises(StudyError, match=r"variable file, .* a TextIOWrapper"):
+        fingerprint(lambda x: file.write(x))
+
+
+def test_it_knows_its_own_source(monkeypatch):
+    def function(x):
+        return Beam
+
+    from workbench.study import versions
+
+    first = fingerprint(function)
+    versions.versions.cache_clear()
+    monkeypatch.setattr(versions, "own_source", lambda: "edited")
+    assert fingerprint(function) != first
+    versions.versions.cache_clear()

@@ -1,0 +1,83 @@
+"""Results on disk, one JSON file a case: whole or not there, and never a pickle."""
+
+import base64
+import hashlib
+import json
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+ARRAY, COMPLEX = "__array__", "__complex__"
+KINDS = "biufc"  # of arrays: booleans, integers, floats, complex numbers
+
+
+def encoded(value, where: str = "the result"):
+    """A result as JSON holds it, arrays bit for bit.
+
+    Raises:
+        TypeError: naming what is neither number, text, list, dict nor array.
+    """
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, np.generic):
+        return encoded(value.item(), where)
+    if isinstance(value, float):
+        return float(value)
+    if isinstance(value, complex):
+        return {COMPLEX: [value.real, value.imag]}
+    if isinstance(value, np.ndarray) and value.dtype.kind in KINDS:
+        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        text = base64.b64encode(little.tobytes()).decode()
+        return {ARRAY: text, "dtype": little.dtype.str, "shape": list(value.shape)}
+    if isinstance(value, list | tuple):
+        return [encoded(item, where) for item in value]
+    if isinstance(value, dict) and all(isinstance(name, str) for name in value):
+        return {name: encoded(item, f"{where}[{name!r}]") for name, item in value.items()}
+    raise TypeError(f"{where} is a {type(value).__name__}; return numbers, texts, arrays, lists and dicts of them")
+
+
+def decoded(value):
+    """What `encoded` was given; tuples come back as lists."""
+    if isinstance(value, list):
+        return [decoded(item) for item in value]
+    if not isinstance(value, dict):
+        return value
+    if COMPLEX in value:
+        return complex(*value[COMPLEX])
+    if ARRAY in value:
+        flat = np.frombuffer(base64.b64decode(value[ARRAY]), np.dtype(value["dtype"]))
+        return flat.reshape(value["shape"]).copy()
+    return {name: decoded(item) for name, item in value.items()}
+
+
+def write_record(path: Path, record: dict) -> None:
+    """Put a record in its place at once: a reader, or a run that resumes, sees all of it or nothing."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = _text(record)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump({"sha256": _sum(text), "record": text}, file)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def read_record(path: Path) -> dict | None:
+    """A record; None where there is none, or where the disk has lost part of it."""
+    try:
+        outer = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(outer["record"]) if outer["sha256"] == _sum(outer["record"]) else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _text(record: dict) -> str:
+    return json.dumps(record, separators=(",", ":"))
+
+
+def _sum(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

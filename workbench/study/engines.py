@@ -1,0 +1,182 @@
+"""Where cases are worked: in this process, in processes of this machine, or on a Dask cluster."""
+
+import functools
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cloudpickle
+from joblib import Parallel, delayed, parallel_config
+from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+from workbench.study.cache import encoded, write_record
+from workbench.study.cases import StudyError
+from workbench.study.fingerprint import is_own
+from workbench.study.versions import own_source
+
+DIED = "its process died: out of memory, killed, or crashed in compiled code"
+CONNECT_SECONDS = 10.0
+
+
+@dataclass(frozen=True)
+class Job:
+    """One case to be worked.
+
+    Attributes:
+        key: of its result.
+        arguments: of the function.
+        file: where a result is put by the process that found it; None where that is left to this one.
+    """
+
+    key: str
+    arguments: Mapping
+    file: Path | None = None
+
+
+def work(function: Callable, job: Job, running: Path | None = None) -> dict:
+    """Work one case; an error is part of the record, never raised."""
+    if running is not None:
+        (running / job.key).touch()
+    start = time.perf_counter()
+    record = {"result": None, "error": None, "trace": None, "workbench": own_source()}
+    try:
+        found = function(**job.arguments)
+        record["result"] = encoded(found if isinstance(found, dict) else {"result": found})
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
+        record["error"] = f"{type(error).__name__}: {error}"
+        record["trace"] = traceback.format_exc()
+    record["seconds"] = time.perf_counter() - start
+    if job.file is not None and record["error"] is None:
+        write_record(job.file, record)
+    if running is not None:
+        (running / job.key).unlink(missing_ok=True)
+    return record
+
+
+def packed(function: Callable) -> bytes:
+    """A function on its way to another process of this run, with the user's own modules that it needs."""
+    own = [
+        module
+        for name, module in list(sys.modules.items())
+        if name not in ("__main__", "__mp_main__")
+        and getattr(module, "__file__", None)
+        and getattr(module, "__name__", None) == name
+        and is_own(module.__file__, name)
+    ]
+    for module in own:
+        cloudpickle.register_pickle_by_value(module)
+    try:
+        return cloudpickle.dumps(function)
+    finally:
+        for module in own:
+            cloudpickle.unregister_pickle_by_value(module)
+
+
+@functools.lru_cache(maxsize=4)
+def unpacked(function: bytes) -> Callable:
+    """The function of `packed`, once a process."""
+    return cloudpickle.loads(function)
+
+
+def here(function: Callable, jobs: list[Job]) -> Iterator[tuple[str, dict]]:
+    """One after the other, in this process."""
+    for job in jobs:
+        yield job.key, work(function, job)
+
+
+def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tuple[str, dict]]:
+    """In processes of this machine, in the order in which they end.
+
+    A case whose process dies takes the others' processes with it. Those that were running then are worked again, each
+    on its own; what dies alone has only itself to blame.
+    """
+    waiting, function = {job.key: job for job in jobs}, packed(function)
+    with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
+        running = Path(folder)
+        while waiting:
+            try:
+                for key, record in _parallel(function, waiting.values(), workers, running):
+                    del waiting[key]
+                    yield key, record
+            except TerminatedWorkerError:
+                suspects = [waiting[path.name] for path in running.iterdir() if path.name in waiting]
+                for path in list(running.iterdir()):
+                    path.unlink()
+                for job in suspects:
+                    del waiting[job.key]
+                    yield job.key, _alone(function, job, running)
+
+
+def _parallel(function: bytes, jobs, workers: int, running: Path) -> Iterator[tuple[str, dict]]:
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        pool = Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
+        yield from pool(delayed(_keyed)(function, job, running) for job in list(jobs))
+
+
+def _keyed(function: bytes, job: Job, running: Path) -> tuple[str, dict]:
+    return job.key, work(unpacked(function), job, running)
+
+
+def _alone(function: bytes, job: Job, running: Path) -> dict:
+    start = time.perf_counter()
+    try:
+        # two processes, of which one idles: with one, joblib would work the case in this very process
+        [(_, record)] = _parallel(function, [job], 2, running)
+    except TerminatedWorkerError:
+        return {"result": None, "error": f"died: {DIED}", "trace": None, "seconds": time.perf_counter() - start}
+    return record
+
+
+def cluster(function: Callable, jobs: list[Job], address: str) -> Iterator[tuple[str, dict]]:
+    """On the workers of a Dask scheduler, in the order in which they end.
+
+    Dask works a case again whose worker is lost, and gives it up after the scheduler's `allowed-failures`.
+
+    Raises:
+        StudyError: Dask is not installed, no scheduler answers, it has no worker, or a worker runs another workbench.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise StudyError(
+            "a cluster needs Dask, which is not installed: pip install 'modal-workbench[cluster]'"
+        ) from None
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise StudyError(
+            f"no Dask scheduler answers at {address} ({error}); start one with `dask scheduler` and its workers with"
+            " `dask worker ADDRESS`"
+        ) from error
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise StudyError(f"the Dask scheduler at {address} has no worker; start one with `dask worker {address}`")
+        keys = [f"workbench-{job.key}" for job in jobs]
+        futures = client.map(_on_worker, jobs, function=packed(function), key=keys, pure=False)
+        key_of = dict(zip(keys, (job.key for job in jobs)))
+        for future in as_completed(futures, loop=client.loop):
+            yield key_of[future.key], _gathered(future)
+            future.release()
+
+
+def _on_worker(job: Job, function: bytes) -> dict:
+    return work(unpacked(function), job)
+
+
+def _gathered(future) -> dict:
+    try:
+        record = future.result()
+    except Exception as error:
+        return {"result": None, "error": f"{type(error).__name__}: {error}", "trace": None, "seconds": 0.0}
+    if record["workbench"] != own_source():
+        raise StudyError(
+            f"a worker of the cluster runs another modal-workbench ({record['workbench']}, here {own_source()}), so its"
+            " results could differ: install the same there"
+        )
+    return record

@@ -1,0 +1,226 @@
+"""What a function's result depends on besides its arguments: its code, what that code reaches, and versions."""
+
+import builtins
+import dis
+import functools
+import hashlib
+import sys
+import sysconfig
+from importlib import metadata, util
+from pathlib import Path
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+
+import numpy as np
+
+from workbench.study.cases import StudyError
+from workbench.study.versions import PACKAGE, own_source, versions
+
+LIBRARIES = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range, slice)
+OF_CLASS = {"__dict__", "__weakref__", "__module__", "__doc__", "__annotations__", "__firstlineno__"}
+
+
+def fingerprint(function) -> str:
+    """A digest that changes whenever the function's result could: 40 hex digits.
+
+    Hashed are its byte code (so that comments do not count), defaults, what its closure holds, the globals it reads,
+    and so on through the user's own functions, classes and modules; installed libraries count by version, this one by
+    its source.
+
+    Raises:
+        StudyError: it depends on something that may differ from run to run, such as a random generator or a file.
+    """
+    walk = _Walk()
+    walk.visit(function, getattr(function, "__qualname__", repr(function)))
+    walk.visit(versions(), "versions")
+    return walk.digest.hexdigest()[:40]
+
+
+class _Walk:
+    """Visits what a function reaches, each thing once, and hashes it on the way."""
+
+    def __init__(self):
+        self.digest = hashlib.sha256()
+        self.seen: dict[int, tuple] = {}  # the things are kept, so that no identity is given twice
+
+    def add(self, *words) -> None:
+        for word in words:
+            word = word if isinstance(word, bytes) else str(word).encode()
+            self.digest.update(f"{len(word)}:".encode() + word)
+
+    def visit(self, value, where: str) -> None:
+        if isinstance(value, PLAIN) and type(value).__module__ == "builtins":
+            return self.add(type(value).__name__, repr(value))
+        if id(value) in self.seen:
+            return self.add("again", self.seen[id(value)][0])
+        self.seen[id(value)] = (len(self.seen), value)
+        if isinstance(value, CodeType):
+            return self._code(value, where)
+        if isinstance(value, FunctionType):
+            return self._function(value, where)
+        if isinstance(value, MethodType):
+            return self._each((value.__func__, value.__self__), where)
+        if isinstance(value, functools.partial):
+            return self._each((value.func, value.args, value.keywords), where)
+        if isinstance(value, ModuleType):
+            return self._module(value, where)
+        if isinstance(value, type):
+            return self._class(value, where)
+        if isinstance(value, BuiltinFunctionType):
+            return self.add("builtin", value.__module__, value.__qualname__)
+        if isinstance(value, np.ndarray) and value.dtype != object:
+            return self.add(value.dtype.str, value.shape, value.tobytes())
+        if isinstance(value, dict):
+            self.add("dict", len(value))
+            return self._each([part for item in value.items() for part in item], where)
+        if isinstance(value, list | tuple):
+            self.add(type(value).__name__, len(value))
+            return self._each(value, where)
+        if isinstance(value, set | frozenset):
+            return self.add("set", *sorted(map(repr, value)))
+        if callable(getattr(value, "__wrapped__", None)) or callable(getattr(value, "py_func", None)):
+            self.add(type(value).__qualname__)  # a cache or a compiler around a function
+            return self.visit(getattr(value, "__wrapped__", None) or value.py_func, where)
+        return self._state(value, where)
+
+    def _each(self, values, where: str) -> None:
+        for value in values:
+            self.visit(value, where)
+
+    def _function(self, function: FunctionType, where: str) -> None:
+        known = library_of(function.__code__.co_filename, function.__module__)
+        if known:
+            self.add(known, function.__qualname__)
+        else:
+            self.visit(function.__code__, where)
+            self._each((function.__defaults__, function.__kwdefaults__), f"default of {where}")
+            for name in sorted(_globals_read(function.__code__)):
+                if name in function.__globals__:
+                    self.add(name)
+                    self.visit(function.__globals__[name], f"global {name}, read by {where},")
+            for name in sorted(_modules_read(function.__code__)):
+                self._imported(name, where)
+        for name, cell in zip(function.__code__.co_freevars, function.__closure__ or ()):
+            self.add(name)
+            try:
+                content = cell.cell_contents
+            except ValueError:  # a name that is not bound yet
+                continue
+            self.visit(content, f"variable {name}, seen by {where},")
+
+    def _code(self, code: CodeType, where: str) -> None:
+        self.add(code.co_code, code.co_names, code.co_varnames, code.co_freevars, code.co_flags)
+        self._each(code.co_consts, where)
+
+    def _class(self, cls: type, where: str) -> None:
+        module = sys.modules.get(cls.__module__)
+        known = library_of(getattr(module, "__file__", None), cls.__module__) if module else None
+        self.add(known or "class", cls.__qualname__)
+        if known:
+            return
+        self._each(cls.__bases__, where)
+        for name, member in sorted(vars(cls).items()):
+            # what dataclasses write themselves follows from the fields, which are here too
+            if name in OF_CLASS or getattr(getattr(member, "__code__", None), "co_filename", "") == "<string>":
+                continue
+            self.add(name)
+            if isinstance(member, property):
+                self._each((member.fget, member.fset), where)
+            elif isinstance(member, classmethod | staticmethod):
+                self.visit(member.__func__, where)
+            elif name == "__dataclass_fields__":
+                for field in member.values():
+                    factory = field.default_factory
+                    self.add(field.name, field.type, factory if isinstance(factory, type) else "")
+            elif not name.startswith("__") or callable(member):
+                self.visit(member, f"{cls.__qualname__}.{name}")
+
+    def _module(self, module: ModuleType, where: str) -> None:
+        file = getattr(module, "__file__", None)
+        known = library_of(file, module.__name__)
+        self.add("module", known or module.__name__)
+        if known or file is None:
+            return
+        self.add(Path(file).read_bytes())
+        for name, value in sorted(vars(module).items()):
+            source = sys.modules.get(getattr(value, "__module__", None) or "")
+            if isinstance(value, ModuleType):
+                self.visit(value, where)
+            elif source not in (None, module) and isinstance(value, type | FunctionType):
+                self.add(name)
+                self.visit(source, where)
+
+    def _imported(self, name: str, where: str) -> None:
+        if name in sys.modules:
+            return self.visit(sys.modules[name], where)
+        try:
+            found = util.find_spec(name)
+        except (ImportError, ValueError):
+            found = None
+        file = getattr(found, "origin", None)
+        known = library_of(file, name)
+        self.add("module", known or name)
+        if not known and file and Path(file).is_file():
+            self.add(Path(file).read_bytes())
+
+    def _state(self, value, where: str) -> None:
+        """Any other object: its class, and the state that a copy of it would be built from."""
+        if isinstance(value, np.random.Generator | np.random.RandomState):
+            raise StudyError(
+                f"{where} is a random generator, so a case would depend on those before it: give the function a"
+                " parameter `seed` and let it make its own"
+            )
+        try:
+            parts = value.__reduce_ex__(4)
+        except Exception as error:
+            raise StudyError(
+                f"{where} is a {type(value).__name__}, of which nothing tells whether it is the same next time:"
+                " build it inside the function, or run with cache=None"
+            ) from error
+        self.add(type(value).__module__, type(value).__qualname__)
+        if isinstance(parts, str):
+            return self.add(parts)
+        for i, part in enumerate(parts):
+            self.visit(list(part) if i > 2 and part is not None else part, where)
+
+
+def is_own(file: str | None, module: str | None) -> bool:
+    """Whether a module is the user's own: no part of Python, of this package or of an installed library."""
+    top = (module or "").partition(".")[0]
+    if top in sys.stdlib_module_names or top == builtins.__name__:
+        return False
+    return file is None or not (file.startswith(LIBRARIES) or Path(file).is_relative_to(PACKAGE))
+
+
+def library_of(file: str | None, module: str | None) -> str | None:
+    """Name and version of the library that a module belongs to; None for the user's own."""
+    if is_own(file, module):
+        return None
+    top = (module or "").partition(".")[0]
+    if file is not None and Path(file).is_relative_to(PACKAGE):
+        return f"workbench {own_source()}"
+    return top if top in sys.stdlib_module_names else f"{top} {_version(top)}"
+
+
+@functools.cache
+def _version(top: str) -> str:
+    try:
+        return metadata.version(top)
+    except metadata.PackageNotFoundError:  # of a distribution with another name than its module
+        return str(getattr(sys.modules.get(top), "__version__", ""))
+
+
+def _codes(code: CodeType):
+    yield code
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _codes(constant)
+
+
+def _globals_read(code: CodeType) -> set[str]:
+    names = ("LOAD_GLOBAL", "LOAD_NAME")
+    return {i.argval for part in _codes(code) for i in dis.get_instructions(part) if i.opname in names}
+
+
+def _modules_read(code: CodeType) -> set[str]:
+    return {i.argval for part in _codes(code) for i in dis.get_instructions(part) if i.opname == "IMPORT_NAME"}

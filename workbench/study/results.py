@@ -1,0 +1,175 @@
+"""The results of many cases as one table: a row a case, a column a quantity."""
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from workbench.study.cases import StudyError
+from workbench.study.versions import versions
+
+ENDINGS = (".csv", ".parquet", ".json")
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """One case and what came of it.
+
+    Attributes:
+        parameters: of the case.
+        seed: it was worked with; None where the function takes none.
+        values: by name; empty where the case failed.
+        error: what it raised, in a line; None where it did not.
+        trace: of the error, for the developer.
+        seconds: it took.
+    """
+
+    parameters: Mapping
+    seed: int | None
+    values: Mapping
+    error: str | None
+    trace: str | None
+    seconds: float
+
+    def __getitem__(self, name: str):
+        """A value or a parameter by name.
+
+        Raises:
+            KeyError: no such name, or the case failed, and how.
+        """
+        if name in self.values:
+            return self.values[name]
+        if name in self.parameters:
+            return self.parameters[name]
+        if self.error is not None:
+            raise KeyError(f"case {dict(self.parameters)} failed: {self.error}")
+        raise KeyError(f"no value or parameter {name!r}; there are {', '.join((*self.parameters, *self.values))}")
+
+
+@dataclass(frozen=True, eq=False)
+class Results(Sequence):
+    """Results in the order of their cases."""
+
+    every: tuple[Result, ...]
+
+    def __len__(self) -> int:
+        return len(self.every)
+
+    def __getitem__(self, index):
+        return self.every[index]
+
+    def __iter__(self) -> Iterator[Result]:
+        return iter(self.every)
+
+    @property
+    def failed(self) -> tuple[Result, ...]:
+        """Those that raised an error."""
+        return tuple(result for result in self.every if result.error is not None)
+
+    @property
+    def seconds(self) -> float:
+        """Work of all cases together, s."""
+        return sum(result.seconds for result in self.every)
+
+    def rows(self) -> list[dict]:
+        """A dict a case, all with the same names: parameters, values, seed, error, seconds, versions.
+
+        What a dict holds has a column of its own, `outer.inner`; a value that no case of this row has is None.
+
+        Raises:
+            StudyError: a value of the name of a parameter that means something else.
+        """
+        used = ", ".join(f"{name} {version}" for name, version in versions().items())
+        parts = [(_flat(r.parameters), _flat(r.values)) for r in self.every]
+        names = dict.fromkeys(name for part in (0, 1) for pair in parts for name in pair[part])
+        rows = []
+        for result, (parameters, values) in zip(self.every, parts):
+            twice = [n for n in parameters.keys() & values.keys() if not _same(parameters[n], values[n])]
+            if twice:
+                raise StudyError(f"{min(twice)!r} is a parameter and a result of another value; rename the result")
+            row = {name: values.get(name, parameters.get(name)) for name in names}
+            ending = {"error": result.error, "seconds": result.seconds, "versions": used}
+            rows.append({**row, "seed": result.seed, **ending})
+        return rows
+
+    def write(self, path: str | Path) -> Path:
+        """Write the table: .csv, .parquet (with pyarrow) or .json, told by the ending.
+
+        In CSV, lists and arrays are written as JSON, and numbers so that they read back bit for bit.
+
+        Raises:
+            StudyError: another ending, or pyarrow is not installed.
+        """
+        path = Path(path)
+        if path.suffix not in ENDINGS:
+            raise StudyError(f"{path}: a table is written as {', '.join(ENDINGS)}; got {path.suffix or 'no ending'}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        rows = [{name: _plain(value) for name, value in row.items()} for row in self.rows()]
+        if path.suffix == ".parquet":
+            _write_parquet(path, rows)
+        elif path.suffix == ".json":
+            path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        else:
+            path.write_text(_csv(rows), encoding="utf-8", newline="")
+        return path
+
+    def frame(self):
+        """The table as a pandas frame.
+
+        Raises:
+            StudyError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError:
+            raise StudyError("a frame needs pandas: pip install 'modal-workbench[table]'") from None
+        return pd.DataFrame(self.rows())
+
+
+def _flat(values: Mapping, before: str = "") -> dict:
+    flat = {}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{before}{name}."))
+        else:
+            flat[before + name] = value
+    return flat
+
+
+def _same(a, b) -> bool:
+    return json.dumps(_plain(a)) == json.dumps(_plain(b))
+
+
+def _plain(value):
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if isinstance(value, complex):
+        return str(value)
+    return str(value) if isinstance(value, Path) else value
+
+
+def _csv(rows: list[dict]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({n: json.dumps(v) if isinstance(v, list | dict) else v for n, v in r.items()} for r in rows)
+    return text.getvalue()
+
+
+def _write_parquet(path: Path, rows: list[dict]) -> None:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise StudyError("Parquet needs pyarrow: pip install 'modal-workbench[table]', or write .csv") from None
+    try:
+        columns = {name: pa.array([row[name] for row in rows]) for name in rows[0]}
+    except (pa.ArrowInvalid, pa.ArrowTypeError) as error:
+        raise StudyError(f"a column mixes kinds that Parquet keeps apart ({error}); write .csv") from error
+    parquet.write_table(pa.table(columns), path)

@@ -1,0 +1,126 @@
+"""Many cases of a study: each worked once, kept as soon as it is done, and taken up again after any interruption."""
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+
+import joblib
+
+from workbench.study.cache import decoded, read_record, write_record
+from workbench.study.cases import StudyError, checked, key_of, seed_of
+from workbench.study.engines import Job, cluster, here, processes
+from workbench.study.fingerprint import fingerprint
+from workbench.study.results import Result, Results
+
+CACHE = Path("out/cache")
+
+
+def run(
+    cases: Iterable[Mapping],
+    function: Callable,
+    *,
+    cache: str | Path | None = CACHE,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    seed: int = 0,
+    report: Callable[[str, float], None] | None = None,
+) -> Results:
+    """The function at every case, in the order of the cases: `for result in study.run(cases, function): ...`.
+
+    A result is kept under a name made of the function (its code and all that reaches), the versions of what computes,
+    the case and its seed, so that a second run works only what is new, changed, failed, or was not finished. What a
+    case raises is kept beside the results of the others. Cases that are equal are worked once.
+
+    Args:
+        cases: dicts of plain parameters; `grid` and `samples` make them.
+        function: of a case's parameters by name; returns a dict of numbers, texts, lists and arrays, or one of these.
+            Where it has a parameter `seed` that the case does not give, it gets a seed of the case's own.
+        cache: folder where results are kept; None keeps none.
+        workers: processes; one for each core unless given. With one, cases are worked in this process.
+        scheduler: address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers take the cases instead.
+        seed: root of the seeds.
+        report: told what is done, and the share of it, after each case.
+
+    Raises:
+        StudyError: no cases; a case or function whose result could not be told from another's; a cluster that does
+            not answer.
+    """
+    cases = [checked(case, number) for number, case in enumerate(cases, 1)]
+    if not cases:
+        raise StudyError("there are no cases to run")
+    if workers is not None and workers < 1:
+        raise StudyError(f"workers must be at least 1; got {workers}")
+    seeds = _seeds(cases, function, seed)
+    print_ = fingerprint(function) if cache is not None else ""
+    keys = [key_of(case, print_, s) for case, s in zip(cases, seeds)]
+    folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{print_[:12]}"
+    records = {} if folder is None else _kept(folder, keys)
+    jobs = {
+        key: Job(key, _arguments(case, s), None if folder is None or scheduler else _file(folder, key))
+        for key, case, s in zip(keys, cases, seeds)
+        if key not in records
+    }
+    _tell(report, len(records), len(set(keys)))
+    for key, record in _worked(function, list(jobs.values()), workers, scheduler):
+        records[key] = record
+        if folder is not None and scheduler and record["error"] is None:
+            write_record(_file(folder, key), record)
+        _tell(report, len(records), len(set(keys)))
+    return Results(
+        tuple(
+            Result(case, _seed_shown(case, s), _values(records[key]), *_ending(records[key]))
+            for case, s, key in zip(cases, seeds, keys)
+        )
+    )
+
+
+def _worked(function, jobs, workers, scheduler):
+    if not jobs:
+        return iter(())
+    if scheduler:
+        return cluster(function, jobs, scheduler)
+    workers = min(workers or joblib.cpu_count(), len(jobs))
+    return here(function, jobs) if workers == 1 else processes(function, jobs, workers)
+
+
+def _seeds(cases, function, root: int) -> list[int | None]:
+    try:
+        wants = "seed" in inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        wants = False
+    return [seed_of(case, root) if wants and "seed" not in case else None for case in cases]
+
+
+def _arguments(case: dict, seed: int | None) -> dict:
+    return case if seed is None else {**case, "seed": seed}
+
+
+def _seed_shown(case: dict, seed: int | None):
+    return case.get("seed") if seed is None else seed
+
+
+def _values(record: dict) -> dict:
+    return decoded(record["result"] or {})
+
+
+def _ending(record: dict) -> tuple:
+    return record["error"], record["trace"], record["seconds"]
+
+
+def _kept(folder: Path, keys: list[str]) -> dict[str, dict]:
+    found = {key: read_record(_file(folder, key)) for key in set(keys)}
+    return {key: record for key, record in found.items() if record is not None}
+
+
+def _file(folder: Path, key: str) -> Path:
+    return folder / f"{key}.json"
+
+
+def _name(function) -> str:
+    name = getattr(function, "__name__", type(function).__name__)
+    return "".join(c if c.isalnum() or c == "_" else "-" for c in name)
+
+
+def _tell(report, done: int, of: int) -> None:
+    if report is not None:
+        report(f"{done} of {of} cases", done / of)
