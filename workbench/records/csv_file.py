@@ -2,47 +2,50 @@
 
 import csv
 import json
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
 from workbench.records.file_error import RecordFileError
+from workbench.records.limits import check_counts
+from workbench.records.named_arrays import Signals
 
 MARK = "# record "
 TIME_NAMES = ("t", "time", "time [s]", "t [s]", "time_s")
+LONGEST_LINE = 1_000_000  # characters
 
 
-def read(path: Path):
+def read(path: Path) -> Signals:
     """(time or None, signals by name, header text or None)."""
-    header_text = None
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        lines = []
-        for number, line in enumerate(file, start=1):
-            if line.startswith(MARK):
-                header_text = line[len(MARK) :]
-            elif line.strip() and not line.startswith("#"):
-                lines.append((number, line))
-    if not lines:
-        raise RecordFileError(f"{path} holds no rows")
-    delimiter = "," if "," in lines[0][1] else ";" if ";" in lines[0][1] else "\t" if "\t" in lines[0][1] else " "
-    rows = list(csv.reader((line for _, line in lines), delimiter=delimiter, skipinitialspace=True))
-    rows = [[cell for cell in row if cell] if delimiter == " " else row for row in rows]
-    names = [name.strip() for name in rows[0]]
-    if all(_is_number(name) for name in names):
-        raise RecordFileError(f"{path}, row {lines[0][0]}: a header line of names is needed before the numbers")
-    if len(set(names)) != len(names) or not all(names):
-        raise RecordFileError(f"{path}: the names of the header must differ and not be empty; got {names}")
-    values = np.empty((len(rows) - 1, len(names)))
-    for i, row in enumerate(rows[1:]):
-        number = lines[i + 1][0]
-        if len(row) != len(names):
-            raise RecordFileError(f"{path}, row {number} has {len(row)} fields; the header has {len(names)}")
-        for j, cell in enumerate(row):
+    header_text, names, cells = None, [], array("d")
+    delimiter = ","
+    for number, line in _lines(path):
+        if line.startswith(MARK):
+            header_text = line[len(MARK) :]
+        elif not line.strip() or line.startswith("#"):
+            continue
+        elif not names:
+            delimiter = next((d for d in ",;\t" if d in line), " ")
+            names = _names(path, number, _fields(line, delimiter))
+        else:
+            row = _fields(line, delimiter)
+            if len(row) != len(names):
+                raise RecordFileError(f"{path}, row {number} has {len(row)} fields; the header has {len(names)}")
             try:
-                values[i, j] = float(cell)
+                cells.extend(map(_number, row))
             except ValueError:
-                raise RecordFileError(f"{path}, channel {names[j]!r}, row {number}: {cell!r} is not a number") from None
-    signals = dict(zip(names, values.T, strict=True))
+                name, cell = next((n, c) for n, c in zip(names, row) if not _is_number(c))
+                text = cell if len(cell) < 40 else f"{cell[:40]}..."
+                raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number") from None
+            if number % 1000 == 0:
+                check_counts(path, len(names), len(cells))
+    if not names:
+        raise RecordFileError(f"{path} holds no rows")
+    check_counts(path, len(names), len(cells))
+    columns = np.frombuffer(cells, float).reshape(-1, len(names)).T if cells else np.empty((len(names), 0))
+    signals = dict(zip(names, columns))
     timed = names[0].lower() in TIME_NAMES
     return (signals.pop(names[0]) if timed else None), signals, header_text
 
@@ -56,9 +59,39 @@ def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
         writer.writerows(zip(*(map(repr, map(float, column)) for column in (time, *signals.values())), strict=True))
 
 
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        number = 0
+        while line := file.readline(LONGEST_LINE):
+            number += 1
+            if len(line) == LONGEST_LINE:
+                raise RecordFileError(f"{path}, row {number} has more than {LONGEST_LINE} characters: is it a table?")
+            yield number, line
+
+
+def _fields(line: str, delimiter: str) -> list[str]:
+    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
+    return [cell for cell in row if cell] if delimiter == " " else row
+
+
+def _names(path: Path, number: int, row: list[str]) -> list[str]:
+    names = [name.strip() for name in row]
+    if all(_is_number(name) for name in names):
+        raise RecordFileError(f"{path}, row {number}: a header line of names is needed before the numbers")
+    if len(set(names)) != len(names) or not all(names):
+        raise RecordFileError(f"{path}: the names of the header must differ and not be empty; got {names}")
+    return names
+
+
+def _number(text: str) -> float:
+    if "_" in text:  # Python's, and nobody else's
+        raise ValueError
+    return float(text)
+
+
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        _number(text)
     except ValueError:
         return False
     return True

@@ -6,22 +6,20 @@ from pathlib import Path
 import numpy as np
 from scipy.io import loadmat, savemat
 
-from workbench.records.npz_file import HEADER, named_signals
+from workbench.records.confined import load_confined
+from workbench.records.named_arrays import HEADER, Signals, numbered, signals_of
 
 
-def read(path: Path):
+def read(path: Path) -> Signals:
     """(time or None, signals by name, header text or None)."""
-    arrays = {name: values for name, values in loadmat(path).items() if not name.startswith("__")}
-    header = None
-    if HEADER in arrays:
-        header = json.loads(str(np.ravel(arrays.pop(HEADER))[0]))
-        # names in a MAT file are identifiers, so the channels' own names travel in the header
-        keys = [f"{c['kind']}:{c['name']}" for c in header["channels"]]
-        arrays = {("t" if name == "t" else keys[int(name.removeprefix("channel_"))]): v for name, v in arrays.items()}
-    return *named_signals(path, arrays), header
+    return signals_of(path, load_confined(__name__, path))
+
+
+def load(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of the file; to be called in a process of its own."""
+    return {name: values for name, values in loadmat(path, appendmat=False).items() if not name.startswith("__")}
 
 
 def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
-    """Write vectors channel_0, channel_1, ... and the header as text."""
-    numbered = {f"channel_{i}": values for i, values in enumerate(signals.values())}
-    savemat(path, {"t": time, **numbered, HEADER: json.dumps(header)})
+    """Write numbered vectors and the header as text: names in a MAT file are identifiers."""
+    savemat(path, {"t": time, **numbered(signals), HEADER: json.dumps(header)}, appendmat=False)

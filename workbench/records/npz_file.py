@@ -1,45 +1,43 @@
 """NPZ: one array a signal, `t` or `time` for the instants; never a pickle."""
 
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
 
-from workbench.records.file_error import RecordFileError
+from workbench.records.file_error import RecordFileError, unreadable
+from workbench.records.limits import check_counts
+from workbench.records.named_arrays import HEADER, Signals, signals_of
 
-HEADER = "record_header"
 
-
-def read(path: Path):
+def read(path: Path) -> Signals:
     """(time or None, signals by name, header text or None)."""
-    with np.load(path, allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    header = str(arrays.pop(HEADER)) if HEADER in arrays else None
-    return *named_signals(path, arrays), header
+    return signals_of(path, load_arrays(path))
 
 
-def named_signals(path: Path, arrays: dict) -> tuple[np.ndarray | None, dict]:
-    """Time and signals out of named arrays: vectors as they are, scalars and texts left out."""
-    time = None
-    signals = {}
-    for name, values in arrays.items():
-        values = np.asarray(values)
-        if values.dtype.kind not in "fiub":
-            if values.dtype.kind == "c":
-                raise RecordFileError(f"{path}, channel {name!r} is complex: is it a transfer function?")
-            continue
-        flat = values.reshape(-1) if values.ndim < 2 or 1 in values.shape else None
-        if flat is None:
-            raise RecordFileError(f"{path}, channel {name!r} has shape {values.shape}; one row of samples is needed")
-        if flat.size == 1:
-            continue
-        if name in ("t", "time") and time is None:
-            time = flat.astype(float)
-        else:
-            signals[name] = flat.astype(float)
-    return time, signals
+def load_arrays(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of an archive, after a look at how large they are.
+
+    Raises:
+        RecordFileError: no archive, a damaged one, a pickle, or more than is read.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+        names = [member.filename for member in members]
+        if len(set(names)) != len(names):
+            raise RecordFileError(f"{path} is damaged: it holds an array twice")
+        check_counts(path, len(members), sum(member.file_size for member in members) // 8)
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: np.asarray(arrays[name]) for name in arrays.files}
+    except RecordFileError:
+        raise
+    except Exception as error:  # damaged archives fail in many ways
+        raise unreadable(path, error) from error
 
 
 def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
     """Write all arrays and the header as text."""
-    np.savez(path, t=time, **signals, **{HEADER: np.array(json.dumps(header))})
+    with path.open("wb") as file:
+        np.savez(file, t=time, **signals, **{HEADER: np.array(json.dumps(header))})

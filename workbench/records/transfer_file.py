@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.io import loadmat
 
+from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.transfer import impulse_record
@@ -34,20 +34,17 @@ def read_transfer(
     path = Path(path)
     if not path.is_file():
         raise RecordFileError(f"{path}: there is no such file")
-    try:
-        arrays = loadmat(path, variable_names=[matrix, sample_rate])
-    except Exception as error:  # damaged files fail in many ways inside the reader
-        raise RecordFileError(f"{path} cannot be read as a MAT file: {error}") from error
+    arrays = load_confined("workbench.records.mat_file", path)
     for name in (matrix, sample_rate):
         if name not in arrays:
             raise RecordFileError(f"{path} holds no array {name!r}; name the right one by `matrix` or `sample_rate`")
     transfer, rate = arrays[matrix], np.ravel(arrays[sample_rate])
-    if transfer.ndim != 2 or transfer.shape[1] != len(positions):
+    if transfer.ndim != 2 or transfer.shape[1] != len(positions) or transfer.dtype.kind not in "fiuc":
         raise RecordFileError(
             f"{path}, {matrix}: {len(positions)} positions need (n_frequencies, {len(positions)}) columns; got"
             f" {transfer.shape}"
         )
-    if rate.size != 1 or not rate[0] > 0:
+    if rate.size != 1 or rate.dtype.kind not in "fiu" or not 0 < rate[0] < np.inf:
         raise RecordFileError(f"{path}, {sample_rate}: the sample rate is one positive number; got {rate[:3]}")
     channels = tuple(Channel(f"point {i + 1}", quantity, at=float(x)) for i, x in enumerate(positions))
     return impulse_record(transfer.T, sample_rate_hz=float(rate[0]), channels=channels, name=path.stem)

@@ -6,65 +6,74 @@ from pathlib import Path
 import numpy as np
 import pyuff
 
+from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
+from workbench.records.named_arrays import HEADER, Signals, signals_of
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}
 QUANTITIES = {code: name for name, code in TYPES.items()}
 LINE = 80
+MARK = b"    -1"
+OURS = ('{"kind"', '"kind":', '"name":')
 
 
-def read(path: Path):
+def read(path: Path) -> Signals:
     """(time or None, signals by name, header or None)."""
+    return signals_of(path, load_confined(__name__, path))
+
+
+def load(path: Path) -> dict[str, np.ndarray]:
+    """The signals of all data sets 58, their instants and their header; to be called in a process of its own."""
+    if sum(line.rstrip() == MARK for line in path.read_bytes().splitlines()) % 2:
+        raise RecordFileError(f"{path} is damaged: its last data set has no end")
     sets = pyuff.UFF(str(path)).read_sets()
     sets = sets if isinstance(sets, list) else [sets]
     sets = [s for s in sets if s.get("type") == 58]
     if not sets:
         raise RecordFileError(f"{path} holds no data set 58")
-    signals, channels, time = {}, [], None
+    arrays: dict[str, np.ndarray] = {}
+    channels, record = [], None
     for number, entry in enumerate(sets, start=1):
+        where = f"{path}, data set {number}"
         data = np.asarray(entry["data"])
         if np.iscomplexobj(data):
-            raise RecordFileError(f"{path}, data set {number} is complex: is it a transfer function?")
-        facts = _facts(entry)
-        name = facts.get("name") or f"node {entry['rsp_node']} direction {entry['rsp_dir']}"
-        facts = {
-            "kind": "output",
-            "quantity": QUANTITIES.get(entry.get("ordinate_spec_data_type"), ""),
-            **facts,
-            "name": name,
-        }
-        key = f"{facts['kind']}:{name}"
-        if key in signals:
-            raise RecordFileError(f"{path}, data set {number}: a second channel is called {name!r}")
-        here = np.asarray(entry["x"], float)
-        if time is not None and (
-            here.size != time.size or np.abs(here - time).max() > 1e-6 * max(np.abs(time).max(), 1e-300)
-        ):
-            raise RecordFileError(f"{path}, data set {number} ({name}) has other sample instants than the first")
-        time = here if time is None else time
-        signals[key] = data.astype(float)
+            raise RecordFileError(f"{where} is complex: is it a transfer function?")
+        if data.size != entry["num_pts"]:
+            raise RecordFileError(f"{where} holds {data.size} samples and says {entry['num_pts']}: it is damaged")
+        facts = _facts(where, entry)
+        record = facts.pop("record", record)
+        key = f"{facts['kind']}:{facts['name']}"
+        if key in arrays:
+            raise RecordFileError(f"{where}: a second channel is called {facts['name']!r}")
+        time = np.asarray(entry["x"], float)
+        first = arrays.setdefault("t", time)
+        if time.size != first.size or np.abs(time - first).max() > 1e-6 * max(np.abs(first).max(), 1e-300):
+            raise RecordFileError(f"{where} ({facts['name']}) has other sample instants than the first")
+        arrays[key] = data
         channels.append(facts)
-    header = None
-    record = next((f["record"] for f in channels if "record" in f), None)
-    if record is not None:
-        header = {**record, "channels": channels}
-    else:
-        step = float(sets[0].get("abscissa_inc") or np.median(np.diff(time)))
-        header = {"name": path.stem, "channels": channels, "sample_time": step, "start_time": float(time[0])}
-        if np.abs(np.diff(time) - step).max() > 1e-3 * abs(step) or step <= 0:
-            raise RecordFileError(f"{path} is not uniformly sampled; resample it first")
-    return time, signals, header
+    if record is None and any("noise_std" in facts for facts in channels):
+        raise RecordFileError(f"{path} is damaged: its description of the record is missing")
+    header = (record or {}) | {"channels": channels}
+    return arrays | {HEADER: np.array(json.dumps(header))}
 
 
-def _facts(entry: dict) -> dict:
-    """Our own description out of the five text lines, where it is there."""
+def as_stored(values: np.ndarray) -> np.ndarray:
+    """Values as the format's twelve digits keep them."""
+    return np.array(("%.11e " * values.size % tuple(values)).split(), float)
+
+
+def _facts(where: str, entry: dict) -> dict:
+    """Our own description out of the five text lines, or what the data set itself says."""
     text = "".join(str(entry.get(f"id{i}", "")) for i in range(1, 6))
-    start = text.find("{")
+    if not any(sign in text for sign in OURS):
+        name = f"node {entry['rsp_node']} direction {entry['rsp_dir']}"
+        return {"kind": "output", "name": name, "quantity": QUANTITIES.get(entry["ordinate_spec_data_type"], "")}
     try:
-        return json.loads(text[start:]) if start >= 0 else {}
-    except ValueError:
-        return {}
+        facts = json.loads(text[text.index("{") :])
+        return {**facts, "kind": str(facts["kind"]), "name": str(facts["name"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordFileError(f"{where}: its description is damaged: {error}") from error
 
 
 def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
@@ -78,8 +87,9 @@ def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
     for i, (facts, values) in enumerate(zip(header["channels"], signals.values(), strict=True)):
         described = dict(facts)
         if i == 0:
-            described["record"] = {k: header[k] for k in ("name", "sample_time", "start_time")}
-        text = json.dumps(described, separators=(",", ":"))
+            described["record"] = {key: value for key, value in header.items() if key != "channels"}
+        # spaces at the end of a line would be lost
+        text = json.dumps(described, separators=(",", ":")).replace(" ", r"\u0020")
         if len(text) > 5 * LINE:
             raise RecordFileError(f"{path}: the names of channel {facts['name']!r} are too long for UFF; shorten them")
         lines = {f"id{j + 1}": text[j * LINE : (j + 1) * LINE].ljust(LINE, " ") or " " for j in range(5)}

@@ -1,0 +1,300 @@
+"""Record files that were cut, overwritten, reordered or never a record: the right record or a refusal, nothing else."""
+
+import resource
+import time as clock
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import savemat
+from typer.testing import CliRunner
+
+from workbench.cli import app
+from workbench.records.file_error import RecordFileError
+from workbench.records.files import read_record, write_record
+from workbench.records.record import Channel, Record
+
+ENDINGS = (".csv", ".npz", ".mat", ".h5", ".uff")
+LONGEST, MOST = 10.0, 2 * 2**20  # s; KiB, as the system counts
+FORMATS_OF_OTHERS = (".mat", ".h5", ".uff")  # read in a process of their own
+
+
+def sample() -> Record:
+    rng = np.random.default_rng(2)
+    return Record(
+        sample_time=0.01,
+        outputs=rng.standard_normal((2, 40)),
+        output_channels=(Channel("tip", "velocity", at=0.5), Channel("b c", "displacement", at=1.5, noise_std=0.1)),
+        inputs=rng.standard_normal((1, 40)),
+        input_channels=(Channel("hammer", "force", at=0.7),),
+        start_time=0.25,
+        name="run",
+    )
+
+
+def damaged(data: bytes, rng: np.random.Generator) -> bytes:
+    """Cut short, overwritten, a stretch repeated, removed or moved, a bit turned, or text put in."""
+    a, b = sorted(int(i) for i in rng.integers(0, len(data), 2))
+    kind = rng.integers(8)
+    if kind == 0:
+        return data[:a]
+    if kind == 1:
+        return data[:a] + rng.bytes(int(rng.integers(1, 9))) + data[a + 4 :]
+    if kind == 2:
+        return data[:b] + data[a:]
+    if kind == 3:
+        return data[:a] + data[a + int(rng.integers(1, 40)) :]
+    if kind == 4:
+        return data[:a] + bytes([data[a] ^ 1 << int(rng.integers(8))]) + data[a + 1 :]
+    if kind == 5:
+        middle = (a + b) // 2
+        return data[:a] + data[middle:b] + data[a:middle] + data[b:]
+    if kind == 6:
+        return data[:a] + b"\xff" * int(rng.integers(1, 9)) + data[a + 8 :]
+    words = (b"nan", b"1e999", b"-", b",,,", b"\x00" * 8, b"{", b"9" * 400, b"\n", "é".encode("latin-1"), b"[" * 5000)
+    return data[:a] + words[rng.integers(len(words))] + data[a:]
+
+
+def same(read: Record, whole: Record, exact: float) -> bool:
+    return (
+        (read.output_channels, read.input_channels) == (whole.output_channels, whole.input_channels)
+        and (read.sample_time, read.start_time, read.name) == (whole.sample_time, whole.start_time, whole.name)
+        and np.allclose(read.outputs, whole.outputs, rtol=exact, atol=0)
+        and np.allclose(read.inputs, whole.inputs, rtol=exact, atol=0)
+    )
+
+
+def peak_kib() -> int:
+    return max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_what_was_written_comes_back_whole_or_not_at_all(tmp_path, ending, count=None):
+    """A file of our own carries a checksum, so no damage may go unseen."""
+    whole = sample()
+    data = write_record(whole, tmp_path / f"whole{ending}").read_bytes()
+    rng = np.random.default_rng([7, ENDINGS.index(ending)])
+    path = tmp_path / f"x{ending}"
+    for i in range(count or (8 if ending in FORMATS_OF_OTHERS else 40)):
+        path.write_bytes(damaged(data, rng))
+        start = clock.monotonic()
+        try:
+            read = read_record(path)
+        except RecordFileError as error:
+            assert path.name in str(error) and len(str(error)) < 1000
+        else:
+            assert same(read, whole, 1e-10 if ending == ".uff" else 0.0), f"damage {i} changed the record unseen"
+        assert clock.monotonic() - start < LONGEST
+    assert peak_kib() < MOST
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_a_thousand_damaged_files(tmp_path, ending):
+    test_what_was_written_comes_back_whole_or_not_at_all(tmp_path, ending, count=200)
+
+
+TIME = 0.5 * np.arange(6)
+WAVE = np.array([1.0, -2.0, 3.0, -4.0, 5.0, 6.0])
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("time,a\n0,1\n0.5,2\n1,3\n", {"a": [1, 2, 3]}),
+        ("a,time\n1,0\n2,0.5\n", "sample_rate_hz"),
+        ("time;a\n0;1\n0.5;2\n", {"a": [1, 2]}),
+        ("time;a\n0,0;1,5\n0,5;2,5\n", "not a number"),
+        ("time a\n0 1\n0.5   2\n", {"a": [1, 2]}),
+        ("\ufefftime,a\n0,1\n0.5,2\n", {"a": [1, 2]}),
+        ("time,a\r\n0,1\r\n0.5,2\r\n", {"a": [1, 2]}),
+        ("time,a\r0,1\r0.5,2\r", {"a": [1, 2]}),
+        ('time,"a, b"\n0,1\n0.5,2\n', {"a, b": [1, 2]}),
+        ("# made by hand\ntime,a\n\n0,1\n# halt\n0.5,2\n", {"a": [1, 2]}),
+        ("time,a\ns,m\n0,1\n0.5,2\n", "'s' is not a number"),
+        ("time,a\n0.5,2\n0,1\n1,3\n", "not uniformly sampled"),
+        ("time,a\n0,1\n0,1\n0,1\n", "not uniformly sampled"),
+        ("time,a\n1,1\n0.5,2\n0,3\n", "not uniformly sampled"),
+        ("time,a\n0,1\n1e308,2\n-1e308,3\n", "not uniformly sampled"),
+        ("time,a\n0,1\nnan,2\n1,3\n", "time, row 2"),
+        ("time,a\n0,1_5\n1,2\n", "'1_5' is not a number"),
+        ("time,a\n0,inf\n1,2\n", "channel 'a', row 1: inf"),
+        ("time,a\n0,1e999\n1,2\n", "channel 'a', row 1: inf"),
+        ("time,a\n0,\n1,2\n", "'' is not a number"),
+        ("time,a\n0,0x10\n1,2\n", "'0x10' is not a number"),
+        ("time,a\n0,__import__('os').system('true')\n1,2\n", "not a number"),
+        ("time,a\x1b]0;owned\x07\n0,1\n1,2\n", "control characters"),
+        ("time,\n0,1\n1,2\n", "not be empty"),
+        ("time,a\n", "two"),
+        ("time\n0\n1\n", "no signals"),
+        ('time,a\n0,"1\n1,2\n', "cannot be read as CSV"),
+        ("time,a\n0," + "9" * 500 + "\n1,2\n", "inf"),
+        ("time,a\n0," + "x" * 100_000 + "\n1,2\n", r"x{40}\.\.\."),
+        ("time," + "a" * 2_000_000 + "\n0,1\n", "more than 1000000 characters"),
+        ("time,a\n0,1\n1,2\x00\n", "not a number"),
+        ('# record {"channels": ' + "[" * 100_000 + "\ntime,a\n0,1\n1,2\n", "damaged"),
+        ("# record {}\ntime,a\n0,1\n1,2\n", "damaged"),
+        ('# record {"channels": [], "name": "x"}\ntime,a\n0,1\n1,2\n', {"a": [1, 2]}),
+    ],
+)
+def test_a_table_of_another_program(tmp_path, text, found):
+    path = tmp_path / "x.csv"
+    path.write_bytes(text.encode())
+    if isinstance(found, str):
+        with pytest.raises(RecordFileError, match=found) as refused:
+            read_record(path)
+        assert len(str(refused.value)) < 1000
+    else:
+        read = read_record(path)
+        np.testing.assert_array_equal(read.outputs, list(found.values()))
+        assert read.output_names == tuple(found)
+
+
+def save_hdf5(path, **arrays):
+    with h5py.File(path, "w") as file:
+        for name, values in arrays.items():
+            file[name] = values
+
+
+SAVE = {
+    ".npz": lambda path, **arrays: np.savez(path, **arrays),
+    ".mat": lambda path, **arrays: savemat(path, arrays),
+    ".h5": save_hdf5,
+}
+
+
+ARRAYS = [
+    ({"t": TIME, "a": WAVE.astype("f4")}, WAVE),
+    ({"t": TIME, "a": WAVE.astype("i1")}, WAVE),
+    ({"t": TIME[:, None], "a": WAVE[None, :]}, WAVE),
+    ({"t": TIME, "a": WAVE, "rate": 2.0, "note": "a text"}, WAVE),
+    ({"t": TIME, "a": WAVE.astype(complex)}, "complex"),
+    ({"t": TIME, "a": np.ones((3, 2))}, r"shape \(3, 2\)"),
+    ({"t": TIME, "a": WAVE[:-1]}, "5 samples"),
+    ({"t": TIME, "time": TIME, "a": WAVE}, "two arrays of times"),
+    ({"t": TIME, "a": np.where(WAVE == 3, np.nan, WAVE)}, "row 3: nan"),
+    ({"t": TIME[::-1], "a": WAVE}, "not uniformly"),
+    ({"a": WAVE}, "tells no time"),
+    ({"t": TIME, "record_channel_0": WAVE}, "do not belong together"),
+    ({"t": TIME, "record_channel_0": WAVE, "record_header": "{}"}, "damaged"),
+    ({"t": np.zeros(0), "a": np.zeros(0)}, "0 samples|no signals|0\\)"),
+    ({"t": TIME}, "no signals"),
+]
+RETYPED = 5  # of them; the rest go through the same lines in every format
+
+
+@pytest.mark.parametrize(
+    ("ending", "arrays", "found"),
+    [(".npz", *case) for case in ARRAYS] + [(e, *case) for e in (".mat", ".h5") for case in ARRAYS[1:RETYPED]],
+)
+def test_arrays_of_another_program(tmp_path, ending, arrays, found):
+    path = tmp_path / f"x{ending}"
+    SAVE[ending](path, **arrays)
+    if isinstance(found, str):
+        with pytest.raises(RecordFileError, match=found):
+            read_record(path)
+    else:
+        read = read_record(path)
+        np.testing.assert_array_equal(read.outputs, [found])
+        assert (read.sample_time, read.output_names) == (0.5, ("a",))
+
+
+def huge_npz(path):
+    np.savez_compressed(path, t=np.zeros(2**25, "i1"), a=np.zeros(2**28, "i1"))
+
+
+def huge_mat(path):
+    savemat(path, {f"a{i}": np.zeros(2**25, "i1") for i in range(2)}, do_compression=True)
+
+
+def huge_hdf5(path):
+    with h5py.File(path, "w") as file:
+        file.create_dataset("a", shape=(2**40,), chunks=(2**16,), dtype="f8")
+
+
+def huge_csv(path):
+    path.write_bytes(b"time,a\n" + b" " * 40_000_000 + b"\n")
+
+
+def elsewhere(path):
+    (path.parent / "secret.bin").write_bytes(np.arange(8.0).tobytes())
+    with h5py.File(path, "w") as file:
+        file["t"] = TIME
+        file.create_dataset("a", shape=(6,), dtype="f8", external=[(str(path.parent / "secret.bin"), 0, 48)])
+
+
+def linked(path):
+    save_hdf5(path.with_name("other.h5"), a=WAVE)
+    with h5py.File(path, "w") as file:
+        file["t"] = TIME
+        file["a"] = h5py.ExternalLink("other.h5", "a")
+
+
+@pytest.mark.parametrize(
+    ("ending", "make", "words"),
+    [
+        (".npz", huge_npz, "at most 33554432"),
+        (".mat", huge_mat, "at most 33554432|GiB"),
+        (".h5", huge_hdf5, "at most 33554432"),
+        (".csv", huge_csv, "1000000 characters"),
+        (".h5", elsewhere, "in another file"),
+        (".h5", linked, "no signals"),
+    ],
+)
+def test_what_is_huge_or_lies_elsewhere_is_not_read(tmp_path, ending, make, words):
+    path = tmp_path / f"x{ending}"
+    make(path)
+    start = clock.monotonic()
+    with pytest.raises(RecordFileError, match=words):
+        read_record(path)
+    assert clock.monotonic() - start < LONGEST and peak_kib() < MOST
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ("import os, signal\ndef load(path): os.kill(os.getpid(), signal.SIGSEGV)\n", r"crashed on it \(SIGSEGV\)"),
+        ("def load(path):\n    while True: pass\n", "no end within 1 s"),
+        ("import numpy\ndef load(path): return {'a': numpy.ones(2**33)}\n", "more than 1.5 GiB"),
+        ("import os\ndef load(path): os._exit(9)\n", "process that reads it failed"),
+        ("def load(path): print('noise'); raise KeyError\n", "cannot be read as MAT: KeyError"),
+        ("import numpy\ndef load(path): return {'a': numpy.array([{}, 0])}\n", None),
+    ],
+    ids=["crash", "hang", "memory", "exit", "error", "objects"],
+)
+def test_a_reader_that_crashes_hangs_or_devours_is_survived(tmp_path, monkeypatch, body, words):
+    from workbench.records import confined
+
+    (tmp_path / "hostile_reader.py").write_text(body)
+    monkeypatch.setattr(confined, "ROOT", str(tmp_path))
+    monkeypatch.setattr(confined, "LEAST_SECONDS", 1.0)
+    path = tmp_path / "x.mat"
+    path.write_bytes(b"x")
+    if words is None:
+        assert confined.load_confined("hostile_reader", path) == {}  # no pickles
+    else:
+        with pytest.raises(RecordFileError, match=words):
+            confined.load_confined("hostile_reader", path)
+
+
+def test_no_file_beside_the_record_runs(tmp_path, monkeypatch):
+    """The reader is another Python; one that looked into the working folder first would run what lies there."""
+    path = write_record(sample(), tmp_path / "x.mat")
+    for name in ("numpy", "json", "scipy", "workbench"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('taken over')")
+    monkeypatch.chdir(tmp_path)
+    assert same(read_record("x.mat"), sample(), 0.0) and path.exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("ending", ENDINGS)
+def test_the_command_ends_in_one_line_and_writes_nothing(tmp_path, ending):
+    data = write_record(sample(), tmp_path / f"whole{ending}").read_bytes()
+    path, found = tmp_path / f"x{ending}", tmp_path / "found.json"
+    path.write_bytes(data[: len(data) // 2])
+    result = CliRunner().invoke(app, ["identify", str(path), "--json", str(found)])
+    assert result.exit_code == 2 and "Traceback" not in result.output, result.output
+    assert path.name in result.output and len(result.output.strip().splitlines()) == 1
+    assert not found.exists()
