@@ -1,12 +1,14 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 
+from workbench.gap.tables import CaseError, check_keys, count, number, numbers, profile, shown, table_of, tables, text
+from workbench.records.file_error import RecordFileError
+from workbench.records.limits import check_size
+from workbench.records.npz_file import load_arrays
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -17,10 +19,15 @@ from workbench.structure.modes import Modes
 
 MOST_SAMPLES = 5_000_000
 LEAST_SAMPLES = 16
+MOST_MODES = 200
 
-
-class CaseError(ValueError):
-    """A case folder that is not one, or holds what a diagnosis cannot use."""
+# What each table may hold; a key beside these is a misspelt one.
+TABLES = ("title", "structure", "input", "output", "record")
+MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
+STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
+MODAL = ("kind", "natural_frequencies_hz", "damping_ratios")
+SINGLE = ("kind", "mass", "damping", "stiffness")
+INPUT, OUTPUT, RECORD = ("name", "kind"), ("name", "quantity", "noise_std"), ("name", "file", "sample_time", "use")
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +77,9 @@ def read_case(folder: str | Path) -> Case:
         raise CaseError(f"{folder} is not a folder; a case is a folder with case.toml and records")
     if not path.is_file():
         raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
-    table = _table(path)
+    table = table_of(path)
     rig = _rig(table, path)
-    records = [(_read_record(folder, entry, rig, path), _use(entry, path)) for entry in _tables(table, "record", path)]
+    records = [(_read_record(folder, entry, rig, path), _use(entry, path)) for entry in tables(table, "record", path)]
     fit = tuple(record for record, use in records if use == "fit")
     if not fit:
         raise CaseError(f'{path}: no record has use = "fit"; a diagnosis needs at least one')
@@ -93,11 +100,16 @@ def read_rig(path: str | Path) -> Rig:
     path = Path(path)
     if not path.is_file():
         raise CaseError(f"{path}: there is no such file")
-    return _rig(_table(path), path)
+    return _rig(table_of(path), path)
 
 
 def _rig(table: dict, path: Path) -> Rig:
-    inputs, outputs = _tables(table, "input", path), _tables(table, "output", path)
+    check_keys(table, TABLES, str(path))
+    inputs, outputs = tables(table, "input", path), tables(table, "output", path)
+    names = [entry["name"] for entry in (*inputs, *outputs)]
+    for name in names:
+        if name == "t" or names.count(name) > 1:
+            raise CaseError(f"{path}: an input or output is called {name!r}, as is another or the time; rename it")
     structure = table.get("structure")
     if not isinstance(structure, dict):
         raise CaseError(f"{path}: the table [structure] is missing")
@@ -108,91 +120,32 @@ def _rig(table: dict, path: Path) -> Rig:
         raise CaseError(f"{path}: {error}") from error
 
 
-# --- tables
-
-
-def _table(path: Path) -> dict:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise CaseError(f"{path} cannot be read as TOML: {error}") from error
-
-
-def _tables(table: dict, key: str, path: Path) -> list[dict]:
-    entries = table.get(key)
-    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
-        raise CaseError(f"{path}: at least one [[{key}]] is needed")
-    names = [_text(entry, "name", f"[[{key}]]") for entry in entries]
-    for name in names:
-        if names.count(name) > 1:
-            raise CaseError(f"{path}: two [[{key}]] are called {name!r}; names must differ")
-    return entries
-
-
-def _text(entry: dict, key: str, where: str) -> str:
-    value = entry.get(key)
-    if not isinstance(value, str) or not value:
-        raise CaseError(f"{where}: {key} must be a text; got {value!r}")
-    return value
-
-
-def _number(entry: dict, key: str, where: str, *, low: float = -np.inf) -> float:
-    value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value) or value < low:
-        limit = "" if low == -np.inf else f" of {low:g} or more"
-        raise CaseError(f"{where}: {key} must be a number{limit}; got {value!r}")
-    return float(value)
-
-
-def _numbers(entry: dict, key: str, where: str, length: int | None = None) -> np.ndarray:
-    try:
-        values = np.array(entry.get(key), float)
-    except (TypeError, ValueError):
-        values = np.zeros((0, 0))
-    if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all() or values.size != (length or values.size):
-        many = "numbers" if length is None else f"{length} numbers"
-        raise CaseError(f"{where}: {key} must be a list of {many}; got {entry.get(key)!r}")
-    return values
-
-
-def _profile(entry: dict, key: str):
-    value = entry.get(key)
-    if isinstance(value, dict):
-        return (_numbers(value, "x", key), _numbers(value, "value", key))
-    return _number(entry, key, "[structure]", low=0.0)
-
-
-def _count(entry: dict, key: str) -> int:
-    value = entry.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 200:
-        raise CaseError(f"[structure]: {key} must be a whole number from 1 to 200; got {value!r}")
-    return value
-
-
 # --- rigs
 
 
 def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     kind = table.get("kind")
-    if kind not in ("beam", "rod"):
-        raise CaseError(f"[structure]: kind is beam, rod or modal; got {kind!r}")
+    if not isinstance(kind, str) or kind not in STRUCTURES:
+        raise CaseError(f"[structure]: kind is beam, rod or modal; got {shown(kind)}")
+    check_keys(table, STRUCTURES[kind], "[structure]")
+    _check_ports(inputs, outputs, "at")
     common = {
-        "length": _number(table, "length", "[structure]"),
-        "mass_per_length": _profile(table, "mass_per_length"),
-        "left": _text(table, "left", "[structure]"),
-        "right": _text(table, "right", "[structure]"),
-        "damping": ModalDamping(_number(table, "damping_ratio", "[structure]", low=0.0)),
+        "length": number(table, "length", "[structure]"),
+        "mass_per_length": profile(table, "mass_per_length"),
+        "left": text(table, "left", "[structure]"),
+        "right": text(table, "right", "[structure]"),
+        "damping": ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     }
     structure: Structure
     if kind == "beam":
         structure = Beam(
-            bending_stiffness=_profile(table, "bending_stiffness"),
-            tension=_number(table, "tension", "[structure]") if "tension" in table else 0.0,
+            bending_stiffness=profile(table, "bending_stiffness"),
+            tension=number(table, "tension", "[structure]") if "tension" in table else 0.0,
             **common,
         )
     else:
-        structure = Bar(axial_stiffness=_profile(table, "axial_stiffness"), **common)
-    modes = structure.modes(_count(table, "modes"), tolerance=1e-9)
+        structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
+    modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
     actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]")) for e in inputs)
     sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]")) for e in outputs)
     return Rig(modes, actuators, sensors, structure=structure)
@@ -200,19 +153,25 @@ def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
 
 def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
-    if "mass" in table:
-        mass = _number(table, "mass", "[structure]", low=1e-300)
-        stiffness = _number(table, "stiffness", "[structure]", low=0.0)
+    single = "mass" in table
+    check_keys(table, SINGLE if single else MODAL, "[structure]")
+    _check_ports(inputs, outputs, "shape")
+    if single:
+        mass = number(table, "mass", "[structure]", low=1e-300)
+        stiffness = number(table, "stiffness", "[structure]", low=0.0)
         omega = np.array([np.sqrt(stiffness / mass)])
-        damping = np.array([[_number(table, "damping", "[structure]", low=0.0) / mass]])
+        damping = np.array([[number(table, "damping", "[structure]", low=0.0) / mass]])
         shape = np.array([1.0 / np.sqrt(mass)])
+        for entry in (*inputs, *outputs):
+            if entry.get("shape", [1.0]) != [1.0]:
+                raise CaseError(f"{entry['name']!r}: the shape of a single degree of freedom is [1.0]; leave it out")
         values = np.tile(shape, (len(inputs) + len(outputs), 1))
     else:
-        omega = 2.0 * np.pi * _numbers(table, "natural_frequencies_hz", "[structure]")
-        damping = _numbers(table, "damping_ratios", "[structure]", omega.size)
+        omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
+        damping = numbers(table, "damping_ratios", "[structure]", omega.size)
         values = np.array(
             [
-                _numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
+                numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
                 for key, entries in (("[[input]]", inputs), ("[[output]]", outputs))
                 for e in entries
             ]
@@ -225,8 +184,14 @@ def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     return Rig(modes, actuators, sensors)
 
 
+def _check_ports(inputs: list[dict], outputs: list[dict], *places: str) -> None:
+    for key, entries, keys in (("input", inputs, INPUT), ("output", outputs, OUTPUT)):
+        for entry in entries:
+            check_keys(entry, (*keys, *places), f"[[{key}]] {entry['name']!r}")
+
+
 def _place(entry: dict, length: float, where: str) -> float:
-    at = _number(entry, "at", f"{where} {entry['name']!r}")
+    at = number(entry, "at", f"{where} {entry['name']!r}")
     if not 0 <= at <= length:
         raise CaseError(f"{where} {entry['name']!r}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
     return at
@@ -235,7 +200,7 @@ def _place(entry: dict, length: float, where: str) -> float:
 def _actuator(entry: dict, at: float) -> Actuator:
     kind = entry.get("kind")
     if kind not in ("actuator", "hammer"):
-        raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {kind!r}")
+        raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {shown(kind)}")
     return Actuator(entry["name"], at, direct=kind == "hammer")
 
 
@@ -243,8 +208,8 @@ def _sensor(entry: dict, at: float) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
-        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {quantity!r}")
-    noise = _number(entry, "noise_std", where, low=0.0)
+        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {shown(quantity)}")
+    noise = number(entry, "noise_std", where, low=0.0)
     if noise == 0:
         raise CaseError(f"{where}: noise_std must be positive; the diagnosis weighs every residual by it")
     return Sensor(entry["name"], at, quantity, noise_std=noise)
@@ -255,26 +220,30 @@ def _sensor(entry: dict, at: float) -> Sensor:
 
 def _use(entry: dict, path: Path) -> str:
     if entry.get("use") not in ("fit", "validate"):
-        raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {entry.get('use')!r}")
+        raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {shown(entry.get('use'))}")
     return entry["use"]
 
 
 def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
     name = entry["name"]
     where = f"{path}: record {name!r}"
-    sample_time = _number(entry, "sample_time", where)
+    check_keys(entry, RECORD, where)
+    sample_time = number(entry, "sample_time", where)
     if sample_time <= 0:
         raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
-    file = (folder / _text(entry, "file", where)).resolve()
+    try:
+        file = (folder / text(entry, "file", where)).resolve()
+    except (OSError, RuntimeError) as error:  # links that go in a circle
+        raise CaseError(f"{where}: file {entry['file']!r} cannot be found: {error}") from error
     if not file.is_relative_to(folder.resolve()):
         raise CaseError(f"{where}: file {entry['file']!r} lies outside the case folder")
     arrays = _arrays(file, where)
     names = {part.name for part in (*rig.actuators, *rig.sensors)}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
     if missing:
-        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; it holds {', '.join(sorted(arrays))}")
+        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; it holds {shown(sorted(arrays))}")
     if extra:
-        raise CaseError(f"{file}: channel {extra[0]!r} is not named in case.toml; name it there or leave it out")
+        raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
     if "t" not in arrays:
         raise CaseError(f"{file}: the array t of sample instants is missing")
     n_samples = arrays["t"].size
@@ -316,15 +285,11 @@ def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {}
-            for name in archive.files:
-                values = archive[name]
-                if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
-                    raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
-                arrays[name] = values.astype(float)
-            return arrays
-    except CaseError:
-        raise
-    except (OSError, ValueError, BadZipFile, EOFError, KeyError, AttributeError, MemoryError) as error:
-        raise CaseError(f"{file} cannot be read as an NPZ archive of arrays: {error}") from error
+        check_size(file)
+        arrays = load_arrays(file)
+    except RecordFileError as error:
+        raise CaseError(str(error)) from error
+    for name, values in arrays.items():
+        if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
+            raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
+    return {name: values.astype(float) for name, values in arrays.items()}

@@ -1,0 +1,144 @@
+"""Values out of the tables of a case file, each checked as it is taken."""
+
+import tomllib
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+from reprlib import Repr
+
+import numpy as np
+
+MOST_BYTES = 2**24
+MOST_ENTRIES = 1000
+
+_REPR = Repr()
+_REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
+_REPR.maxlist = 20
+shown = _REPR.repr
+
+
+class CaseError(ValueError):
+    """A case folder that is not one, or holds what a diagnosis cannot use."""
+
+
+def table_of(path: Path) -> dict:
+    """The table that a TOML file holds.
+
+    Raises:
+        CaseError: no TOML, or more than `MOST_BYTES`.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise CaseError(f"{path} has {size} bytes; a case file has at most {MOST_BYTES}")
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except CaseError:
+        raise
+    except RecursionError:
+        raise CaseError(f"{path} cannot be read as TOML: its brackets are nested too deeply") from None
+    except (ValueError, OSError) as error:
+        raise CaseError(f"{path} cannot be read as TOML: {error}") from error
+
+
+def check_keys(entry: dict, allowed: Iterable[str], where: str) -> None:
+    """Refuse a key that nothing would read: a misspelt one would change the case unseen.
+
+    Raises:
+        CaseError: naming the key, and the one that was meant.
+    """
+    allowed = list(allowed)
+    for key in entry:
+        if key not in allowed:
+            close = get_close_matches(key, allowed, 1)
+            meant = f"did you mean {close[0]!r}?" if close else f"the keys are {', '.join(allowed)}"
+            raise CaseError(f"{where} has no key {shown(key)}; {meant}")
+
+
+def tables(table: dict, key: str, path: Path) -> list[dict]:
+    """The entries [[key]], each with a name of its own.
+
+    Raises:
+        CaseError: none, too many, or two of one name.
+    """
+    entries = table.get(key)
+    if not isinstance(entries, list) or not entries or not all(isinstance(e, dict) for e in entries):
+        raise CaseError(f"{path}: at least one [[{key}]] is needed")
+    if len(entries) > MOST_ENTRIES:
+        raise CaseError(f"{path}: {len(entries)} [[{key}]]; at most {MOST_ENTRIES} are read")
+    names = [text(entry, "name", f"{path}: [[{key}]]") for entry in entries]
+    for name in names:
+        if names.count(name) > 1:
+            raise CaseError(f"{path}: two [[{key}]] are called {shown(name)}; names must differ")
+    return entries
+
+
+def text(entry: dict, key: str, where: str) -> str:
+    """A text of printable characters.
+
+    Raises:
+        CaseError: anything else.
+    """
+    value = entry.get(key)
+    if not isinstance(value, str) or not value or not value.isprintable() or len(value) > 255:
+        raise CaseError(f"{where}: {key} must be a text of up to 255 printable characters; got {shown(value)}")
+    return value
+
+
+def number(entry: dict, key: str, where: str, *, low: float = -np.inf) -> float:
+    """A finite number, at least `low`.
+
+    Raises:
+        CaseError: anything else.
+    """
+    value = entry.get(key)
+    try:
+        as_float = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else np.nan
+    except OverflowError:
+        as_float = np.inf
+    if not np.isfinite(as_float) or as_float < low:
+        limit = "" if low == -np.inf else f" of {low:g} or more"
+        raise CaseError(f"{where}: {key} must be a number{limit}; got {shown(value)}")
+    return as_float
+
+
+def numbers(entry: dict, key: str, where: str, length: int | None = None) -> np.ndarray:
+    """A list of finite numbers, `length` of them where given.
+
+    Raises:
+        CaseError: anything else.
+    """
+    given = entry.get(key)
+    plain = isinstance(given, list) and all(isinstance(v, int | float) and not isinstance(v, bool) for v in given)
+    try:
+        values = np.array(given if plain else [], float)
+    except OverflowError:
+        values = np.zeros(0)
+    if values.size == 0 or not np.isfinite(values).all() or values.size != (length or values.size):
+        many = "numbers" if length is None else f"{length} numbers"
+        raise CaseError(f"{where}: {key} must be a list of {many}; got {shown(given)}")
+    return values
+
+
+def profile(entry: dict, key: str) -> float | tuple[np.ndarray, np.ndarray]:
+    """A number, or points (x, value) with straight lines between.
+
+    Raises:
+        CaseError: anything else.
+    """
+    value = entry.get(key)
+    if isinstance(value, dict):
+        check_keys(value, ("x", "value"), f"[structure] {key}")
+        return numbers(value, "x", key), numbers(value, "value", key)
+    return number(entry, key, "[structure]", low=0.0)
+
+
+def count(entry: dict, key: str, most: int) -> int:
+    """A whole number from 1 to `most`.
+
+    Raises:
+        CaseError: anything else.
+    """
+    value = entry.get(key)
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise CaseError(f"[structure]: {key} must be a whole number from 1 to {most}; got {shown(value)}")
+    return value
