@@ -149,7 +149,9 @@ def identify(
     """
     from workbench.records.files import read_record
     from workbench.study.ring_down import modes_of
+    from workbench.study.whole_file import check_target
 
+    check_target(json_path)
     names = tuple(name.strip() for name in inputs.split(",") if name.strip())
     read = read_record(record, sample_rate_hz=sample_rate_hz, inputs=names).between(start)
     found = modes_of(read, n_modes=modes)
@@ -283,7 +285,7 @@ def place(
 @_guarded
 def diagnose(
     case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
-    json_path: Annotated[Path | None, typer.Option("--json", help="Write the verdict here as JSON.")] = None,
+    json_path: JsonPath = None,
     page: Annotated[Path | None, typer.Option(help="Write the page here; default out/CASE.html.")] = None,
 ) -> None:
     """Say where a simulation and a test disagree, which effect is missing, and how far the gap then shrinks.
@@ -293,7 +295,9 @@ def diagnose(
     from workbench.gap.case import read_case
     from workbench.gap.diagnose import diagnose as run
     from workbench.study.verdict_page import verdict_page
+    from workbench.study.whole_file import check_target, write_whole
 
+    check_target(json_path)
     found = read_case(case)
     with _progress() as progress:
         task = progress.add_task("reading", total=1.0)
@@ -320,7 +324,7 @@ def diagnose(
         console.print(f"  {note}", markup=False)
     target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html")
     if json_path is not None:
-        json_path.write_text(json.dumps(shown, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(json_path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
         console.print(f"  verdict    {_short(json_path)}", markup=False)
     console.print(f"  page       {_short(target)}", markup=False)
 
@@ -341,7 +345,9 @@ def trial(
     from workbench.draw.trials import plot_confusion
     from workbench.gap.case import read_case
     from workbench.gap.holding import hold_trials
+    from workbench.study.whole_file import check_target
 
+    check_target(json_path)
     if cases < 1:
         raise ValueError(f"--cases must be at least 1; got {cases}")
     found = read_case(case)
@@ -384,9 +390,10 @@ def _blow(rig, at: float | None) -> float:
 
 def _write_json(path: Path | None, content: dict) -> None:
     from workbench.study.outcome import plain
+    from workbench.study.whole_file import write_whole
 
     if path is not None:
-        path.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
         console.print(f"  written to {_short(path)}", markup=False)
 
 
