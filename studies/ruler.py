@@ -6,18 +6,22 @@ mass and the mass per length are 1 here, so work and effort compare placements b
 """
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from workbench.design.placement import nodes_of_mode, place, placement_task
 from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
+from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
 from workbench.identification.refinement import amplitudes
 from workbench.identification.stabilisation import real_modes, stabilise
 from workbench.identification.telling import tell_apart
 from workbench.records.resample import decimate
 from workbench.records.transfer_file import read_transfer
+from workbench.rig.rig import Rig
 from workbench.structure.member import Beam
 
 NEEDS_DATA = "ruler.mat, the measured transfer functions"
@@ -31,6 +35,7 @@ DECIMATION, DELAYS, ORDERS = 6, 150, range(6, 25)
 SEEN_HZ = (39.4, 108.8, 212.0, 352.6, 517.9, 729.0)
 OTHERS_HZ = (6.7, 551.0)
 DAMPING_WANTED = 0.05
+SHIFTING = ("point_mass", "local_stiffness_loss", "axial_load", "ground_spring")  # kinds that shift frequencies
 
 
 def study(outcome, data: Path | None = None) -> None:
@@ -54,6 +59,7 @@ def study(outcome, data: Path | None = None) -> None:
         measured_modes(bending, others, told, beam.select(range(2, 8))),
         "The ruler's shapes at its ten points, over those of a uniform free-free beam.",
     )
+    diagnose_frequencies(outcome, bending, others, beam)
     place_actuators(outcome, bending)
 
 
@@ -74,6 +80,60 @@ def report_modes(outcome, bending, others, told) -> None:
     if bending.n_modes == len(seen):
         outcome.check("bending frequencies against those seen by eye, relative", np.abs(found / seen - 1).max(), 0.01)
     outcome.check("MAC with the free-free beam, first five", told.mac[:5].min(), 0.95, at_least=True)
+
+
+def diagnose_frequencies(outcome, bending, others, beam) -> None:
+    """What each linear effect of a structure, with the stiffness free, would leave of the frequencies' disagreement."""
+    structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free")
+    rig = Rig(structure.modes(8), (), (), structure=structure)
+    left = {"stiffness alone": _disagreement(rig, (), (), bending)[0]}
+    values = {}
+    for kind in (k for k in CATALOGUE if k.name in SHIFTING):
+        parameters = kind.parameters(rig, None)
+        trials = [_disagreement(rig, (kind,), start, bending) for start in _starts(parameters)]
+        left[kind.name], found = min(trials, key=lambda trial: np.linalg.norm(trial[0]))
+        values[kind.name] = {p.name: p.from_free(z) for p, z in zip(parameters, found, strict=True)}
+    rms = {name: float(np.sqrt(np.mean(differences**2))) for name, differences in left.items()}
+    best = min(rms, key=rms.get)
+    worst = int(np.abs(left["stiffness alone"]).argmax())
+    outcome.table("frequency_gap", {"relative": left, "rms": rms, "values": values})
+    outcome.say(
+        f"a uniform beam misses the suspension at {others.frequencies_hz[0]:.1f} Hz, a mode at"
+        f" {others.frequencies_hz[-1]:.0f} Hz that is not bending, and {100 * rms['stiffness alone']:.2f} % rms of the"
+        f" bending frequencies, most in mode {worst + 1}"
+    )
+    outcome.say(
+        f"no linear effect alone explains these: the nearest, {best.replace('_', ' ')}, leaves {100 * rms[best]:.2f} %"
+    )
+
+
+def _starts(parameters):
+    """Free coordinates to start from: places along the ruler, and small and large values of what is not a place."""
+    sizes = {
+        "mass": (0.005, 0.03),
+        "stiffness": (10.0, 100.0),
+        "width": (0.05, 0.2),
+        "loss": (0.1, 0.4),
+        "tension": (0.1, 2),
+    }
+    choices = [(0.05, 0.25, 0.5, 0.75, 0.95) if p.name == "at" else sizes[p.name] for p in parameters]
+    for values in product(*choices):
+        yield [p.to_free(value) for p, value in zip(parameters, values, strict=True)]
+
+
+def _disagreement(rig, kinds, start, bending):
+    """Relative differences of the bending frequencies after the best fit, (n_modes,), and the coordinates fitted."""
+
+    def differences(free):
+        changed = rig
+        for kind in kinds:
+            named = zip(kind.parameters(rig, None), free[1:], strict=True)
+            changed = kind.apply(rig, None, {p.name: p.from_free(z) for p, z in named})
+        return np.exp(free[0]) * changed.modes.frequencies_hz[2:8] / bending.frequencies_hz - 1.0
+
+    scale = np.log(bending.frequencies_hz[0] / rig.modes.frequencies_hz[2])
+    found = least_squares(lambda z: 1e3 * differences(z), [scale, *start], diff_step=1e-3, max_nfev=40)
+    return differences(found.x), found.x[1:]
 
 
 def place_actuators(outcome, bending) -> None:
