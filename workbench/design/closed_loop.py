@@ -122,7 +122,7 @@ def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndar
     modal = np.empty((state.size, time.size))
     modal[:, 0] = expm(loop.matrix * time[0]) @ state
     steps = np.diff(time)
-    uniform = steps.size > 0 and np.ptp(steps) <= 1e-12 * max(time[-1], 1.0)
+    uniform = steps.size > 0 and np.ptp(steps) <= 1e-12 * time[-1]
     step = expm(loop.matrix * steps[0]) if uniform else None
     for k in range(1, time.size):
         modal[:, k] = (step if uniform else expm(loop.matrix * steps[k - 1])) @ modal[:, k - 1]
