@@ -25,8 +25,9 @@ figures: $(BIN)/workbench  ## every study that makes its own data, with its figu
 bench: $(BIN)/workbench  ## speeds, as ratios
 	$(BIN)/workbench study speed
 
-lint: $(BIN)/workbench  ## style
+lint: $(BIN)/workbench  ## style and types
 	$(BIN)/ruff check workbench studies tests
+	$(BIN)/mypy workbench/structure workbench/records workbench/rig
 
 clean:
 	rm -rf $(VENV) out

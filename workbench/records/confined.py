@@ -12,6 +12,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -71,8 +72,8 @@ def serve(module: str, name: str) -> None:
         arrays = {key: np.asarray(values) for key, values in import_module(module).load(path).items()}
         arrays = {key: values for key, values in arrays.items() if values.dtype.kind in "fiubcU"}
         check_arrays(path, arrays.values())
-        numbered = {f"array_{i}": values for i, values in enumerate(arrays.values())}
-        np.savez(out, **{NAMES: np.array(json.dumps([*arrays]))}, **numbered)
+        sent: dict[str, Any] = {f"array_{i}": values for i, values in enumerate(arrays.values())}
+        np.savez(out, **(sent | {NAMES: np.array(json.dumps([*arrays]))}))
         code = 0
     except MemoryError:
         code = NO_MEMORY

@@ -19,7 +19,9 @@ LONGEST_LINE = 1_000_000  # characters
 
 def read(path: Path) -> Signals:
     """(time or None, signals by name, header text or None)."""
-    header_text, names, cells = None, [], array("d")
+    header_text: str | None = None
+    names: list[str] = []
+    cells = array("d")
     delimiter = ","
     for number, line in _lines(path):
         if line.startswith(MARK):

@@ -3,6 +3,7 @@
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,5 +40,6 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
     """Write all arrays and the header as text."""
+    arrays: dict[str, Any] = {"t": time, **signals, HEADER: np.array(json.dumps(header))}
     with path.open("wb") as file:
-        np.savez(file, t=time, **signals, **{HEADER: np.array(json.dumps(header))})
+        np.savez(file, **arrays)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -20,6 +21,7 @@ from workbench.rig.elements import (
     MidplaneStretching,
     OneSidedStop,
     PeriodicForce,
+    PointElement,
     RandomForce,
     UserLaw,
 )
@@ -39,7 +41,7 @@ from workbench.rig.stepping import (
     step_record,
 )
 
-LAWS = {
+LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
     LinearDamper: (LINEAR_DAMPER, lambda e: (e.coefficient,)),
     CubicSpring: (CUBIC, lambda e: (e.stiffness,)),
@@ -173,7 +175,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
         acting += participation[:, group] @ at_samples
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
-        if isinstance(element, RandomForce):
+        if not isinstance(element, PeriodicForce):
             continue
         shape = modes.phi(element.at)[0]
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
@@ -197,7 +199,7 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
             forces, at_samples = np.vstack([forces, mean]), np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi(element.at)[0]])
-    points = [e for e in rig.elements if type(e) in LAWS]
+    points = [e for e in rig.elements if isinstance(e, PointElement)]
     parameters = np.zeros((len(points), 3))
     for row, element in zip(parameters, points, strict=True):
         values = LAWS[type(element)][1](element)

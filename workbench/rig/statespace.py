@@ -45,7 +45,8 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     Raises:
         ValueError: an actuator or sensor that is not linear (delay, dead zone, limit, bias, rounding).
     """
-    for part in (*actuators, *sensors):
+    parts: tuple[Actuator | Sensor, ...] = (*actuators, *sensors)
+    for part in parts:
         if not part.linear:
             raise ValueError(f"{part} is not linear, so the rig has no StateSpace; simulate it instead")
     n = modes.n_modes

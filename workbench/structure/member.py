@@ -1,7 +1,9 @@
 """Bars and beams: profiles, ends and attachments, and the modes they have."""
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
@@ -19,9 +21,9 @@ MOST_FUNCTIONS = 2400
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Member:
     length: float
-    mass_per_length: ProfileLike
-    left: str | End
-    right: str | End
+    mass_per_length: Profile
+    left: End
+    right: End
     attachments: tuple[Attachment, ...] = ()
     damping: Damping = field(default_factory=ModalDamping)
 
@@ -121,14 +123,13 @@ class _Member:
                 else:
                     rigidity[index, index] += spring
         for part in self.attachments:
-            target, values = {
-                PointMass: (mass, lambda p: (p.mass, p.rotary_inertia)),
-                PointSpring: (rigidity, lambda p: (p.stiffness, p.rotational_stiffness)),
-                PointDamper: (None, None),
-            }[type(part)]
-            if target is None:
+            if isinstance(part, PointMass):
+                target, values = mass, (part.mass, part.rotary_inertia)
+            elif isinstance(part, PointSpring):
+                target, values = rigidity, (part.stiffness, part.rotational_stiffness)
+            else:
                 continue
-            for derivative, value in enumerate(values(part)):
+            for derivative, value in enumerate(values):
                 if value:
                     row = segments.evaluation(part.at, derivative)
                     target += value * row.T @ row
@@ -211,7 +212,21 @@ class Bar(_Member):
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside.
     """
 
-    axial_stiffness: ProfileLike
+    axial_stiffness: Profile
+
+    if TYPE_CHECKING:  # the door is wider than the fields: short forms become `Profile` and `End` on the way in
+
+        def __init__(
+            self,
+            *,
+            length: float,
+            mass_per_length: ProfileLike,
+            axial_stiffness: ProfileLike,
+            left: str | End,
+            right: str | End,
+            attachments: Sequence[Attachment] = (),
+            damping: Damping = ...,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         self._prepare(("fixed", "free"), "axial_stiffness")
@@ -238,8 +253,23 @@ class Beam(_Member):
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside, buckling.
     """
 
-    bending_stiffness: ProfileLike
+    bending_stiffness: Profile
     tension: float = 0.0
+
+    if TYPE_CHECKING:  # the door is wider than the fields: short forms become `Profile` and `End` on the way in
+
+        def __init__(
+            self,
+            *,
+            length: float,
+            mass_per_length: ProfileLike,
+            bending_stiffness: ProfileLike,
+            left: str | End,
+            right: str | End,
+            attachments: Sequence[Attachment] = (),
+            damping: Damping = ...,
+            tension: float = 0.0,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         self._prepare(("hinged", "clamped", "free", "sliding"), "bending_stiffness")

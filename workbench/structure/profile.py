@@ -78,7 +78,7 @@ class Profile:
         return Profile(changed, tuple(sorted({*self.breaks, float(start), float(stop)})))
 
 
-ProfileLike = Profile | Real | Callable[[np.ndarray], np.ndarray] | tuple
+ProfileLike = Profile | float | Callable[[np.ndarray], np.ndarray] | tuple[ArrayLike, ArrayLike]
 
 
 def as_profile(quantity: ProfileLike) -> Profile:
