@@ -1,4 +1,4 @@
-"""Coupled control: one regulator for all controlled modes together, by python-control."""
+"""Coupled control: one law for all controlled modes together, by the Riccati equation or by poles."""
 
 from collections.abc import Sequence
 
@@ -6,7 +6,8 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.design.law import DesignError, Law, controlled_indices, participation
+from workbench.design.law import DesignError, Law, controlled_indices, moved, participation
+from workbench.design.pole_assignment import assign
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
@@ -39,6 +40,8 @@ def coupled_lqr(
     actuators = tuple(actuators)
     if len(index) <= len(actuators):
         participation(modes, index, actuators)
+    else:
+        moved(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
     a, b = controlled_plant(modes, index, actuators)
     q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
     r = np.asarray(weight, float)
@@ -58,3 +61,24 @@ def coupled_lqr(
             f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
         )
     return Law(np.asarray(gain), index, actuators, "coupled LQR")
+
+
+def coupled_poles(
+    modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, poles: ArrayLike
+) -> Law:
+    """The law that puts the poles of all controlled modes together, from any number of actuators.
+
+    Each mode's pole is moved by the forces that act on that mode best, F ∝ b_r (see `assign`), which keeps gains low.
+
+    Args:
+        modes, controlled, actuators: as for `imsc`; fewer actuators than modes will do.
+        poles: (n_controlled,) one of each conjugate pair per controlled mode, rad/s.
+
+    Raises:
+        DesignError: a pole that is not stable, a mode that no actuator moves, poles that cannot be held apart.
+    """
+    index = controlled_indices(modes, controlled)
+    b = moved(modes, index, actuators)
+    a, full = controlled_plant(modes, index, actuators)
+    gain = assign(a, full, poles, b.T.astype(complex), [f"mode {r + 1}" for r in index])
+    return Law(gain, index, tuple(actuators), "coupled poles")

@@ -82,17 +82,29 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
                     f"actuators {first.name} and {second.name} both stand at x = {first.at:g}, so B is singular;"
                     " move one by more than 1e-6 of the length"
                 )
-    b = input_matrix(modes, actuators)[list(controlled)]
-    possible = _largest_participation(modes, actuators)
-    for row, r in zip(b, controlled, strict=True):
-        if np.abs(row).max() < UNMOVED * possible[r]:
-            raise DesignError(f"no actuator moves mode {r + 1}: all stand at its nodes; move one")
+    b = moved(modes, controlled, actuators)
     condition = np.linalg.cond(b)
     if condition > SINGULAR:
         raise DesignError(
             f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
             f" {', '.join(f'{a.at:g}' for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
         )
+    return b
+
+
+def moved(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
+    """B of the controlled modes, (n_controlled, n_actuators), where some actuator moves each.
+
+    Raises:
+        DesignError: no actuators, or a mode at whose nodes all of them stand.
+    """
+    if not actuators:
+        raise DesignError("there are no actuators to control with; add one")
+    b = input_matrix(modes, actuators)[list(controlled)]
+    possible = _largest_participation(modes, actuators)
+    for row, r in zip(b, controlled, strict=True):
+        if np.abs(row).max() < UNMOVED * possible[r]:
+            raise DesignError(f"no actuator moves mode {r + 1}: all stand at its nodes; move one")
     return b
 
 
