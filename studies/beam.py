@@ -14,6 +14,7 @@ from workbench.design.modal_filter import displacement_filter
 from workbench.design.placement import place, placement_task
 from workbench.design.spillover import effort, finite_spillover, quadratic_cost
 from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works
+from workbench.draw.motion import response_motion
 from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
 from workbench.identification.ibrahim import stacked_delays
 from workbench.identification.refinement import refine
@@ -202,4 +203,10 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
         "motion",
         plot_motion(responses, x),
         "The beam from end to end (upwards) over time (rightwards), without and with control.",
+    )
+    shown = {name: responses[name] for name in ("no control", "through modal filters")}
+    sensors = [Sensor(f"y{i + 1}", at, "displacement") for i, at in enumerate(SENSORS)]
+    outcome.motion(
+        response_motion(shown, actuators=laws["IMSC"].actuators, sensors=sensors),
+        "The same motion: struck at x = 6.3, with nobody at the controls and with four actuators (triangles).",
     )

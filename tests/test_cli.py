@@ -84,6 +84,9 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     np.testing.assert_allclose(imsc["work"][5:], expected, rtol=1e-5)
     assert coupled["cost"] <= imsc["cost"] * (1 + 1e-9)
     assert "mode 6" in result.output
+    page = run("report", found, "--page", tmp_path / "p.html")
+    assert page.exit_code == 0 and "page" in page.output
+    assert "coupled LQR" in (tmp_path / "p.html").read_text() and (tmp_path / "p.page.json").is_file()
 
 
 def test_place_does_better_than_even_places(rig, tmp_path):
@@ -107,6 +110,8 @@ def test_place_does_better_than_even_places(rig, tmp_path):
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("diagnose", "nowhere"), "not a folder"),
         (("study", "nothing_of_that_name"), "no study is called"),
+        (("report", "nowhere.json"), "no such file"),
+        (("report", "{rig}"), "no study is called"),
         (("study", "ruler"), "needs --data"),
         (("study", "ruler", "--data", "nowhere.mat"), "no such file"),
     ],
@@ -160,6 +165,6 @@ def test_cases_that_fail_are_reported_at_the_end_beside_the_others(tmp_path, mon
 
 
 def test_every_command_explains_itself_with_an_example():
-    for name in ("study", "identify", "design", "place", "diagnose"):
+    for name in ("study", "identify", "design", "place", "diagnose", "trial", "report"):
         result = run(name, "--help")
         assert result.exit_code == 0 and "Example: workbench" in result.output

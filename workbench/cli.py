@@ -169,6 +169,7 @@ def identify(
         json_path,
         {
             "sensors": read.output_names,
+            "positions": [channel.at for channel in read.output_channels],
             "frequencies_hz": found.modes.frequencies_hz,
             "frequencies_std_hz": found.omega_std / TURN,
             "damping_ratios": found.modes.zeta,
@@ -222,6 +223,7 @@ def design(
             "impulse_at": at,
             "weight": weight,
             "final_time": end,
+            "controlled": list(range(n)),
             "laws": [
                 {
                     "law": r.law.name,
@@ -322,7 +324,7 @@ def diagnose(
         console.print(f"  rival      {label} ({probability:.2g})", markup=False)
     for note in verdict.notes:
         console.print(f"  {note}", markup=False)
-    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html")
+    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)
     if json_path is not None:
         write_whole(json_path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
         console.print(f"  verdict    {_short(json_path)}", markup=False)
@@ -370,6 +372,30 @@ def trial(
     if json_path is not None:
         _write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})
     console.print(f"  picture  {_short(picture)}", markup=False)
+
+
+@app.command()
+@_guarded
+def report(
+    what: Annotated[str, typer.Argument(help="A JSON file of this command, a case folder, or a study that has run.")],
+    page: Annotated[Path | None, typer.Option(help="Write the page here; default out/NAME.html.")] = None,
+) -> None:
+    """Make one page of a study, a case or a result: figures that zoom, motion that moves, no network needed.
+
+    Example: workbench report verdict.json
+    """
+    from workbench.study.page import write_page
+    from workbench.study.report import story_about
+
+    name, story = story_about(what)
+    console.print(story.title, style="bold", markup=False)
+    if story.lead:
+        console.print(f"  {story.lead}", markup=False)
+    for line in story.lines:
+        console.print(f"  {line}", markup=False)
+    target = write_page(page or Path("out") / f"{name}.html", story)
+    console.print(f"  page  {_short(target)}", markup=False)
+    console.print(f"  data  {_short(target.with_suffix('.page.json'))}", markup=False)
 
 
 def _structure_rig(path: Path):

@@ -9,7 +9,7 @@ import pytest
 from workbench.draw.style import new_figure
 from workbench.study.catalogue import StudyError, describe
 from workbench.study.outcome import Outcome, plain
-from workbench.study.page import study_page, write_page
+from workbench.study.page import Story, study_page, write_page
 
 
 class Tags(HTMLParser):
@@ -66,12 +66,12 @@ def test_a_page_is_one_file_and_escapes_what_it_is_told(tmp_path):
     assert "<script>alert(1)</script>" not in text and "&lt;script&gt;alert(1)" in text
     assert "Is 1 &lt; 2 &amp; 3?" in text
     sources = [a["src"] for _, a in tags.found if "src" in a] + [a["href"] for _, a in tags.found if "href" in a]
-    assert sources and all(s.startswith("data:image/png;base64,") for s in sources)
+    assert all(s.startswith("data:") for s in sources), "nothing is fetched"
     assert [a["class"] for t, a in tags.found if t == "td" and "class" in a] == ["good", "bad"]
 
 
 def test_hostile_table_cells_are_escaped(tmp_path):
-    path = write_page(tmp_path / "p.html", title="t", tables=[("<b>", ("<i>",), [("</td><img src=x>",)])])
+    path = write_page(tmp_path / "p.html", Story("t", tables=[("<b>", ("<i>",), [("</td><img src=x>",)])]))
     tags = Tags()
     tags.feed(path.read_text(encoding="utf-8"))
     assert not {"b", "i", "img"} & {tag for tag, _ in tags.found}

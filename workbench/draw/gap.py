@@ -1,6 +1,6 @@
 """Figures of a diagnosis."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -8,19 +8,20 @@ from matplotlib.figure import Figure
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.verdict import Verdict
 from workbench.records.record import Record
+from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate
 
 
-def plot_responses(verdict: Verdict, records: Sequence[Record]) -> Figure:
-    """Measured, nominal and corrected, for the sensor and the stretch of each record where they differ most."""
+def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure:
+    """Measured and simulated by each rig, at the sensor and in the stretch where the first differs most, by record."""
     records = list(records)[-3:]
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
     for ax, record in zip(axes[:, 0], records, strict=True):
-        nominal, corrected = (
-            simulate(rig, record.inputs, sample_time=record.sample_time).outputs
-            for rig in (verdict.nominal, verdict.corrected)
-        )
-        spread = ((record.outputs - nominal) / record.outputs.std(axis=1, keepdims=True)) ** 2
+        outputs = {
+            name: simulate(rig, record.inputs, sample_time=record.sample_time).outputs for name, rig in rigs.items()
+        }
+        first = next(iter(outputs.values()))
+        spread = ((record.outputs - first) / record.outputs.std(axis=1, keepdims=True)) ** 2
         j = int(spread.mean(axis=1).argmax())
         width = min(record.n_samples, 300)
         smooth = np.convolve(spread[j], np.ones(width), mode="valid")
@@ -28,12 +29,26 @@ def plot_responses(verdict: Verdict, records: Sequence[Record]) -> Figure:
         channel = record.output_channels[j]
         time = record.time[piece]
         ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=2.6, alpha=0.35)
-        ax.plot(time, nominal[j, piece], color=COLOURS[1], label="nominal", linestyle="--")
-        ax.plot(time, corrected[j, piece], color=COLOURS[0], label="corrected")
+        for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
+            ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style)
         ax.set_title(f"record {record.name}, sensor {channel.name}")
         ax.set_ylabel(f"{channel.quantity} [{channel.unit}]" if channel.unit else channel.quantity)
         ax.legend(loc="upper right", ncols=3)
     axes[-1, 0].set_xlabel("time [s]")
+    return figure
+
+
+def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
+    """The gap of each record before and after, over the floor that no model of this kind gets below."""
+    records = list(gap["before"])
+    figure, ax = new_figure(width=9, height=3.5)
+    for i, (name, colour) in enumerate(zip(("before", "after", "floor"), (COLOURS[1], COLOURS[0], GREY))):
+        values = [gap[name].get(record) or np.nan for record in records]
+        ax.bar(np.arange(len(records)) + 0.27 * (i - 1), values, 0.27, color=colour, label=name)
+    ax.set_xticks(np.arange(len(records)), records)
+    ax.set_xlim(-1.0, max(len(records), 3) - 0.5)
+    ax.set(yscale="log", xlabel="record", ylabel="gap", title="the gap on records kept out of the fit")
+    ax.legend()
     return figure
 
 

@@ -1,6 +1,7 @@
 """Studies: scripts of one question each, found by name or path, and run."""
 
 import ast
+import hashlib
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,4 +95,14 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
     spec.loader.exec_module(module)
     module.study(outcome, data)
     outcome.write_runs(root / "out")
-    return outcome.write(study.path.parent / "results"), study_page(outcome, root / "out")
+    made_by = f"workbench study {study.name}" + (f" --data {data}" if data else "")
+    page = study_page(outcome, root / "out", inputs=_inputs(study, data), made_by=made_by)
+    return outcome.write(study.path.parent / "results"), page
+
+
+def _inputs(study: StudyFile, data: Path | None) -> dict[str, str]:
+    """The script, and what tells the data from others."""
+    found = {f"studies/{study.path.name}": study.path.read_text(encoding="utf-8")}
+    if data is not None and data.is_file():
+        found["data (SHA-256)"] = f"{hashlib.sha256(data.read_bytes()).hexdigest()}  {data.name}"
+    return found

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from workbench.study.results import Results
 from workbench.study.runner import CACHE, run
+from workbench.study.whole_file import write_whole
 
 DIGITS = 10
 
@@ -39,6 +40,7 @@ class Outcome:
     tables: dict = field(default_factory=dict)
     checks: list[dict] = field(default_factory=list)
     figures: list[tuple[str, Path, str]] = field(default_factory=list)
+    shown: list[tuple[object, str]] = field(default_factory=list)
     runs: dict[str, Results] = field(default_factory=dict)
 
     def say(self, text: str) -> None:
@@ -59,11 +61,16 @@ class Outcome:
         )
 
     def figure(self, name: str, figure: Figure, caption: str) -> None:
-        """Save a figure as figures/STUDY-name.png."""
+        """Save a figure as figures/STUDY-name.png, and show it on the page."""
         self.figures_folder.mkdir(parents=True, exist_ok=True)
         path = self.figures_folder / f"{self.name}-{name}.png"
         figure.savefig(path, metadata={"Software": None})
         self.figures.append((name, path, caption))
+        self.shown.append((figure, caption))
+
+    def motion(self, motion: Mapping, caption: str) -> None:
+        """Show motion on the page, as `draw.motion` describes it."""
+        self.shown.append((motion, caption))
 
     def track(self, iterable: Iterable, what: str) -> Iterator:
         """The same iterable, with its progress shown."""
@@ -85,10 +92,8 @@ class Outcome:
 
     def write(self, folder: Path) -> Path:
         """Write folder/NAME.json."""
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{self.name}.json"
-        path.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        return path
+        text = json.dumps(self.to_json(), indent=1, allow_nan=False) + "\n"
+        return write_whole(folder / f"{self.name}.json", text)
 
     def write_runs(self, folder: Path) -> list[Path]:
         """Write the table of each run as folder/STUDY-name.csv."""

@@ -1,126 +1,161 @@
-"""One self-contained page per study or diagnosis: figures inlined, text escaped, no network."""
+"""One self-contained page per study or diagnosis: figures that zoom, motion that moves, text escaped, no network."""
 
-import base64
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from jinja2 import Environment
+from markupsafe import Markup
 
+from workbench.draw.interactive import drawable
+from workbench.study.cases import StudyError
 from workbench.study.outcome import Outcome
 from workbench.study.versions import versions
 
-TEMPLATE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ title }}</title>
-<style>
-:root { --ink:#1b1f24; --paper:#ffffff; --soft:#5c6670; --line:#d8dde3; --good:#00795a; --bad:#b03a00; --card:#f6f8fa; }
-@media (prefers-color-scheme: dark) { :root { --ink:#e8eaed; --paper:#14171a; --soft:#a3adb8; --line:#353b42;
-  --good:#3ecf9b; --bad:#ff9a66; --card:#1c2126; } figure img { filter: invert(0.9) hue-rotate(180deg); } }
-@media print { :root { --ink:#000; --paper:#fff; } figure { break-inside: avoid; } }
-body { font: 16px/1.5 system-ui, sans-serif; color: var(--ink); background: var(--paper); max-width: 62rem;
-  margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.6rem; line-height: 1.25; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-.lead { font-size: 1.2rem; background: var(--card); border-left: 4px solid var(--good); padding: .8rem 1rem; }
-figure { margin: 1.2rem 0; } figure img { width: 100%; height: auto; } figcaption { color: var(--soft); }
-.scroll { overflow-x: auto; } table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .92rem; }
-th, td { padding: .25rem .7rem; border-bottom: 1px solid var(--line); text-align: right; }
-th:first-child, td:first-child { text-align: left; } th { cursor: pointer; color: var(--soft); font-weight: 600; }
-.good { color: var(--good); } .bad { color: var(--bad); } footer { color: var(--soft); font-size: .85rem;
-  margin-top: 3rem; border-top: 1px solid var(--line); padding-top: .6rem; }
-details summary { cursor: pointer; color: var(--soft); }
-</style></head><body>
-<h1>{{ title }}</h1>
-{% if lead %}<p class="lead">{{ lead }}</p>{% endif %}
-{% if lines %}<ul>{% for line in lines %}<li>{{ line }}</li>{% endfor %}</ul>{% endif %}
-{% for figure in figures %}<figure><img alt="{{ figure.caption }}" src="data:image/png;base64,{{ figure.data }}">
-<figcaption>{{ figure.caption }}</figcaption></figure>{% endfor %}
-{% for table in tables %}<h2>{{ table.title }}</h2><div class="scroll"><table><thead><tr>
-{% for head in table.heads %}<th>{{ head }}</th>{% endfor %}</tr></thead><tbody>
-{% for row in table.rows %}<tr>{% for cell in row %}<td{% if cell is sameas true %} class="good">holds{% elif cell is
- sameas false %} class="bad">does not hold{% else %}>{{ cell }}{% endif %}</td>{% endfor %}</tr>{% endfor %}
-</tbody></table></div>{% endfor %}
-<footer>{{ made_by }}. {% for name, version in versions.items() %}{{ name }} {{ version }}{{ ", " if not loop.last }}{%
- endfor %}.</footer>
-<script>
-document.querySelectorAll("th").forEach(function (head) { head.addEventListener("click", function () {
-  var body = head.closest("table").tBodies[0], column = head.cellIndex, up = head.dataset.up !== "1";
-  head.dataset.up = up ? "1" : "0";
-  Array.from(body.rows).sort(function (a, b) {
-    var x = a.cells[column].textContent, y = b.cells[column].textContent, p = parseFloat(x), q = parseFloat(y);
-    var order = isNaN(p) || isNaN(q) ? x.localeCompare(y) : p - q; return up ? order : -order;
-  }).forEach(function (row) { body.appendChild(row); }); }); });
-</script></body></html>
-"""
+ASSETS = Path(__file__).with_name("assets")
+SCRIPTS = ("figure.js", "motion.js", "table.js")
+FORMAT = "workbench page 1"
+MOST_ROWS = 2000
 
 
-def write_page(
-    path: Path,
-    *,
-    title: str,
-    lead: str = "",
-    lines: Sequence[str] = (),
-    figures: Sequence[tuple[Path | bytes, str]] = (),
-    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence]]] = (),
-    made_by: str = "",
-) -> Path:
-    """Write a page; every text is escaped, every figure inlined.
+@dataclass(frozen=True)
+class Story:
+    """All that a page shows, as plain values: the page can be made again from it.
 
-    Args:
-        path: of the HTML file.
-        figures: (PNG file or its bytes, caption).
+    Attributes:
+        title, lead, lines: what was asked, what was found in a sentence, and what else was found.
+        blocks: figures ("figure"), motion ("motion") or pictures ("picture", PNG in base64), each with a "caption".
         tables: (title, heads, rows); a cell of True or False reads "holds" or "does not hold".
-        made_by: the command that makes the page again.
+        inputs: what the page was made from, text by name.
+        made_by: the command that makes it again.
+        versions: of what computed it.
     """
-    environment = Environment(autoescape=True, trim_blocks=True)
-    shown = [
-        {"data": base64.b64encode(f if isinstance(f, bytes) else Path(f).read_bytes()).decode(), "caption": caption}
-        for f, caption in figures
-    ]
-    html = environment.from_string(TEMPLATE).render(
-        title=title,
-        lead=lead,
-        lines=list(lines),
-        figures=shown,
+
+    title: str
+    lead: str = ""
+    lines: Sequence[str] = ()
+    blocks: Sequence[Mapping] = ()
+    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence]]] = ()
+    inputs: Mapping[str, str] = field(default_factory=dict)
+    made_by: str = ""
+    versions: Mapping[str, str] = field(default_factory=versions)
+
+    def to_json(self) -> dict:
+        """Plain JSON, told from others by its "format"."""
+        return {"format": FORMAT, **asdict(self)}
+
+
+def story_of(content: dict) -> Story:
+    """The story that `Story.to_json` wrote.
+
+    Raises:
+        StudyError: a file of another format, or one that has been damaged.
+    """
+    shape = {"title": str, "lead": str, "lines": list, "blocks": list, "tables": list, "inputs": dict, "made_by": str}
+    shape["versions"] = dict
+    bad = [name for name, kind in shape.items() if not isinstance(content.get(name), kind)]
+    bad += ["tables"] * (not bad and not all(_is_table(table) for table in content["tables"]))
+    bad += ["blocks"] * (not bad and not all(isinstance(block, dict) for block in content["blocks"]))
+    if content.get("format") != FORMAT or bad:
+        raise StudyError(f"this is no {FORMAT!r}: its {bad[0] if bad else 'format'} is missing or damaged")
+    return Story(**{name: content[name] for name in shape})
+
+
+def _is_table(table) -> bool:
+    return (
+        isinstance(table, list) and len(table) == 3 and isinstance(table[1], list) and isinstance(table[2], list)
+        and all(isinstance(row, list) for row in table[2])
+    )  # fmt: skip
+
+
+def block(shown, caption: str) -> dict:
+    """A figure, or the motion that `draw.motion` describes, with its caption."""
+    return {**({"motion": dict(shown)} if isinstance(shown, Mapping) else drawable(shown)), "caption": caption}
+
+
+def write_page(path: Path, story: Story) -> Path:
+    """Write a story as a page, and as JSON beside it (.page.json); every text is escaped."""
+    environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    template = environment.from_string((ASSETS / "page.html").read_text(encoding="utf-8"))
+    moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in story.blocks]
+    html = template.render(
+        **{
+            name: getattr(story, name) for name in ("title", "lead", "lines", "blocks", "inputs", "made_by", "versions")
+        },
         tables=[
-            {"title": t, "heads": heads, "rows": [[_cell(c) for c in r] for r in rows]} for t, heads, rows in tables
+            {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
+            for title, heads, rows in story.tables
         ],
-        made_by=made_by,
-        versions=versions(),
+        css=asset("page.css"),
+        scripts=Markup("\n").join(map(asset, SCRIPTS)),
+        data=in_script(moving),
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(html, encoding="utf-8")
+    text = json.dumps(story.to_json(), separators=(",", ":"))
+    path.with_suffix(".page.json").write_text(text + "\n", encoding="utf-8")
     return path
 
 
-def study_page(outcome: Outcome, folder: Path) -> Path:
-    """The page of a study: what it found, its figures, its checks."""
+def asset(name: str) -> Markup:
+    """One of the files that pages are made of."""
+    return Markup((ASSETS / name).read_text(encoding="utf-8"))
+
+
+def in_script(content) -> Markup:
+    """JSON that may stand in a script element: nothing in it can end the element."""
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    for sign in "<>&\u2028\u2029":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return Markup(text)
+
+
+def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | None = None, made_by: str = "") -> Path:
+    """The page of a study: what it found, its figures, its checks, the tables of its runs."""
     checks = [
         (c["name"], _cell(c["value"]), ("≥ " if c["at_least"] else "≤ ") + _cell(c["limit"]), c["holds"])
         for c in outcome.checks
     ]
-    return write_page(
-        folder / f"{outcome.name}.html",
+    runs = [(name, *_table_of(found.rows())) for name, found in outcome.runs.items()]
+    story = Story(
         title=outcome.title or outcome.name,
-        lines=outcome.lines,
-        figures=[(path, caption) for _, path, caption in outcome.figures],
-        tables=[*_rows_of(outcome.tables), *([("Checks", ("what", "value", "limit", ""), checks)] if checks else ())],
-        made_by=f"workbench study {outcome.name}",
+        lines=tuple(outcome.lines),
+        blocks=[block(shown, caption) for shown, caption in outcome.shown],
+        tables=[
+            *tables_of(outcome.tables),
+            *([("Checks", ("what", "value", "limit", ""), checks)] if checks else ()),
+            *runs,
+        ],
+        inputs=inputs or {},
+        made_by=made_by or f"workbench study {outcome.name}",
     )
+    return write_page(folder / f"{outcome.name}.html", story)
 
 
-def _rows_of(tables: dict) -> list[tuple]:
-    """Those tables that are rows of named figures; what else a study keeps is in its JSON."""
-    found = []
-    for name, table in tables.items():
-        if isinstance(table, list) and table and all(isinstance(row, dict) for row in table):
-            heads = tuple(table[0])
-            found.append((name.replace("_", " "), heads, [[row.get(head, "") for head in heads] for row in table]))
-    return found
+def tables_of(content: Mapping) -> list[tuple]:
+    """Those tables that are rows of named figures; what else there is stays in the JSON."""
+    return [
+        (name.replace("_", " "), *_table_of(table))
+        for name, table in content.items()
+        if isinstance(table, list) and table and all(isinstance(row, dict) for row in table)
+    ]
+
+
+def _table_of(rows: Sequence[Mapping]) -> tuple[tuple, list]:
+    heads = tuple(dict.fromkeys(head for row in rows for head in row if head != "versions"))
+    return heads, [[_shown(row.get(head)) for head in heads] for row in rows]
+
+
+def _shown(value):
+    return "" if value is None else value if isinstance(value, bool) else _cell(value)
 
 
 def _cell(value):
-    if isinstance(value, list):
-        return ", ".join(str(_cell(item)) for item in value)
     if isinstance(value, bool):
         return value
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return ", ".join(str(_cell(item)) for item in value)
     return f"{value:.6g}" if isinstance(value, float) else str(value)

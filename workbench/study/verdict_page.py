@@ -1,20 +1,34 @@
 """The page of a diagnosis."""
 
-from io import BytesIO
+import hashlib
 from pathlib import Path
 
+import numpy as np
+
 from workbench.draw.gap import plot_missing_force, plot_responses, plot_rivals, plot_where
+from workbench.draw.motion import mode_motion
 from workbench.gap.case import Case
 from workbench.gap.verdict import Verdict
-from workbench.study.page import write_page
+from workbench.study.page import Story, block, write_page
+
+MOVING = "How the nominal model swings, and the corrected one where it differs; circles are sensors, triangles inputs."
 
 
-def verdict_page(verdict: Verdict, case: Case, path: Path) -> Path:
-    """Write the page: the verdict, measured beside nominal and corrected, where, the missing force, the rivals."""
+def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None) -> Path:
+    """Write the page: the verdict, measured beside nominal and corrected, where, the missing force, the rivals.
+
+    Args:
+        verdict: of the diagnosis.
+        case: that was diagnosed.
+        path: of the HTML file.
+        folder: that the case was read from, so that the page can say what it was.
+    """
+    nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
+    changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
     shown = verdict.to_json()
     figures = [
         (
-            plot_responses(verdict, (*case.fit, *case.validation)),
+            plot_responses({"nominal": verdict.nominal, "corrected": verdict.corrected}, (*case.fit, *case.validation)),
             "Measured, nominal and corrected response where they"
             " differ most. Validation records were not seen by any fit.",
         ),
@@ -50,21 +64,32 @@ def verdict_page(verdict: Verdict, case: Case, path: Path) -> Path:
         ("Effects", ("effect", "parameter", "value", "standard deviation", "x", "input or output"), effects),
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
-    return write_page(
-        path,
+    moving = mode_motion(
+        {"nominal": verdict.nominal.modes, **({"corrected": verdict.corrected.modes} if changed else {})},
+        actuators=verdict.nominal.actuators,
+        sensors=verdict.nominal.sensors,
+    )
+    story = Story(
         title=f"Diagnosis of {verdict.case}",
         lead=verdict.sentence,
         lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
-        figures=[(_png(figure), caption) for figure, caption in figures],
+        blocks=[
+            *(block(figure, caption) for figure, caption in figures),
+            *([block(moving, MOVING)] if verdict.nominal.structure is not None else []),
+        ],
         tables=[table for table in tables if table[2]],
-        made_by=f"workbench diagnose {verdict.case}",
+        inputs={} if folder is None else case_inputs(folder),
+        made_by=f"workbench diagnose {folder or verdict.case}",
     )
+    return write_page(path, story)
 
 
-def _png(figure) -> bytes:
-    buffer = BytesIO()
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
+def case_inputs(folder: Path) -> dict[str, str]:
+    """What a case was read from: its description, and what tells its records from others."""
+    files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != "case.toml")
+    digests = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder)}" for file in files]
+    text = (folder / "case.toml").read_text(encoding="utf-8")
+    return {f"{folder.name}/case.toml": text, "records (SHA-256)": "\n".join(digests)}
 
 
 def _could_show(verdict: Verdict) -> str:

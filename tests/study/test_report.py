@@ -1,0 +1,112 @@
+"""A report of any file that the command wrote, and of none that only looks like one."""
+
+import json
+
+import pytest
+
+from workbench.study.cases import StudyError
+from workbench.study.report import story_about, story_in
+
+VERDICT = {
+    "case": "arm", "outcome": "explained", "sentence": "A spring explains it.", "nearest": [], "notes": ["a note"],
+    "effects": [{"kind": "ground_spring", "parameters": {"stiffness": 2.0}, "parameters_std": {"stiffness": 0.1},
+                 "at": 3.0}],
+    "alternatives": [{"kind": "point_mass", "probability": 0.01}], "next_experiment": "Strike it.",
+    "gap": {"before": {"r": 0.5}, "after": {"r": 0.02}, "floor": {"r": 0.01}},
+}  # fmt: skip
+IDENTIFIED = {
+    "sensors": ["a", "b"], "positions": [1.0, 2.0], "frequencies_hz": [3.0], "frequencies_std_hz": [0.1],
+    "damping_ratios": [0.01], "damping_std": [0.001], "shapes_real": [[1.0], [0.5]], "shapes_imag": [[0.0], [0.1]],
+}  # fmt: skip
+DESIGNED = {
+    "weight": 2.0, "controlled": [0],
+    "laws": [{"law": "IMSC", "cost": 1.0, "effort": 2.0, "peak_force": 3.0, "work": [-1.0, 0.25, 0.5],
+              "poles_real": [-1.0, -1.0], "poles_imag": [2.0, -2.0]}],
+}  # fmt: skip
+STUDIED = {
+    "front": [{"x": 1.0, "y": "<b>"}, {"x": 2.0, "z": [1, 2]}],
+    "checks": [{"name": "c", "value": 0.5, "limit": 1.0, "holds": True, "at_least": False}], "found": ["a line"],
+}  # fmt: skip
+KINDS = {"verdict": VERDICT, "identified": IDENTIFIED, "designed": DESIGNED, "studied": STUDIED}
+
+
+def written(tmp_path, content, name="file.json"):
+    path = tmp_path / name
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    return path
+
+
+def test_a_verdict_tells_its_story(tmp_path):
+    story = story_in(written(tmp_path, VERDICT))
+    assert story.title == "Diagnosis of arm" and story.lead == "A spring explains it."
+    assert story.lines == ["a note", "Strike it."]
+    assert story.tables[0][2] == [["ground_spring", "stiffness", 2.0, 0.1, 3.0]]
+    assert story.tables[1][2] == [["r", 0.5, 0.02, 0.01]]
+    boxes = [mark["boxes"][0][3] for mark in story.blocks[0]["figure"]["panels"][0]["marks"]]
+    assert boxes == [0.5, 0.02, 0.01]
+
+
+def test_identified_modes_swing(tmp_path):
+    [moving, damping] = story_in(written(tmp_path, IDENTIFIED)).blocks
+    [track] = moving["motion"]["tracks"]
+    assert track["x"] == [1.0, 2.0] and track["frequencies_hz"] == [3.0] and "figure" in damping
+    assert track["imaginary"] == [[0.0], [0.1]]
+
+
+def test_a_design_shows_what_it_spills(tmp_path):
+    story = story_in(written(tmp_path, DESIGNED))
+    assert story.tables == [("Laws", ("law", "cost", "effort", "peak force", "W_R"), [["IMSC", 1.0, 2.0, 3.0, 0.75]])]
+    [bars] = [m for m in story.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "bars"]
+    assert [box[3] for box in bars["boxes"]] == [0.25, 0.5]
+
+
+def test_results_of_a_study_and_any_rows_become_tables(tmp_path):
+    story = story_in(written(tmp_path, STUDIED))
+    assert story.tables[0] == ("front", ("x", "y", "z"), [["1", "<b>", ""], ["2", "", "1, 2"]])
+    assert story.tables[1][2] == [["c", 0.5, "≤ 1", True]] and story.lines == ["a line"]
+    rows = story_in(written(tmp_path, [{"a": 1}], "rows.json"))
+    assert rows.title == "rows" and rows.tables == [("rows", ("a",), [["1"]])]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ("{", "cannot be read as JSON"),
+        ("[" * 100_000, "cannot be read as JSON"),
+        ('{"a": NaN}', "NaN is no number of JSON"),
+        ("3", "holds a int"),
+        ("{}", "no rows of named figures"),
+        ('{"format": "page 9"}', "has the format 'page 9'"),
+        ('{"format": "workbench page 1"}', "its title is missing"),
+        ('{"sentence": 3}', "looks like a verdict, but is damaged"),
+        ('{"laws": [{}]}', "looks like a comparison of control laws, but is damaged"),
+        ('{"laws": 3}', "looks like a comparison"),
+        ('{"shapes_real": [[1, 2], [3]]}', "looks like the modes of a record"),
+        ('{"checks": "no"}', "looks like the results of a study"),
+    ],
+)
+def test_what_is_something_else_is_refused(tmp_path, content, words):
+    with pytest.raises(StudyError, match=words):
+        story_in(written(tmp_path, content))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("fault", [None, "text", 3, -1.5, [], {}, [None], [[]], [{}], True])
+def test_no_wrong_part_ends_in_anything_but_a_story_or_a_refusal(tmp_path, kind, fault):
+    for name in KINDS[kind]:
+        try:
+            story = story_in(written(tmp_path, {**KINDS[kind], name: fault}))
+        except StudyError:
+            continue
+        assert all(isinstance(line, str) for line in (story.title, story.lead, *story.lines))
+        assert all(len(row) == len(heads) for _, heads, rows in story.tables for row in rows)
+
+
+def test_a_study_that_has_not_run_says_so(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies/some.py").write_text('"""Why?"""\ndef study(outcome, data=None): ...\n')
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StudyError, match="study some has left no page here; run it: workbench study some"):
+        story_about("some")
+    with pytest.raises(StudyError, match="no study is called 'other'"):
+        story_about("other")

@@ -1,0 +1,291 @@
+"""A figure as plain numbers, for a page to draw: to zoom, to hover over, to read on a phone and in the dark."""
+
+import base64
+from io import BytesIO
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection, QuadMesh
+from matplotlib.colors import to_hex
+from matplotlib.container import BarContainer
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon, Rectangle
+from matplotlib.text import Annotation, Text
+from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
+
+MOST_POINTS = 4000
+MOST_CELLS = (160, 320)
+DASHES = {"-": "", "--": "6 4", ":": "2 3", "-.": "7 3 2 3"}
+POINTS = 4.0 / 3.0  # CSS pixels in a point
+BARE = {"None", "none", "", " "}
+
+
+class Undescribed(TypeError):
+    """A figure that holds what only matplotlib can draw."""
+
+
+def drawable(figure: Figure) -> dict:
+    """What a page draws of a figure: its description as "figure", or a "picture" (PNG in base64) where it has none."""
+    try:
+        return {"figure": described(figure)}
+    except Undescribed:
+        buffer = BytesIO()
+        figure.savefig(buffer, format="png")
+        return {"picture": base64.b64encode(buffer.getvalue()).decode()}
+
+
+def described(figure: Figure) -> dict:
+    """The panels of a figure, what is drawn in each, and how: lists, numbers and texts only.
+
+    Raises:
+        Undescribed: naming the artist that has no plain description.
+    """
+    figure.canvas.draw()
+    axes = [ax for ax in figure.axes if ax.get_visible() and not hasattr(ax, "_colorbar")]
+    width, height = figure.get_size_inches() * 96
+    starts = {ax: ax.get_subplotspec() for ax in axes}
+    return {
+        "columns": max((s.get_gridspec().ncols for s in starts.values() if s is not None), default=1),
+        "width": round(width),
+        "panels": [_panel(ax, axes, height) for ax in axes],
+        "legend": bool(figure.legends),
+    }
+
+
+def _panel(ax: Axes, axes: list[Axes], height: float) -> dict:
+    marks = [mark for artist in _artists(ax) for mark in _described(ax, artist)]
+    return {
+        "title": _text(ax.get_title("left") or ax.get_title()),
+        "height": round(ax.get_position().height * height),
+        "x": _axis(ax, ax.xaxis, ax.get_xlim(), ax.get_xscale(), ax.get_shared_x_axes(), axes),
+        "y": _axis(ax, ax.yaxis, ax.get_ylim(), ax.get_yscale(), ax.get_shared_y_axes(), axes),
+        "legend": ax.get_legend() is not None,
+        "marks": marks,
+    }
+
+
+def _axis(ax: Axes, axis, limits, scale: str, shared, axes: list[Axes]) -> dict:
+    if scale not in ("linear", "log"):
+        raise Undescribed(f"an axis with scale {scale!r}")
+    found = {
+        "label": _text(axis.get_label().get_text()),
+        "limits": [float(v) for v in limits],
+        "log": scale == "log",
+        "group": min(axes.index(other) for other in shared.get_siblings(ax) if other in axes),
+    }
+    if not isinstance(axis.get_major_locator(), MaxNLocator | LogLocator):
+        if not isinstance(axis.get_major_locator(), FixedLocator | NullLocator) and not axis.have_units():
+            raise Undescribed(f"ticks by {type(axis.get_major_locator()).__name__}")
+        names = [label.get_text() for label in axis.get_ticklabels()]
+        found["ticks"] = [[float(at), _text(name)] for at, name in zip(axis.get_ticklocs(), names)]
+    return found
+
+
+def _artists(ax: Axes) -> list:
+    bars = [c for c in ax.containers if isinstance(c, BarContainer)]
+    of_bars = {id(patch) for c in bars for patch in c.patches}
+    alone = [a for a in (*ax.collections, *ax.images, *ax.patches, *ax.lines, *ax.texts) if a.get_visible()]
+    return sorted([*bars, *(a for a in alone if id(a) not in of_bars)], key=_height)
+
+
+def _height(artist) -> float:
+    return artist.patches[0].get_zorder() if isinstance(artist, BarContainer) else artist.get_zorder()
+
+
+def _described(ax: Axes, artist) -> list[dict]:
+    if isinstance(artist, BarContainer):
+        boxes = [_box(ax, patch) for patch in artist.patches]
+        colours = [_colour(patch.get_facecolor()) for patch in artist.patches]
+        return [{"kind": "bars", "boxes": boxes, "colours": colours, "label": _label(artist)}]
+    for kind, describe in KINDS.items():
+        if isinstance(artist, kind):
+            return describe(ax, artist)
+    raise Undescribed(f"a {type(artist).__name__}")
+
+
+def _line(ax: Axes, line: Line2D) -> list[dict]:
+    style = {"colour": _colour(line.get_color()), "label": _label(line), "alpha": _alpha(line)}
+    style |= {"width": round(line.get_linewidth() * POINTS, 2), "dash": DASHES.get(line.get_linestyle(), "")}
+    for transform, axis, values in (
+        (ax.get_xaxis_transform(), "x", line.get_xdata()),
+        (ax.get_yaxis_transform(), "y", line.get_ydata()),
+    ):
+        if line.get_transform() is transform:
+            return [{"kind": "rule", "axis": axis, "at": float(np.atleast_1d(values)[0]), **style}]
+    if line.get_transform() is not ax.transData:
+        raise Undescribed("a line that is not in the axes' coordinates")
+    x, y = np.asarray(line.get_xdata(orig=False), float), np.asarray(line.get_ydata(orig=False), float)
+    if x.size == 0:
+        return []
+    if line.get_linestyle() in BARE:
+        style["width"] = 0
+    marker = str(line.get_marker())
+    if marker not in BARE:
+        style |= {"marker": marker, "size": round(line.get_markersize() * POINTS * (0.5 if marker == "." else 1.0), 2)}
+        fill = line.get_markerfacecolor()
+        style |= {"hollow": isinstance(fill, str) and fill in BARE}
+    return [{"kind": "line", **_thinned(x, y), **style}]
+
+
+def _thinned(x: np.ndarray, y: np.ndarray) -> dict:
+    """At most MOST_POINTS points that look the same: along rising x, the least and the largest of each stretch."""
+    if x.size > MOST_POINTS:
+        if (np.diff(x) >= 0).all():
+            edges = np.linspace(0, x.size, MOST_POINTS // 2 + 1).astype(int)
+            pieces = [(a, np.nan_to_num(y[a:b])) for a, b in zip(edges, edges[1:])]
+            keep = np.unique([a + i for a, piece in pieces for i in (piece.argmin(), piece.argmax())])
+        else:
+            keep = np.arange(0, x.size, -(-x.size // MOST_POINTS))
+        x, y = x[keep], y[keep]
+    return {"x": _numbers(x), "y": _numbers(y)}
+
+
+def _box(ax: Axes, patch: Rectangle) -> list[float | None]:
+    x0, y0 = patch.get_xy()
+    x1, y1 = x0 + patch.get_width(), y0 + patch.get_height()
+    if patch.get_data_transform() == ax.get_xaxis_transform():
+        return [*_numbers([x0, x1]), None, None]
+    if patch.get_data_transform() == ax.get_yaxis_transform():
+        return [None, None, *_numbers([y0, y1])]
+    return _numbers([x0, x1, y0, y1])
+
+
+def _rectangle(ax: Axes, patch: Rectangle) -> list[dict]:
+    faint = patch.get_facecolor()
+    look = {"colours": [_colour(faint)], "alpha": float(faint[3]), "label": _label(patch)}
+    if faint[3] == 0:
+        look = {"colours": ["none"], "edge": _colour(patch.get_edgecolor()), "label": _label(patch)}
+    return [{"kind": "bars", "boxes": [_box(ax, patch)], **look}]
+
+
+def _points(ax: Axes, points: PathCollection) -> list[dict]:
+    x, y = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float).T
+    faces, sizes = points.get_facecolors(), points.get_sizes()
+    colours = [_colour(face) for face in faces] or [_colour(c) for c in points.get_edgecolors()]
+    same = {"colour": colours[0]} if len(colours) <= 1 else {"colours": colours, "colour": colours[0]}
+    size = round(float(np.sqrt(np.mean(sizes))) * POINTS, 2)
+    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "width": 0, "marker": "o", "size": size, **same,
+             "label": _label(points), "alpha": _alpha(points)}]  # fmt: skip
+
+
+def _polygons(ax: Axes, areas: PolyCollection) -> list[dict]:
+    face = areas.get_facecolors()
+    if len(face) == 0:
+        raise Undescribed("areas without a colour")
+    return [
+        {"kind": "area", **dict(zip("xy", map(_numbers, path.vertices.T))), "colour": _colour(face[0]),
+         "alpha": float(face[0][3]), "label": _label(areas)}
+        for path in areas.get_paths()
+    ]  # fmt: skip
+
+
+def _polygon(ax: Axes, patch: Polygon) -> list[dict]:
+    face = patch.get_facecolor()
+    x, y = patch.get_xy().T
+    return [{"kind": "area", "x": _numbers(x), "y": _numbers(y), "colour": _colour(face), "alpha": float(face[3]),
+             "label": _label(patch)}]  # fmt: skip
+
+
+def _segments(ax: Axes, lines: LineCollection) -> list[dict]:
+    gap = np.full((1, 2), np.nan)
+    x, y = np.concatenate([part for segment in lines.get_segments() for part in (segment, gap)]).T
+    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "colour": _colour(lines.get_colors()[0]),
+             "width": round(float(np.mean(lines.get_linewidths())) * POINTS, 2), "dash": "", "label": _label(lines),
+             "alpha": _alpha(lines)}]  # fmt: skip
+
+
+def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict]:
+    corners = mesh.get_coordinates()
+    x, y = corners[0, :, 0], corners[:, 0, 1]
+    if not (np.allclose(corners[..., 0], x) and np.allclose(corners[..., 1].T, y)):
+        raise Undescribed("a mesh that is no grid")
+    values = np.ma.filled(mesh.get_array().astype(float), np.nan)
+    return [_field(mesh, values.reshape(values.shape[-2:]), (x[0], x[-1]), (y[0], y[-1]))]
+
+
+def _image(ax: Axes, image: AxesImage) -> list[dict]:
+    values = np.ma.filled(np.ma.asarray(image.get_array()).astype(float), np.nan)
+    if values.ndim != 2:
+        raise Undescribed("a picture of colours")
+    left, right, bottom, top = image.get_extent()
+    return [_field(image, values if image.origin == "lower" else values[::-1], (left, right), (bottom, top))]
+
+
+def _field(artist, values: np.ndarray, x, y) -> dict:
+    """Values over a grid, in 255 steps of its colours; 255 means none."""
+    steps = [max(1, -(-n // most)) for n, most in zip(values.shape, MOST_CELLS)]
+    values = values[:: steps[0], :: steps[1]]
+    low, high = (float(v) for v in artist.get_clim())
+    shares = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)
+    steps = np.where(np.isfinite(values), np.round(254 * np.nan_to_num(shares)), 255).astype(np.uint8)
+    bar = artist.colorbar
+    return {
+        "kind": "field",
+        "x": _numbers(x),
+        "y": _numbers(y),
+        "shape": list(steps.shape),
+        "values": base64.b64encode(steps.tobytes()).decode(),
+        "limits": [low, high],
+        "colours": [to_hex(c) for c in artist.cmap(np.linspace(0.0, 1.0, 33))],
+        "label": _text(bar.ax.get_ylabel() or bar.ax.get_xlabel()) if bar else "",
+    }
+
+
+def _words(ax: Axes, text) -> list[dict]:
+    if not text.get_text().strip():
+        return []
+    shift, at = (0.0, 0.0), text.get_position()
+    transform = text.get_transform()
+    if isinstance(text, Annotation):
+        at = text.xy
+        if text.anncoords == "offset points":
+            shift = text.get_position()
+            transform = text.xycoords
+        elif text.anncoords != "data":
+            raise Undescribed("a note away from what it notes")
+    at = [float(v) for v in (ax.convert_xunits(at[0]), ax.convert_yunits(at[1]))]
+    if transform in ("axes fraction", ax.transAxes):
+        frame = "axes"
+    elif transform in ("data", ax.transData) or isinstance(text, Annotation):
+        frame = "data"
+    else:
+        raise Undescribed("a text that is not in the axes' coordinates")
+    return [{"kind": "text", "x": at[0], "y": at[1], "frame": frame, "text": _text(text.get_text()),
+             "shift": [shift[0] * POINTS, -shift[1] * POINTS], "colour": _colour(text.get_color()),
+             "across": text.get_ha(), "up": text.get_va(), "size": round(text.get_fontsize() * POINTS, 1)}]  # fmt: skip
+
+
+KINDS = {
+    Line2D: _line,
+    Rectangle: _rectangle,
+    Polygon: _polygon,
+    PathCollection: _points,
+    LineCollection: _segments,
+    PolyCollection: _polygons,
+    QuadMesh: _mesh,
+    AxesImage: _image,
+    Text: _words,
+}
+
+
+def _numbers(values) -> list[float | None]:
+    return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, float)]
+
+
+def _colour(colour) -> str:
+    return to_hex(colour)
+
+
+def _alpha(artist) -> float:
+    return 1.0 if artist.get_alpha() is None else float(artist.get_alpha())
+
+
+def _label(artist) -> str:
+    label = str(artist.get_label() or "")
+    return "" if label.startswith("_") else _text(label)
+
+
+def _text(text: str) -> str:
+    return text.replace("$", "").replace("\\mathdefault", "").strip()

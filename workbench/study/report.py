@@ -1,0 +1,205 @@
+"""A report of what is at hand: a study that has run, a case folder, or a JSON file that the command wrote."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from workbench.draw.beam import plot_two_works
+from workbench.draw.gap import plot_gaps, plot_responses
+from workbench.draw.motion import mode_motion
+from workbench.draw.tables import plot_deviations, plot_poles
+from workbench.gap.case import read_case
+from workbench.structure.modes import SampledModes
+from workbench.study.cases import StudyError
+from workbench.study.catalogue import find_study
+from workbench.study.page import FORMAT, Story, block, story_of, tables_of
+from workbench.study.verdict_page import MOVING, case_inputs
+
+TURN = 2.0 * np.pi
+MOST_BYTES = 200_000_000
+
+
+def story_about(what: str) -> tuple[str, Story]:
+    """The name and the story of a JSON file, a case folder, or a study by name.
+
+    Raises:
+        StudyError: none of these, a study that has not run here, or a file that holds something else.
+    """
+    path = Path(what)
+    if path.is_dir():
+        return path.resolve().name, case_story(path)
+    if path.suffix == ".json":
+        return path.name.removesuffix(".json").removesuffix(".page"), story_in(path)
+    study = find_study(what)
+    kept = study.path.resolve().parent.parent / "out" / f"{study.name}.page.json"
+    if not kept.is_file():
+        raise StudyError(f"study {study.name} has left no page here; run it: workbench study {what}")
+    return study.name, story_in(kept)
+
+
+def case_story(folder: Path) -> Story:
+    """What a case holds before any diagnosis: its nominal model, in motion, and its records beside what that says."""
+    case = read_case(folder)
+    rig, records = case.rig, (*case.fit, *case.validation)
+    places = {"actuators": rig.actuators, "sensors": rig.sensors}
+    blocks = [block(mode_motion({"nominal": rig.modes}, **places), MOVING)]
+    beside = plot_responses({"nominal": rig}, records)
+    told = "Measured beside the nominal model, at the sensor and in the stretch where they differ most."
+    rows = [
+        (r.name, "fit" if r in case.fit else "validate", r.n_samples, r.sample_rate_hz, float(r.inputs.std()))
+        for r in records
+    ]
+    modes = list(zip(range(1, rig.modes.n_modes + 1), rig.modes.frequencies_hz.tolist(), rig.modes.zeta.tolist()))
+    return Story(
+        title=f"Case {case.name}, before any diagnosis",
+        lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
+        blocks=[*(blocks if rig.structure is not None else []), block(beside, told)],
+        tables=[
+            ("Records", ("record", "use", "samples", "sample rate [Hz]", "input rms"), rows),
+            ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
+        ],
+        inputs=case_inputs(folder),
+        made_by=f"workbench report {folder}",
+    )
+
+
+def story_in(path: Path) -> Story:
+    """The story that a JSON file holds or tells.
+
+    Raises:
+        StudyError: no such file, no JSON, or JSON of something else.
+    """
+    if not path.is_file():
+        raise StudyError(f"{path}: there is no such file")
+    if path.stat().st_size > MOST_BYTES:
+        raise StudyError(f"{path} holds {path.stat().st_size} bytes; a report reads at most {MOST_BYTES}")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+    except (ValueError, RecursionError) as error:
+        raise StudyError(f"{path} cannot be read as JSON: {error}") from error
+    if isinstance(content, list):
+        content = {path.stem: content}
+    if not isinstance(content, dict):
+        raise StudyError(f"{path} holds a {type(content).__name__}; a report needs an object or a list of rows")
+    if "format" in content:
+        if content["format"] != FORMAT:
+            raise StudyError(f"{path} has the format {content['format']!r:.60}; this workbench reads {FORMAT!r}")
+        return story_of(content)
+    tell = next((tell for key, tell in KINDS.items() if key in content), _anything)
+    try:
+        told = tell(content)
+    except (KeyError, TypeError, AttributeError, ValueError, IndexError, ArithmeticError) as error:
+        raise StudyError(
+            f"{path} looks like {tell.__doc__[0].lower()}{tell.__doc__[1:-1]}, but is damaged: {error!r:.120}"
+        ) from error
+    story = {"title": path.stem.replace("_", " "), "tables": _tables(content), **told}
+    return Story(made_by=f"workbench report {path.name}", **story)
+
+
+def _refuse(word: str):
+    raise ValueError(f"{word} is no number of JSON")
+
+
+def _tables(content: Mapping) -> list[tuple]:
+    single = {name: value for name, value in content.items() if isinstance(value, str | int | float | bool)}
+    alone = [("Figures", ("name", "value"), [[name, value] for name, value in single.items()])] if single else []
+    return [*alone, *tables_of(content)]
+
+
+def _words(lines: list) -> list[str]:
+    if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
+        raise TypeError(f"{lines!r:.60} is no list of texts")
+    return lines
+
+
+def _verdict(content: dict) -> dict:
+    """A verdict."""
+    gap = {name: dict(values) for name, values in content["gap"].items()}
+    effects = [
+        [effect["kind"], name, value, effect.get("parameters_std", {}).get(name, ""), effect.get("at", "")]
+        for effect in [*content["effects"], *content.get("nearest", [])]
+        for name, value in effect["parameters"].items()
+    ]
+    rivals = [[rival["kind"], rival["probability"]] for rival in content["alternatives"]]
+    gaps = [[record, *(gap[name].get(record) for name in ("before", "after", "floor"))] for record in gap["before"]]
+    tables = [
+        ("Effects", ("effect", "parameter", "value", "standard deviation", "x"), effects),
+        ("Gap on records kept out of the fit", ("record", "before", "after", "floor"), gaps),
+        ("Rivals", ("set of effects", "probability"), rivals),
+    ]
+    return {
+        "title": f"Diagnosis of {content['case']}",
+        "lead": _words([content["sentence"]])[0],
+        "lines": _words([*content.get("notes", []), *filter(None, [content.get("next_experiment")])]),
+        "blocks": [block(plot_gaps(gap), "The gap before and after, over the noise floor.")] if gaps else [],
+        "tables": [table for table in tables if table[2]],
+    }
+
+
+def _identified(content: dict) -> dict:
+    """The modes of a record."""
+    shapes = np.array(content["shapes_real"], float) + 1j * np.array(content["shapes_imag"], float)
+    hertz = np.array(content["frequencies_hz"], float)
+    if not (np.isfinite(shapes).all() and np.isfinite(hertz).all()):
+        raise ValueError("a shape or frequency is no number")
+    places = [np.nan if at is None else float(at) for at in content.get("positions") or [None] * len(shapes)]
+    modes = SampledModes(TURN * hertz, np.array(content["damping_ratios"], float), shapes, np.array(places))
+    columns = [content[n] for n in ("frequencies_hz", "frequencies_std_hz", "damping_ratios", "damping_std")]
+    names = [f"mode {r + 1}" for r in range(hertz.size)]
+    damping = plot_deviations(names, columns[2], columns[3], "damping ratio")
+    heads = ("mode", "frequency [Hz]", "standard deviation", "damping ratio", "standard deviation ")
+    return {
+        "blocks": [
+            block(
+                mode_motion({"identified": modes}), "The shapes found, at the sensors, with the phase that each has."
+            ),
+            block(damping, "Damping of each mode, and how well the record tells it."),
+        ],
+        "tables": [("Modes", heads, [[r + 1, *row] for r, row in enumerate(zip(*columns, strict=True))])],
+    }
+
+
+def _designed(content: dict) -> dict:
+    """A comparison of control laws."""
+    laws = content["laws"]
+    controlled = set(content.get("controlled", ()))
+    works = {law["law"]: np.array([w for r, w in enumerate(law["work"]) if r not in controlled]) for law in laws}
+    poles = {law["law"]: np.array(law["poles_real"], float) + 1j * np.array(law["poles_imag"], float) for law in laws}
+    rows = [[law["law"], law["cost"], law["effort"], law["peak_force"], works[law["law"]].sum()] for law in laws]
+    return {
+        "blocks": [
+            block(plot_two_works(works, first=len(controlled)), "Work that each law puts into each mode."),
+            block(plot_poles(poles), "Closed-loop poles."),
+        ],
+        "tables": [("Laws", ("law", "cost", "effort", "peak force", "W_R"), rows)],
+    }
+
+
+def _studied(content: dict) -> dict:
+    """The results of a study."""
+    checks = [
+        [c["name"], c["value"], ("≥ " if c.get("at_least") else "≤ ") + f"{c['limit']:.6g}", bool(c["holds"])]
+        for c in content["checks"]
+    ]
+    tables = tables_of({name: value for name, value in content.items() if name != "checks"})
+    return {
+        "lines": _words(content.get("found", [])),
+        "tables": [*tables, *([("Checks", ("what", "value", "limit", ""), checks)] if checks else [])],
+    }
+
+
+def _anything(content: dict) -> dict:
+    """A table."""
+    if not _tables(content):
+        raise ValueError("it holds no rows of named figures")
+    return {}
+
+
+KINDS: dict[str, Callable[[dict], dict]] = {
+    "sentence": _verdict,
+    "shapes_real": _identified,
+    "laws": _designed,
+    "checks": _studied,
+}
