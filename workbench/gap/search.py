@@ -1,0 +1,168 @@
+"""A search through the catalogue: every kind and target as one more effect beside those found before."""
+
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.evidence import Evidence
+from workbench.gap.fit import HOPELESS, Fit, cost_of, fit
+from workbench.gap.prediction import FitData
+from workbench.rig.rig import Rig
+
+SLACK = 0.03
+INTEGRATION_SHARE = 2e-6
+SURE = 30.0
+WORTHWHILE = 0.01  # of the noise power: less is within what two good finite-element models differ by
+TARGETS_A_KIND, JOINED = 2, 10
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What every step of a search works on.
+
+    Attributes:
+        rig: nominal, with what shows in the readings themselves.
+        data: all records to fit.
+        quick: the two most telling of them.
+        first: the most telling one, coarsely stepped.
+        catalogue: kinds of effects to try.
+        report: told (what, share done).
+        pool: threads.
+        nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
+    """
+
+    rig: Rig
+    data: FitData
+    quick: FitData
+    first: FitData
+    catalogue: tuple[Kind, ...]
+    report: Callable[[str, float], None]
+    pool: ThreadPoolExecutor
+    nominal: np.ndarray
+
+    def explains(self, candidate: Fit) -> bool:
+        """Whether what is left is noise, in every record, up to the error of integration."""
+        left = candidate.cost_by_channel.mean(axis=1)
+        per_record = self.data.counted[0].outputs.size
+        slack = SLACK + 5.0 * np.sqrt(2.0 / per_record) + INTEGRATION_SHARE * self.nominal.mean(axis=1)
+        overall = SLACK + INTEGRATION_SHARE * self.nominal.mean()
+        return bool((left < 1.0 + slack).all() and left.mean() < 1.0 + overall)
+
+    def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
+        """Whether the gain in likelihood pays for `extra` more numbers."""
+        n = self.data.n_values
+        return n * (than - candidate.cost) > SURE + extra * np.log(n)
+
+    def worthwhile(self, candidate: Fit, than: float) -> bool:
+        """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
+        return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > WORTHWHILE
+
+    def near(self, candidate: Fit, share: float) -> bool:
+        """Whether at most this share of the gap's power is left."""
+        return candidate.cost - 1.0 < share * (self.nominal.mean() - 1.0)
+
+    def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
+        """`function(search, candidate)` of each, in their order."""
+        return list(self.pool.map(lambda candidate: function(self, candidate), candidates))
+
+
+def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begin, end, *, finalists: int) -> list[Fit]:
+    """Fits of the given effects with one more, for every kind and target; the best `finalists` on all records."""
+    rig = apply_all(search.rig, given)
+    left = search.data.by_channel(search.data.residual(rig))
+    tasks = [
+        (kind, target)
+        for kind in search.catalogue
+        if kind is not RANDOM_DISTURBANCE and kind.name not in ("sensor_quantisation", "sensor_clipping")
+        for target in _worthwhile(kind, rig, left)
+        if not _repeats(kind, target, given)
+    ]
+    _ = evidence.at_peaks
+    started = [s for s in search.pool.map(lambda task: _started(search, rig, evidence, *task), tasks) if s]
+    search.report("starts", begin + 0.3 * (end - begin))
+    if given:
+        started = _promising(started, TARGETS_A_KIND)
+        started = list(search.pool.map(lambda s: _alone(search, rig, s), started))
+        started = _promising(started, TARGETS_A_KIND)[:JOINED]
+    quick_fits: list[Fit] = []
+    for i, candidate in enumerate(search.pool.map(lambda s: _quick_fit(search, given, s), started)):
+        search.report(candidate.effects[-1].kind.words, begin + (end - begin) * (0.3 + 0.5 * (i + 1) / len(started)))
+        quick_fits.append(candidate)
+    quick_fits.sort(key=lambda f: f.cost)
+    chosen = spread_over_kinds(quick_fits, 3)
+    close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
+    chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
+    full = list(search.pool.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), chosen))
+    full.sort(key=lambda f: f.cost)
+    running = [f for i, f in enumerate(full) if i < 3 or f.cost < 2.0 * full[0].cost]
+    full[: len(running)] = search.pool.map(lambda f: fit(search.rig, f.effects, search.data), running)
+    search.report("all records", end)
+    return sorted(full, key=lambda f: f.cost)
+
+
+def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
+    """The fits in their order, at most so many whose last effect is of one kind, none twice."""
+    chosen, counts, keys = [], {}, set()
+    for candidate in fits:
+        name = candidate.effects[-1].kind.name
+        if candidate.cost < HOPELESS and counts.get(name, 0) < most and candidate.key not in keys:
+            chosen.append(candidate)
+            keys.add(candidate.key)
+            counts[name] = counts.get(name, 0) + 1
+    return chosen
+
+
+def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> Iterable:
+    """Targets of a kind; a fault of one sensor is only looked for where that sensor disagrees."""
+    targets = kind.targets(rig)
+    if kind.path != "sensor":
+        return targets
+    by_sensor = left.max(axis=0)
+    names = [s.name for s in rig.sensors]
+    worst = {names[j] for j in np.argsort(-by_sensor)[:3]}
+    return [t for t in targets if t == "all" or t in worst or by_sensor[names.index(t)] > 0.2 * by_sensor.max()]
+
+
+def _repeats(kind: Kind, target, given: Sequence[Effect]) -> bool:
+    """The same figure of the same thing twice says nothing new."""
+    for effect in given:
+        if effect.kind is kind and (kind.path in ("actuator", "sensor") or "at" not in effect.values):
+            if target == effect.target or "all" in (target, effect.target) or kind.name == "truncated_modes":
+                return True
+    return False
+
+
+def _started(search: Search, rig: Rig, evidence: Evidence, kind: Kind, target) -> list[tuple[float, Effect]]:
+    """The two best starts of a kind on the most telling record, coarsely stepped, with their costs."""
+    starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+    costs = [cost_of(rig, (effect,), search.first) for effect in starts]
+    order = [i for i in np.argsort(costs) if costs[i] < HOPELESS]
+    # a lone start is of an effect that is linear in its number: its cost says nothing yet
+    return [(-1.0 if len(starts) == 1 else costs[i], starts[i]) for i in order[:2]]
+
+
+def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[list[tuple[float, Effect]]]:
+    """The tasks in the order of their costs, at most so many targets of a kind."""
+    kept, counts = [], {}
+    for task in sorted(started, key=lambda s: s[0][0]):
+        name = task[0][1].kind.name
+        counts[name] = counts.get(name, 0) + (task[0][0] >= 0)
+        if counts[name] <= most:
+            kept.append(task)
+    return kept
+
+
+def _alone(search: Search, rig: Rig, started: list[tuple[float, Effect]]) -> list[tuple[float, Effect]]:
+    """The best start, improved a little with the effects found before held fixed."""
+    candidate = fit(rig, (started[0][1],), search.quick, iterations=3)
+    return [(candidate.cost, candidate.effects[0])]
+
+
+def _quick_fit(search: Search, given: tuple[Effect, ...], started: list[tuple[float, Effect]]) -> Fit:
+    """The best of a kind's starts, improved a little on the quick records, jointly with the given effects."""
+    fits = [fit(search.rig, (*given, effect), search.quick, iterations=4 if given else 7) for _, effect in started]
+    return min(fits, key=lambda f: f.cost)
