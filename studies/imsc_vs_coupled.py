@@ -1,12 +1,15 @@
 """What does independent modal-space control give away against coupled LQR, and what does it save?"""
 
+import warnings
+
 import control
 import numpy as np
 
-from workbench.design.closed_loop import impulse_state
-from workbench.design.coupled import coupled_lqr
+from workbench.design.closed_loop import close_loop, impulse_state
+from workbench.design.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.imsc import imsc, riccati_gains, riccati_matrices
-from workbench.design.spillover import effort, quadratic_cost, spillover
+from workbench.design.on_off import on_off, on_off_work, respond_on_off
+from workbench.design.spillover import distributed_cost, effort, modal_cost, quadratic_cost, spillover
 from workbench.draw.design import plot_comparison
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
@@ -32,31 +35,90 @@ def riccati_errors() -> tuple[float, float]:
     return residual, gains
 
 
+def pole_gains(beam, outcome):
+    """The same poles by the Sylvester equation and by control.place: gains, poles missed."""
+    rows = []
+    for n, places in ((4, (1.3, 2.6)), (10, (1.3, 4.1, 7.7)), (20, (0.9, 2.3, 4.1, 6.2, 8.7))):
+        modes = beam.modes(n)
+        actuators = [Actuator(f"F{i + 1}", x) for i, x in enumerate(places)]
+        a, b = controlled_plant(modes, range(n), actuators)
+        wanted = modes.omega * (-0.1 + 1j * np.sqrt(1 - 0.1**2))
+        both = np.r_[wanted, wanted.conj()]
+
+        def missed(gain, a=a, b=b, both=both):
+            poles = np.linalg.eigvals(a - b @ gain)
+            return max(np.abs(poles - p).min() / abs(p) for p in both)
+
+        mine = coupled_poles(modes, n, actuators, poles=wanted).gain
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # place_poles often stops short of its own tolerance
+            peer = np.asarray(control.place(a, b, both))
+            rows.append(
+                {
+                    "modes": n,
+                    "actuators": len(places),
+                    "gain_norm": np.linalg.norm(mine),
+                    "place_gain_norm": np.linalg.norm(peer),
+                    "poles_missed": missed(mine),
+                    "place_poles_missed": missed(peer),
+                }
+            )
+        outcome.say(
+            f"{n} modes, {len(places)} actuators, 10 % damping: |K| = {rows[-1]['gain_norm']:.4g} against"
+            f" {rows[-1]['place_gain_norm']:.4g} of control.place"
+        )
+    return rows
+
+
 def study(outcome, data=None):
     beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
     modes = beam.modes(9)
     state = impulse_state(modes, 6.3)
     state[9 + 4 :] = 0.0
+    unattainable = distributed_cost(modes, 4, state, MODAL_WEIGHT)
 
     def compared(places):
         actuators = [Actuator(f"F{i + 1}", x) for i, x in enumerate(places)]
+        independent = imsc(modes, 4, actuators, weight=MODAL_WEIGHT)
+        poles = close_loop(modes.select(range(4)), independent).poles
+        poles = np.sort_complex(poles[poles.imag > 0])
+        poles = poles[np.argsort(poles.imag)]
         laws = {
-            "IMSC": imsc(modes, 4, actuators, weight=MODAL_WEIGHT),
+            "IMSC": independent,
             "coupled LQR": coupled_lqr(modes, 4, actuators, weight=FORCE_WEIGHT),
+            "coupled, IMSC's poles, two actuators fewer": coupled_poles(modes, 4, actuators[1:3], poles=poles),
         }
-        return [
+        rows = [
             {
                 "law": label,
                 "cost": quadratic_cost(modes, law, state, FORCE_WEIGHT),
+                "modal_cost": modal_cost(modes, law, state, MODAL_WEIGHT),
                 "effort": effort(modes, law, state),
                 "W_R": spillover(modes, law, state).residual_total,
             }
             for label, law in laws.items()
         ]
+        relay = on_off(modes, 4, actuators, force=0.05, dead_band=0.01, slope=0.05)
+        time = np.linspace(0.0, 120.0, 24001)
+        forces = respond_on_off(modes, relay, state, time).response.forces
+        rows.append(
+            {
+                "law": "IMSC on-off",
+                "effort": np.trapezoid((forces**2).sum(axis=0), time),
+                "W_R": on_off_work(modes, relay, state, 120.0).residual_total,
+            }
+        )
+        a, b = controlled_plant(modes, range(4), actuators)
+        p, _, _ = control.care(a, b, np.diag([*modes.omega[:4] ** 2, 1, 1, 1, 1]), FORCE_WEIGHT * np.eye(4))
+        start = np.r_[state[:4], state[9:13]]
+        return rows, float(start @ p @ start)
 
-    rows, crowded = compared((2.0, 4.0, 6.0, 8.0)), compared((1.3, 2.6, 3.9, 5.2))
+    (rows, least), (crowded, crowded_least) = compared((2.0, 4.0, 6.0, 8.0)), compared((1.3, 2.6, 3.9, 5.2))
+    gains_by_poles = pole_gains(beam, outcome)
     outcome.table("nodes_of_mode_5", rows)
     outcome.table("crowded", crowded)
+    outcome.table("distributed", {"modal_cost": unattainable, "W_R": 0.0})
+    outcome.table("poles", gains_by_poles)
 
     residual, gains = riccati_errors()
     outcome.check("Riccati residual of the closed form over five decades, relative", residual, 1e-12)
@@ -66,11 +128,44 @@ def study(outcome, data=None):
         abs(rows[1]["cost"] / rows[0]["cost"] - 1.0),
         1e-9,
     )
-    outcome.check("cost of coupled LQR over IMSC, actuators crowded", crowded[1]["cost"] / crowded[0]["cost"], 1.0)
+    outcome.check(
+        "cost of coupled LQR against x0ᵀ P x0 of control.care, relative, both places",
+        max(abs(rows[1]["cost"] / least - 1.0), abs(crowded[1]["cost"] / crowded_least - 1.0)),
+        1e-9,
+    )
+    outcome.check(
+        "IMSC, modal forces weighed, against distributed control wherever the actuators stand, relative",
+        max(abs(r[0]["modal_cost"] / unattainable - 1.0) for r in (rows, crowded)),
+        1e-9,
+    )
+    outcome.check(
+        "coupled LQR, modal forces weighed, over distributed control, actuators crowded",
+        crowded[1]["modal_cost"] / unattainable,
+        1.0,
+        at_least=True,
+    )
+    outcome.check(
+        "actuators crowded: cost of IMSC over coupled LQR",
+        crowded[0]["cost"] / crowded[1]["cost"],
+        90.0,
+        at_least=True,
+    )
+    outcome.check("poles of the Sylvester way, relative", max(r["poles_missed"] for r in gains_by_poles), 1e-9)
+    outcome.check(
+        "its gain norm over that of control.place",
+        max(r["gain_norm"] / r["place_gain_norm"] for r in gains_by_poles),
+        1.0,
+    )
     outcome.say("actuators at the nodes of mode 5: IMSC and coupled LQR are the same law")
     outcome.say(
         f"actuators crowded: coupled LQR costs {crowded[1]['cost'] / crowded[0]['cost']:.3f} of IMSC, with"
         f" {crowded[1]['effort'] / crowded[0]['effort']:.3f} of its effort and"
         f" {crowded[1]['W_R'] / crowded[0]['W_R']:.3f} of its spillover"
     )
-    outcome.figure("comparison", plot_comparison(crowded), "Actuators at 1.3, 2.6, 3.9, 5.2: coupled LQR beside IMSC.")
+    outcome.say(
+        "weighed on modal forces IMSC costs what distributed control does, wherever its actuators stand; what the"
+        " places decide is the effort and the spillover"
+    )
+    outcome.figure(
+        "comparison", plot_comparison(crowded[:2]), "Actuators at 1.3, 2.6, 3.9, 5.2: coupled LQR beside IMSC."
+    )

@@ -8,6 +8,7 @@ residual ones. For an undamped residual mode at rest and t_f to infinity the dou
 the energy that the actuators' forces leave in it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,8 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from workbench.design.closed_loop import ClosedLoop
 from workbench.design.coupled import controlled_plant
-from workbench.design.law import DesignError, Law
+from workbench.design.imsc import riccati_matrices
+from workbench.design.law import DesignError, Law, controlled_indices
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, frozen
 
@@ -152,14 +154,39 @@ def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
     return float(np.trace(law.gain @ gramian @ law.gain.T))
 
 
-def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
-    """∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt of the controlled modes over all time: the same yardstick for every law."""
+def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
+    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time: the same yardstick for every law.
+
+    Args:
+        weight: R, a number or (n_actuators, n_actuators); R BᵀB weighs modal forces, R fᵀf.
+    """
     a, b = controlled_plant(modes, law.controlled, law.actuators)
     index = list(law.controlled)
     start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
     gramian = solve_continuous_lyapunov(a - b @ law.gain, -np.outer(start, start))
-    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + weight * law.gain.T @ law.gain
+    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + _weighed(law.gain, weight)
     return float(np.trace(q @ gramian))
+
+
+def _weighed(gain: np.ndarray, weight: float | np.ndarray) -> np.ndarray:
+    return weight * gain.T @ gain if np.ndim(weight) == 0 else gain.T @ weight @ gain
+
+
+def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
+    """`quadratic_cost` with modal forces weighed, R fᵀf, f = B F."""
+    b = input_matrix(modes, law.actuators)[list(law.controlled)]
+    return quadratic_cost(modes, law, state, weight * b.T @ b)
+
+
+def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.ndarray, weight: float) -> float:
+    """The least `modal_cost` of any law: that of distributed control, f(x, t) = Σ m φ_r f_r (5.5), with W_R = 0.
+
+    Modal forces are then at will, one a mode, so the cost is Σ x_rᵀ P_r x_r of the closed-form Riccati equations.
+    """
+    index = list(controlled_indices(modes, controlled))
+    p = riccati_matrices(modes.omega[index], weight, np.diag(modes.damping)[index])
+    x = np.array([state[index], state[[modes.n_modes + r for r in index]]])
+    return float(np.einsum("ir,rij,jr->", x, p, x))
 
 
 def _energies(modes: Modes, state: np.ndarray) -> np.ndarray:
