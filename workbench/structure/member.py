@@ -16,6 +16,7 @@ from workbench.structure.supports import HELD, Attachment, End, PointDamper, Poi
 
 HIGHEST_DEGREE = 48
 MOST_FUNCTIONS = 2400
+RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -113,6 +114,7 @@ class _Member:
         if tension:
             rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
         held, essential = [], []
+        springs: list[tuple[float, np.ndarray]] = []  # stiffness, and the row that tells what it is stretched by
         last = segments.nodes.size - 1
         for node, at, end in ((0, 0.0, self.left), (last, self.length, self.right)):
             for derivative, spring in enumerate((end.translation, end.rotation)[:order]):
@@ -120,19 +122,18 @@ class _Member:
                 if spring == HELD:
                     held.append(index)
                     essential.append((at, derivative))
-                else:
-                    rigidity[index, index] += spring
+                elif spring:
+                    springs.append((spring, segments.evaluation(at, derivative)))
         for part in self.attachments:
             if isinstance(part, PointMass):
-                target, values = mass, (part.mass, part.rotary_inertia)
-            elif isinstance(part, PointSpring):
-                target, values = rigidity, (part.stiffness, part.rotational_stiffness)
-            else:
-                continue
-            for derivative, value in enumerate(values):
-                if value:
+                for derivative, value in enumerate((part.mass, part.rotary_inertia)):
                     row = segments.evaluation(part.at, derivative)
-                    target += value * row.T @ row
+                    mass += value * row.T @ row
+            elif isinstance(part, PointSpring):
+                for derivative, value in enumerate((part.stiffness, part.rotational_stiffness)):
+                    springs.append((value, segments.evaluation(part.at, derivative)))
+        for spring, row in springs:
+            rigidity += spring * row.T @ row
         free = np.setdiff1d(np.arange(segments.n_functions), held)
         if n_modes > free.size:
             raise ValueError(f"{n_modes} modes asked of {free.size} functions")
@@ -149,12 +150,18 @@ class _Member:
         except LinAlgError as error:
             raise ValueError(_unstable(tension)) from error
         nu, vectors = nu[::-1], vectors[:, ::-1]
-        eigenvalues = 1.0 / nu - shift
-        if (eigenvalues < -1e-7 * shift).any():
+        if (1.0 / nu - shift < -1e-7 * shift).any():
             raise ValueError(_unstable(tension))
-        omega = np.sqrt(np.where(eigenvalues < 1e-10 * shift, 0.0, eigenvalues))
         coefficients = np.zeros((segments.n_functions, n_modes))
         coefficients[free] = vectors / np.sqrt(np.einsum("ir,ij,jr->r", vectors, mass, vectors, optimize=True))
+        # Rayleigh's quotient, from the curvatures themselves: on a short segment the entries of K, EI/h³, cancel in a
+        # soft mode, and 1/ν - σ keeps little of it; a sum of squares keeps all.
+        eigenvalues = segments.form(stiffness, order, coefficients)
+        if tension:
+            eigenvalues += segments.form(lambda x: np.full(x.shape, tension), 1, coefficients)
+        for spring, row in springs:
+            eigenvalues += spring * (row @ coefficients)[0] ** 2
+        omega = np.sqrt(np.where(eigenvalues < RIGID * shift, 0.0, eigenvalues))
         rigid = np.flatnonzero(omega == 0)
         if rigid.size == 2:
             slope = segments.evaluation(0.5 * self.length, 1)[0] @ coefficients[:, rigid]

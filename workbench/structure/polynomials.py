@@ -109,6 +109,17 @@ class Segments:
             matrix[np.ix_(indices, indices)] += table.T @ (density[:, None] * table)
         return matrix
 
+    def form(self, weight, derivative: int, coefficients: np.ndarray) -> np.ndarray:
+        """Integral of weight(x) times the squared derivative of each column of coefficients: (n_columns,)."""
+        points, weights, tables = tabulated_basis(self.degree, self.continuity, self.degree + 4)
+        total = np.zeros(coefficients.shape[1])
+        for s in range(self.n_segments):
+            h = self.nodes[s + 1] - self.nodes[s]
+            x = self.nodes[s] + 0.5 * h * (points + 1.0)
+            table = tables[derivative] * self.scales(s) * (2.0 / h) ** derivative
+            total += (weights * 0.5 * h * weight(x)) @ (table @ coefficients[self.indices(s)]) ** 2
+        return total
+
     def unresolved(self, coefficients: np.ndarray) -> float:
         """Largest share of the last two internal coefficients among all: small once the degree suffices."""
         nodal = 2 * (self.continuity + 1)
