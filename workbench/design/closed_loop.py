@@ -16,13 +16,13 @@ UNSEEN = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoop:
-    """x' = A x, x = (q, q') of every mode, with the law's forces u = -K x̂ in it.
+    """x' = A x, x = (q, q') of every mode, then the states of an observer where there is one, forces u = -K x̂ in it.
 
     Attributes:
         modes: all of them.
         law: that closes the loop.
-        matrix: (2n, 2n) A, rad/s.
-        feedback: (n_actuators, 2n) from the state to the actuator forces, sign included.
+        matrix: (n_states, n_states) A, rad/s; n_states is 2 n_modes but for an observer's.
+        feedback: (n_actuators, n_states) from the state to the actuator forces, sign included.
     """
 
     modes: Modes
@@ -32,7 +32,7 @@ class ClosedLoop:
 
     @property
     def poles(self) -> np.ndarray:
-        """Closed-loop poles (2n,), rad/s."""
+        """Closed-loop poles (n_states,), rad/s."""
         return np.linalg.eigvals(self.matrix)
 
     @property
@@ -111,7 +111,8 @@ def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> np.ndarray:
 def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
     """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
 
-    Uniform instants share one matrix exponential; others cost one each.
+    A state (2 n_modes,) of the modes alone starts an observer from zero. Uniform instants share one matrix
+    exponential; others cost one each.
 
     Raises:
         ValueError: times that do not increase from zero or later.
@@ -119,11 +120,12 @@ def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndar
     time = np.asarray(time, float)
     if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
         raise ValueError("times must increase, from zero or later")
+    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
     modal = np.empty((state.size, time.size))
     modal[:, 0] = expm(loop.matrix * time[0]) @ state
     steps = np.diff(time)
     uniform = steps.size > 0 and np.ptp(steps) <= 1e-12 * time[-1]
-    step = expm(loop.matrix * steps[0]) if uniform else None
+    step = expm(loop.matrix * steps[0]) if uniform else np.zeros((0, 0))
     for k in range(1, time.size):
         modal[:, k] = (step if uniform else expm(loop.matrix * steps[k - 1])) @ modal[:, k - 1]
-    return Response(time, modal, loop.feedback @ modal, loop.modes)
+    return Response(time, modal[: 2 * loop.modes.n_modes], loop.feedback @ modal, loop.modes)

@@ -124,6 +124,7 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
     if not (np.isfinite(final_time) and final_time > 0):
         raise ValueError(f"the final time must be positive and finite; got {final_time}")
     n = loop.modes.n_modes
+    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
     moments = _second_moments(loop.matrix, state, final_time)
     force_rows = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
     work = np.array([force_rows[r] @ moments[:, n + r] for r in range(n)])

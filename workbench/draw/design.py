@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.design.closed_loop import Response
+from workbench.design.explain import Explanation
 from workbench.design.placement import Placement
 from workbench.design.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
@@ -118,4 +119,47 @@ def plot_comparison(rows: Sequence[dict]) -> Figure:
     ax.axhline(1.0, color=GREY, linewidth=0.8)
     ax.set_title("two ways to control the same modes with the same actuators, weighed on the actuator forces")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def plot_spillover_paths(explained: Explanation) -> Figure:
+    """Growth of each residual mode in the full closed loop, and by path what control adds to it."""
+    figure, axes = new_figure(1, 2, width=11, height=4.5, width_ratios=[1, 1.2])
+    moved = sorted(explained.moved, key=lambda m: m.mode)
+    numbers = [m.mode + 1 for m in moved]
+    growth = np.array([m.closed_pole.real for m in moved])
+    axes[0].bar(numbers, growth, color=[COLOURS[1] if g > 0 else COLOURS[0] for g in growth])
+    axes[0].plot(
+        numbers, [m.pole.real for m in moved], "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled"
+    )
+    axes[0].axhline(0.0, color=GREY, linewidth=0.8)
+    axes[0].set(xlabel="residual mode", ylabel="growth of the mode, Re λ [1/s]", xticks=numbers)
+    axes[0].set_title("above zero the full plant is unstable")
+    axes[0].legend()
+    worst = explained.moved[0]
+    labels = [f"sensor {p.sensor_at:.2f} → {p.actuator}" for p in worst.paths] + ["all paths"]
+    shifts = np.array([p.shift.real for p in worst.paths] + [worst.shift.real])
+    rows = np.arange(len(labels))[::-1]
+    axes[1].barh(rows, shifts, color=[COLOURS[1] if s > 0 else COLOURS[0] for s in shifts])
+    axes[1].axvline(0.0, color=GREY, linewidth=0.8)
+    axes[1].set_yticks(rows, labels)
+    axes[1].set(xlabel="what the path adds to the growth [1/s]", title=f"which path moves mode {worst.mode + 1}")
+    return figure
+
+
+def plot_cure(margins: dict[str, np.ndarray], counts: dict[str, int | None]) -> Figure:
+    """Stability margin of the full plant against the number of sensors, one line a way to estimate."""
+    figure, ax = new_figure(width=9, height=4.5)
+    for (name, values), colour, mark in zip(margins.items(), COLOURS, "osD", strict=False):
+        numbers = np.arange(1, len(values) + 1)
+        there = np.isfinite(values)
+        count = counts[name]
+        label = f"{name}: {count} suffice" if count else f"{name}: not by {len(values)} sensors"
+        ax.plot(numbers[there], values[there], mark + "-", color=colour, label=label, markersize=4)
+    ax.axhline(0.0, color=GREY, linewidth=1.0)
+    largest = max(v[np.isfinite(v)].max() for v in margins.values())
+    ax.set_yscale("symlog", linthresh=max(largest, 1e-6))
+    ax.set(xlabel="number of sensors, evenly spaced", ylabel="stability margin [1/s]; below zero unstable")
+    ax.set_title("observation spillover, and what sensors do about it")
+    ax.legend()
     return figure

@@ -1,0 +1,136 @@
+"""It works on the reduced model and fails on the full one: which mode did it, by which path, and what settles it?"""
+
+import numpy as np
+
+from workbench.design.closed_loop import close_loop
+from workbench.design.controller import close_with, filtered
+from workbench.design.coupled import coupled_lqr
+from workbench.design.explain import explain, stability_margin
+from workbench.design.law import Law
+from workbench.design.modal_filter import displacement_filter
+from workbench.design.observers import kalman, luenberger
+from workbench.design.remedies import remedies, sensors_that_suffice
+from workbench.draw.design import plot_cure, plot_spillover_paths
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+# after Balas (1978): a hinged beam, three modes controlled by one actuator at a sixth and one sensor
+CONTROLLED = 3
+ACTUATORS = (Actuator("F1", 10.0 / 6.0), Actuator("F2", 10.0 / 2.3))
+BESIDE, ACROSS = 10.0 / 6.0, 50.0 / 6.0
+
+
+def margins_of_filter(modes, way, actuators, count=24):
+    places = modes.length * np.arange(1, count + 1) / (count + 1)
+    return stability_margin(close_with(modes, way(actuators, places)))
+
+
+def study(outcome, data=None):
+    beam = Beam(
+        length=10.0,
+        mass_per_length=1.0,
+        bending_stiffness=1.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.002),
+    )
+    modes = beam.modes(12)
+
+    def law(actuators, share=1.0):
+        design = coupled_lqr(modes, CONTROLLED, actuators, weight=1.0)
+        return Law(share * design.gain, design.controlled, design.actuators, design.name)
+
+    def observed(actuators, sensors, share=1.0):
+        sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensors)]
+        return luenberger(modes, law(actuators, share), sensors, poles=(-0.3 + 1j) * modes.omega[:CONTROLLED])
+
+    def estimated(actuators, sensors, share=1.0):
+        sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(sensors)]
+        return kalman(modes, law(actuators, share), sensors, disturbance=1.0, noise=1e-2)
+
+    def through_filter(actuators, sensors, share=1.0):
+        return filtered(law(actuators, share), displacement_filter(modes.select(range(CONTROLLED)), sensors, 1.0))
+
+    def reduced(controller):
+        return stability_margin(close_with(modes.select(range(CONTROLLED)), controller))
+
+    one = ACTUATORS[:1]
+    stable, unstable = (explain(modes, observed(one, [place])) for place in (BESIDE, ACROSS))
+    outcome.check("margin on the reduced model, sensor across", reduced(observed(one, [ACROSS])), 0.01, at_least=True)
+    outcome.check("margin on the full model, sensor beside the actuator", stable.margin, 0.0, at_least=True)
+    outcome.check("margin on the full model, sensor across", unstable.margin, 0.0)
+    culprit = unstable.culprit
+    outcome.say(
+        f"one sensor at x = {BESIDE:.2f}, beside the actuator: stable, margin {stable.margin:.2g} 1/s; at {ACROSS:.2f}:"
+        f" mode {culprit.mode + 1} grows at {culprit.closed_pole.real:.2g} 1/s, though the reduced model's margin is"
+        f" {reduced(observed(one, [ACROSS])):.2g}"
+    )
+
+    # two actuators and two sensors: by which path?
+    crossed = explain(modes, observed(ACTUATORS, [3.1, ACROSS]))
+    worst = crossed.moved[0]
+    path = worst.paths[0]
+    outcome.check(
+        "paths add up to the exact movement of every residual pole, relative to its frequency",
+        max(abs(sum(p.shift for p in m.paths) - m.shift) / abs(m.pole) for m in crossed.moved),
+        1e-9,
+    )
+    outcome.say(
+        f"two actuators, two sensors: mode {worst.mode + 1} moves by {worst.shift.real:+.3g} 1/s,"
+        f" {path.shift.real:+.3g} of it from the sensor at {path.sensor_at:.2f} to {path.actuator}; first order says"
+        f" {worst.first_order.real:+.3g}"
+    )
+
+    found = remedies(modes, observed, one, [ACROSS])
+    for remedy in found:
+        outcome.say(f"settled by: {remedy.change}; margin then {remedy.margin:.2g} 1/s")
+    checked = [explain(modes, remedy.controller).margin for remedy in found]
+    outcome.check("every remedy, recomputed on the full plant: least margin", min(checked), 0.0, at_least=True)
+    outcome.check("kinds of remedy found", len(found), 4, at_least=True)
+
+    ways = {"Luenberger observer": observed, "Kalman filter": estimated, "modal filter": through_filter}
+    counts, margins = {}, {}
+    for name, way in ways.items():
+        counts[name], margins[name] = sensors_that_suffice(modes, way, one, most=24)
+        outcome.say(f"{name}: {counts[name] or 'no number up to 24 of'} evenly spaced sensors suffice")
+    outcome.say(
+        "an even grid of k sensors takes mode 2(k + 1) - r for mode r, so a filter of displacements alone is cured only"
+        " once the alias of its highest mode lies beyond the plant's"
+    )
+    perfect = stability_margin(close_loop(modes, law(one)))
+    outcome.check("a number of sensors suffices for the modal filter, up to", counts["modal filter"] or np.inf, 24)
+    outcome.check(
+        "its margin with 24 sensors over that with exact modal coordinates",
+        margins_of_filter(modes, through_filter, one) / perfect,
+        0.99,
+        at_least=True,
+    )
+    outcome.table(
+        "balas",
+        [
+            {
+                "sensor": place,
+                "margin": e.margin,
+                "mode": e.moved[0].mode + 1,
+                "shift": e.moved[0].shift.real,
+                "first_order": e.moved[0].first_order.real,
+            }
+            for place, e in ((BESIDE, stable), (ACROSS, unstable))
+        ],
+    )
+    outcome.table(
+        "paths",
+        [{"actuator": p.actuator, "sensor": p.sensor_at, "growth": p.shift.real} for p in worst.paths],
+    )
+    outcome.table("remedies", [{"kind": r.kind, "change": r.change, "size": r.size, "margin": r.margin} for r in found])
+    outcome.table("sensors_that_suffice", counts)
+    outcome.figure(
+        "paths",
+        plot_spillover_paths(crossed),
+        "How fast each residual mode grows or decays under control, and the paths that make it.",
+    )
+    outcome.figure(
+        "cure", plot_cure(margins, counts), "Stability margin of the full plant against the number of sensors."
+    )

@@ -1,0 +1,163 @@
+"""Which residual mode a design unsettles on the full plant, and by which path from sensor to actuator.
+
+Without mode r the rest of the loop answers readings y with forces T(s) y. Mode r closes that loop at s = λ + Δ:
+
+    (s - λ)(s - λ*) = b_rᵀ T(s) c_r(s),   so   Δ = Σ_ji b_rj T_ji(s) c_ir(s) / (s - λ*),
+
+one term for each actuator j and sensor i. At s = λ this is the perturbation of the eigenvalue to first order; at the
+pole of the full loop it is exact. Either spillover at zero, b_r or c_r, leaves the mode where it was (Balas 1978).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from workbench.design.closed_loop import ClosedLoop
+from workbench.design.controller import Controller, close_with, reading
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes
+
+SECANT_STEPS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """How far one actuator, fed by the sensors at one place, moves a mode's pole.
+
+    Attributes:
+        actuator: name.
+        sensor_at: place of the sensors, m; all the channels read there count together.
+        shift: its share of the exact movement, rad/s; the real part is what it adds to the growth.
+        first_order: the same from the open-loop pole.
+    """
+
+    actuator: str
+    sensor_at: float
+    shift: complex
+    first_order: complex
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """What a controller does to one residual mode.
+
+    Attributes:
+        mode: zero-based index.
+        pole: open loop, upper half plane, rad/s.
+        closed_pole: of the full closed loop.
+        paths: the most destabilising first; their shifts add up to the movement.
+    """
+
+    mode: int
+    pole: complex
+    closed_pole: complex
+    paths: tuple[Path, ...]
+
+    @property
+    def shift(self) -> complex:
+        """Movement of the pole, rad/s."""
+        return self.closed_pole - self.pole
+
+    @property
+    def first_order(self) -> complex:
+        """The movement to first order; far from `shift` where the spillover is not small."""
+        return sum(path.first_order for path in self.paths)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A controller on the full plant.
+
+    Attributes:
+        loop: of all modes.
+        moved: every residual mode, the least stable first.
+    """
+
+    loop: ClosedLoop
+    moved: tuple[Moved, ...]
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Of the whole closed loop, rad/s."""
+        return self.loop.poles
+
+    @property
+    def margin(self) -> float:
+        """Distance of the rightmost pole from the axis, 1/s; negative where the loop is unstable."""
+        return stability_margin(self.loop)
+
+    @property
+    def culprit(self) -> Moved | None:
+        """The residual mode that the controller unsettles, None where the loop is stable."""
+        return self.moved[0] if self.moved and self.moved[0].closed_pole.real > 0 else None
+
+
+def stability_margin(loop: ClosedLoop) -> float:
+    """-max Re of the poles, 1/s."""
+    return float(-loop.poles.real.max())
+
+
+def explain(modes: Modes, controller: Controller) -> Explanation:
+    """The poles of the whole, and what moved each residual mode, by path.
+
+    Args:
+        modes: of the fuller plant; those that the law does not control are residual.
+        controller: from `filtered`, `luenberger` or `kalman`.
+    """
+    loop = close_with(modes, controller)
+    residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
+    poles = loop.poles
+    upper = poles[poles.imag > 0]
+    moved = []
+    if residual:
+        at = [_OneMode(modes, controller, r) for r in residual]
+        far = np.abs(np.array([mode.closed_pole() for mode in at])[:, None] - upper[None, :])
+        for i, k in zip(*linear_sum_assignment(far), strict=True):
+            moved.append(Moved(residual[i], at[i].pole, complex(upper[k]), at[i].paths(complex(upper[k]))))
+    moved.sort(key=lambda m: -m.closed_pole.real)
+    return Explanation(loop, tuple(moved))
+
+
+class _OneMode:
+    """One residual mode, and the forces T(s) (n_actuators, n_channels) with which all the rest answers readings."""
+
+    def __init__(self, modes: Modes, controller: Controller, r: int) -> None:
+        rest = [i for i in range(modes.n_modes) if i != r]
+        own = modes.select(rest)
+        self._controller, self._loop = controller, close_with(own, controller)
+        b = input_matrix(own, controller.law.actuators) @ controller.direct
+        self._enters = np.vstack([np.zeros_like(b), b, controller.reads])
+        self._pushed = input_matrix(modes, controller.law.actuators)[r]
+        self._seen = reading(modes.select([r]), controller.sensors)
+        c, omega = modes.damping[r, r], modes.omega[r]
+        self.pole = complex(-0.5 * c + 1j * np.sqrt(max(omega**2 - 0.25 * c**2, 0.0)))
+
+    def _terms(self, s: complex) -> np.ndarray:
+        """Shares (n_actuators, n_channels) of the movement that s would be."""
+        matrix = self._loop.matrix
+        answer = self._loop.feedback @ np.linalg.solve(s * np.eye(matrix.shape[0]) - matrix, self._enters)
+        answer = answer + self._controller.direct
+        return self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
+
+    def closed_pole(self) -> complex:
+        """Where the mode goes: s = λ + Δ(s) by the secant method, else to first order."""
+        first = self.pole + self._terms(self.pole).sum()
+        near, s = self.pole, first
+        miss = near - first
+        for _ in range(SECANT_STEPS):
+            now = s - self.pole - self._terms(s).sum()
+            if abs(now) < 1e-12 * abs(s) or now == miss:
+                break
+            near, s, miss = s, s - now * (s - near) / (now - miss), now
+        return s if abs(s - self.pole) < 0.5 * abs(self.pole) else first
+
+    def paths(self, closed: complex) -> tuple[Path, ...]:
+        exact, first = self._terms(closed), self._terms(self.pole)
+        at = np.array([sensor.at for sensor in self._controller.sensors])
+        found = [
+            Path(actuator.name, place, complex(exact[j, at == place].sum()), complex(first[j, at == place].sum()))
+            for j, actuator in enumerate(self._controller.law.actuators)
+            for place in self._controller.places
+        ]
+        return tuple(sorted(found, key=lambda path: -path.shift.real))
