@@ -223,3 +223,24 @@ def test_bad_structures_are_refused(change, words):
 def test_positions_outside_are_refused():
     with pytest.raises(ValueError, match="outside"):
         uniform("hinged", "hinged").modes(2).phi(10.5)
+
+
+@pytest.mark.parametrize("softness", [1e-2, 1e-5, 1e-8, 1e-11])
+def test_a_soft_spring_keeps_its_digits(softness):
+    """A free bar on an end spring k: β tan β = k L / EA; ω² = k / m L where k is small."""
+    bar = Bar(length=2.0, mass_per_length=3.0, axial_stiffness=5.0, left=End(softness * 5.0 / 2.0), right="free")
+    beta = brentq(lambda b: b * np.tan(b) - softness, 0.5 * np.sqrt(softness), 1.5, xtol=1e-300, rtol=1e-15)
+    assert bar.modes(2).omega[0] == pytest.approx(beta / 2.0 * np.sqrt(5.0 / 3.0), rel=1e-12)
+
+
+def test_a_short_segment_leaves_a_rigid_body_rigid():
+    """Between a break and a mass close by, the entries of the stiffness matrix are 10⁷ times its eigenvalues."""
+    beam = Beam(
+        length=1.0,
+        mass_per_length=1.0,
+        bending_stiffness=([0.0, 0.168, 1.0], [1.0, 1.1, 1.0]),
+        left="free",
+        right="hinged",
+        attachments=(PointMass(0.5, 1.0), PointMass(0.172, 1.0)),
+    )
+    assert beam.modes(3).omega[0] == 0

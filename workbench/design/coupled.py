@@ -48,7 +48,7 @@ def coupled_lqr(
     r = r * np.eye(len(actuators)) if r.ndim == 0 else np.diag(r) if r.ndim == 1 else r
     if r.shape != (len(actuators),) * 2 or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
         raise DesignError(
-            f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {weight}"
+            f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {r}"
         )
     try:
         gain, _, poles = control.lqr(a, b, q, r)

@@ -106,7 +106,7 @@ def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:
     points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
     breaks = np.unique(np.r_[0.0, splines.t, modes.length])
     breaks = breaks[(breaks >= 0) & (breaks <= modes.length)]
-    total = 0.0
+    total = np.zeros((modes.n_modes, splines.c.shape[1]))
     for a, b in zip(breaks[:-1], breaks[1:], strict=True):
         at = a + 0.5 * (b - a) * (points + 1.0)
         density = modes.phi(at) * (mass(at) * weights * 0.5 * (b - a))[:, None]
@@ -117,5 +117,5 @@ def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:
 def _checked(positions: ArrayLike, least: int) -> np.ndarray:
     x = np.asarray(positions, float)
     if x.ndim != 1 or x.size < least or not (np.diff(x) > 0).all():
-        raise ValueError(f"at least {least} sensor positions, increasing, are needed; got {positions}")
+        raise ValueError(f"at least {least} sensor positions, increasing, are needed; got {x}")
     return x

@@ -158,9 +158,9 @@ def _response(modes: Modes, law: OnOffLaw, state, time, stretches) -> Response:
             modal[r, inside], modal[n + r, inside] = travel(
                 relay.omega, relay.damping, tau, stretch.displacement, stretch.rate, *pattern
             )
-            at = travel(omega, damping, tau, *driven, *pattern)
+            at = travel(omega, damping, tau, driven[0], driven[1], *pattern)
             position[:, inside] += push[:, [j]] * at[0]
             rate[:, inside] += push[:, [j]] * at[1]
-            driven = np.array(travel(omega, damping, stretch.end - stretch.start, *driven, *pattern))
+            driven = np.array(travel(omega, damping, stretch.end - stretch.start, driven[0], driven[1], *pattern))
     modal[residual], modal[[n + r for r in residual]] = position, rate
     return Response(time, modal, law.spread @ force, modes)

@@ -8,6 +8,7 @@ is singular and the forces grow without bound. So a placement here always limits
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -222,7 +223,7 @@ def batch_work(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.
 
 def law_at(task: PlacementTask, positions: ArrayLike, *, weight: float) -> Law:
     """The IMSC law with actuators at the given places."""
-    actuators = [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(positions)]
+    actuators = [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(np.asarray(positions, float))]
     return imsc(task.modes, task.n_controlled, actuators, weight=weight)
 
 
@@ -261,8 +262,14 @@ def _solver(task: PlacementTask, effort_limit: float, spacing: float, margin: fl
     reference = task.evaluate(length * (np.arange(n) + 1) / (n + 1))[0]
     gaps = z[1:] - z[:-1]
     constraints = ca.vertcat(effort / effort_limit, gaps)
-    problem = {"x": z, "f": ca.log(work / max(reference, 1e-300)), "g": constraints}
-    options = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes", "ipopt.max_iter": 200, "ipopt.tol": 1e-9}
+    problem: dict[str, ca.MX] = {"x": z, "f": ca.log(work / max(reference, 1e-300)), "g": constraints}
+    options: dict[str, Any] = {
+        "ipopt.print_level": 0,
+        "print_time": 0,
+        "ipopt.sb": "yes",
+        "ipopt.max_iter": 200,
+        "ipopt.tol": 1e-9,
+    }
     solver = ca.nlpsol("placement", "ipopt", problem, options)
     low, high = max(margin / length, 1e-3), 1.0 - max(margin / length, 1e-3)
 

@@ -7,6 +7,7 @@ go by leaving out the knots nearest that end ("not a knot"), which assumes nothi
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -86,7 +87,7 @@ class Spline:
 
 
 def interpolating_spline(
-    positions: Sequence[float], *, length: float, ends: KnownEnds = KnownEnds(), degree: int
+    positions: Sequence[float] | np.ndarray, *, length: float, ends: KnownEnds = KnownEnds(), degree: int
 ) -> Spline:
     """The spline through values at the sensors that honours the known ends.
 
@@ -99,13 +100,13 @@ def interpolating_spline(
     Raises:
         ValueError: an even degree, too few sensors for it, sensors outside, unplaced or at one place.
     """
-    positions = np.asarray(positions, float)
-    _check_places(positions, length, degree)
+    at_sensors = np.asarray(positions, float)
+    _check_places(at_sensors, length, degree)
     slack = 1e-9 * length
     conditions = _usable(ends.zeros, degree, length)
     held = [at for at, derivative in conditions if derivative == 0]
-    read = np.array([all(abs(x - at) > slack for at in held) for x in positions])
-    sites = np.union1d(positions[read], held)
+    read = np.array([all(abs(x - at) > slack for at in held) for x in at_sensors])
+    sites = np.union1d(at_sensors[read], np.array(held))
     derivatives = [(at, d) for at, d in conditions if d > 0]
     n_functions = sites.size + len(derivatives)
     if n_functions < degree + 1:
@@ -116,8 +117,8 @@ def interpolating_spline(
     knots = _knots(sites, derivatives, length, degree)
     unit = np.eye(n_functions)
     basis = BSpline(knots, unit, degree)
-    rows = [basis(positions[read])] + [basis(at, d)[None] * length**d for at, d in conditions]
-    targets = np.zeros((n_functions, positions.size))
+    rows = [basis(at_sensors[read])] + [basis(at, d)[None] * length**d for at, d in conditions]
+    targets = np.zeros((n_functions, at_sensors.size))
     targets[np.arange(read.sum()), np.flatnonzero(read)] = 1.0
     return Spline(frozen(knots), degree, frozen(np.linalg.solve(np.vstack(rows), targets)))
 
@@ -205,7 +206,7 @@ class _Splines:
 
     @classmethod
     def through(cls, sampled: SampledModes, *, length: float, ends: KnownEnds, degree: int | None) -> "_Splines":
-        where = {"length": length, "ends": ends}
+        where: dict[str, Any] = {"length": length, "ends": ends}
         degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
         return cls(
             tuple(

@@ -176,5 +176,5 @@ def _hankel(outputs: np.ndarray, delays: int) -> np.ndarray:
 def _leading_left(matrix: np.ndarray, order: int) -> np.ndarray:
     """Leading left singular vectors, by an orthogonal factorisation of the longer side first."""
     if matrix.shape[1] > matrix.shape[0]:
-        matrix = np.linalg.qr(matrix.T, mode="r").T
+        matrix = np.asarray(np.linalg.qr(matrix.T, mode="r")).T
     return svd(matrix, full_matrices=False)[0][:, :order]

@@ -69,10 +69,11 @@ class Refined:
     def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
         """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row."""
         width = float(ndtri(0.5 * (1.0 + level)))
-        return tuple(
+        omega, zeta = (
             np.stack([value - width * std, value + width * std])
             for value, std in ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
         )
+        return omega, zeta
 
 
 def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: bool = False) -> Refined:

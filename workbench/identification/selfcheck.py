@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -49,7 +50,7 @@ def structure_of(found: Distributions, *, kind: str, length: float, left: str | 
     Raises:
         ValueError: a distribution that is not positive everywhere.
     """
-    where = {"length": length, "left": left, "right": right, "mass_per_length": found.mass.profile}
+    where: dict[str, Any] = {"length": length, "left": left, "right": right, "mass_per_length": found.mass.profile}
     if kind == "bar":
         return Bar(axial_stiffness=found.stiffness.profile, **where)
     return Beam(bending_stiffness=found.stiffness.profile, **where)
@@ -107,7 +108,7 @@ def choose_terms(
     Raises:
         ValueError: no pair of numbers gives a structure; the last reason is told.
     """
-    ends = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
+    ends: dict[str, Any] = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
     best, tried, reason = None, [], "no number of terms was given"
     enough = _frequency_error(measured)
     pairs = sorted(((a, b) for a in terms for b in terms), key=lambda pair: (sum(pair), pair))

@@ -101,8 +101,8 @@ def real_modes(
     best, stayed = [best[i] for i in order], [stayed[i] for i in order]
     positions = diagram.found[0].positions
     modes = SampledModes(
-        [m.omega[r] for m, r in best],
-        [m.zeta[r] for m, r in best],
+        np.array([m.omega[r] for m, r in best]),
+        np.array([m.zeta[r] for m, r in best]),
         np.array([m.shapes[:, r] for m, r in best]).reshape(len(best), positions.size).T,
         positions,
     )

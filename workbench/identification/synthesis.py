@@ -37,7 +37,7 @@ def struck(modes: Modes, *, at: float, positions: Sequence[float], impulse: floa
         )
     omega_d = modes.omega * np.sqrt(1.0 - modes.zeta**2)
     shapes = -1j * impulse * modes.phi(positions) * modes.phi(at)[0] / omega_d
-    return SampledModes(modes.omega, modes.zeta, shapes, positions)
+    return SampledModes(modes.omega, modes.zeta, shapes, np.asarray(positions, float))
 
 
 def free_decay(
