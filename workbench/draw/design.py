@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 
 from workbench.design.closed_loop import Response
 from workbench.design.explain import Explanation
+from workbench.design.how_many import HowMany
 from workbench.design.placement import Placement
 from workbench.design.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
@@ -162,4 +163,24 @@ def plot_cure(margins: dict[str, np.ndarray], counts: dict[str, int | None]) -> 
     ax.set(xlabel="number of sensors, evenly spaced", ylabel="stability margin [1/s]; below zero unstable")
     ax.set_title("observation spillover, and what sensors do about it")
     ax.legend()
+    return figure
+
+
+def plot_how_many(found: dict[str, HowMany], share: float) -> Figure:
+    """What is left of each disturbance when the lowest n modes are controlled: untouched and spilled, as shares."""
+    figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
+    for ax, (name, result) in zip(axes[0], found.items(), strict=True):
+        total = result.energy.sum()
+        ax.bar(result.counts, result.untouched / total, color=COLOURS[0], label="in modes not controlled")
+        ax.bar(
+            result.counts, result.spilled / total, bottom=result.untouched / total, color=COLOURS[1], label="spilled"
+        )
+        ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
+        if result.recommended:
+            ax.axvline(
+                result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=f"control {result.recommended}"
+            )
+        ax.set(xlabel="modes controlled, n", xticks=result.counts, title=name)
+        ax.legend()
+    axes[0, 0].set_ylabel("share of the disturbance's energy left")
     return figure

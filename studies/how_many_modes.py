@@ -1,0 +1,81 @@
+"""How many modes are in need of control, and when does one more spill more than it takes?"""
+
+import numpy as np
+
+from workbench.design.closed_loop import close_loop, impulse_state
+from workbench.design.how_many import how_many_modes
+from workbench.design.imsc import imsc
+from workbench.design.placement import nodes_of_mode
+from workbench.design.spillover import finite_spillover
+from workbench.draw.design import plot_how_many
+from workbench.rig.actuators import Actuator
+from workbench.structure.member import Beam
+
+WEIGHT, SHARE, PUSH = 20.0, 0.05, 1.0
+
+
+def pushed(modes, at, seconds):
+    """State after a half-sine push (N) of some seconds at a place, undamped modes from rest, from its end on."""
+    w, turn = modes.omega, np.pi / seconds
+    strength = PUSH * modes.phi(at)[0]
+    s = 1j * w
+    transform = turn * (1 + np.exp(-s * seconds)) / (turn**2 - w**2) * strength
+    # q' + iω q at the end of the push is the push's transform turned on by e^{iωt}
+    moving = transform * np.exp(s * seconds)
+    return np.r_[moving.imag / w, moving.real]
+
+
+def study(outcome, data=None):
+    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    modes = beam.modes(24)
+    blow = impulse_state(modes, 6.3)
+    push = pushed(modes, 6.3, 4.0)
+    found = {
+        "a blow, the same momentum for every mode": how_many_modes(modes, blow, weight=WEIGHT, share=SHARE),
+        "a push of 4 s": how_many_modes(modes, push, weight=WEIGHT, share=SHARE),
+    }
+    for name, result in found.items():
+        n = result.recommended
+        outcome.say(
+            f"{name}: control {n} modes, which leave {result.left[n - 1] / result.energy.sum():.1%} of the energy"
+            if n
+            else f"{name}: no number up to {result.counts[-1]} leaves as little as {SHARE:.0%};"
+            f" least is left with {result.least}"
+        )
+        outcome.table(
+            name.split(",")[0].replace(" ", "_"),
+            {
+                "energy": result.energy,
+                "untouched": result.untouched,
+                "spilled": result.spilled,
+                "effort": result.effort,
+                "recommended": n,
+                "least": result.least,
+            },
+        )
+    gentle = found["a push of 4 s"]
+    n = gentle.recommended
+    law = imsc(modes, n, [Actuator(f"F{i}", x) for i, x in enumerate(nodes_of_mode(modes, n))], weight=WEIGHT)
+    rest = push.copy()
+    rest[n:24] = rest[24 + n :] = 0.0
+    late = finite_spillover(close_loop(modes, law), rest, 2000.0)
+    outcome.check(
+        "what the recommended number spills, against the work up to 2000 s, relative",
+        abs(late.residual_total / gentle.spilled[n - 1] - 1.0),
+        1e-6,
+    )
+    outcome.check(
+        "what control takes from its modes (5.27) against what the push gave them, relative",
+        abs(-late.controlled_total / gentle.energy[:n].sum() - 1.0),
+        1e-9,
+    )
+    outcome.check("modes recommended for the push of 4 s", n, 6)
+    outcome.check(
+        "left by one mode fewer, over what may be left",
+        gentle.left[n - 2] / (SHARE * gentle.energy.sum()),
+        1.0,
+        at_least=True,
+    )
+    outcome.figure(
+        "energy", plot_how_many(found, SHARE), "Energy left when the lowest n modes are controlled, by what leaves it."
+    )
