@@ -111,6 +111,8 @@ def test_place_does_better_than_even_places(rig, tmp_path):
         (("diagnose", "nowhere"), "not a folder"),
         (("study", "nothing_of_that_name"), "no study is called"),
         (("report", "nowhere.json"), "no such file"),
+        (("bench", "nowhere.toml"), "no such file"),
+        (("bench", "{rig}", "--port", 1_000_000), "port 1000000 cannot be had"),
         (("report", "{rig}"), "no study is called"),
         (("study", "ruler"), "needs --data"),
         (("study", "ruler", "--data", "nowhere.mat"), "no such file"),
@@ -165,6 +167,6 @@ def test_cases_that_fail_are_reported_at_the_end_beside_the_others(tmp_path, mon
 
 
 def test_every_command_explains_itself_with_an_example():
-    for name in ("study", "identify", "design", "place", "diagnose", "trial", "report"):
+    for name in ("study", "identify", "design", "place", "diagnose", "trial", "report", "bench"):
         result = run(name, "--help")
         assert result.exit_code == 0 and "Example: workbench" in result.output

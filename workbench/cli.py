@@ -398,6 +398,36 @@ def report(
     console.print(f"  data  {_short(target.with_suffix('.page.json'))}", markup=False)
 
 
+@app.command()
+@_guarded
+def bench(
+    rig: Annotated[
+        Path | None, typer.Argument(help="TOML with [structure], [[input]], [[output]]; a hinged beam unless given.")
+    ] = None,
+    port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 takes any that is free.")] = 8321,
+    show: Annotated[bool, typer.Option(help="Open the page in a browser.")] = False,
+) -> None:
+    """Play with a design: drag actuators and sensors, move the gains, see at once what control spills.
+
+    Example: workbench bench case.toml
+    """
+    import webbrowser
+
+    from workbench.study.bench import bench_server
+    from workbench.study.trying import read_structure
+
+    found, text = read_structure(rig)
+    with bench_server(found, text, port=port) as server:
+        address = f"http://127.0.0.1:{server.server_address[1]}/"
+        console.print(f"The bench is at {address}\n  designs are saved in studies/; end with Ctrl-C", markup=False)
+        if show:
+            webbrowser.open(address)
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            console.print("  ended")
+
+
 def _structure_rig(path: Path):
     from workbench.gap.case import read_rig
 

@@ -108,6 +108,6 @@ workbench.move = function (root, spec) {
     seen = entries[entries.length - 1].isIntersecting;
     if (seen && !was) requestAnimationFrame(step);
   }).observe(root);
-  new ResizeObserver(measure).observe(picture.parentNode);
-  return { set: function (fresh) { spec = fresh; spec.tracks.forEach(function (t, i) { tracks[i].spec = t; }); if (!modes) reach = largest(); measure(); } };
+  var wide = 0;
+  new ResizeObserver(function () { if (picture.clientWidth !== wide) { wide = picture.clientWidth; measure(); } }).observe(picture.parentNode);
 };

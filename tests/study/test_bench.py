@@ -1,0 +1,189 @@
+"""The bench: its numbers are the library's, its server answers its own page only, and it can be played on."""
+
+import http.client
+import json
+import threading
+import time
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from workbench.design.law import DesignError
+from workbench.study.bench import bench_server
+from workbench.study.cases import StudyError
+from workbench.study.catalogue import describe, run_study
+from workbench.study.outcome import Outcome
+from workbench.study.saved_design import save
+from workbench.study.trying import asked, read_structure, shown, start, try_out
+
+RIG, TEXT = read_structure(None)
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with bench_server(RIG, TEXT, folder=tmp_path / "studies") as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server.server_address[1]
+        server.shutdown()
+        thread.join()
+
+
+def plain(design) -> dict:
+    return json.loads(json.dumps(asdict(design)))
+
+
+def request(port, method, path, content=None, **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    headers = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, content if content is None else json.dumps(content), headers)
+    answer = connection.getresponse()
+    return answer.status, answer.read().decode()
+
+
+def test_it_begins_with_the_design_of_section_5_8():
+    design = start(RIG)
+    assert design.actuators == (2.0, 4.0, 6.0, 8.0) and design.struck_at == 6.3 and design.controlled == 4
+    found = shown(RIG, replace(design, final_time=3000.0))
+    expected = [0.0, 1.213865e-3, 5.203347e-5, 1.294254e-4, 1.037589e-4]
+    np.testing.assert_allclose(found["by_mode"][4:], expected, rtol=1e-5, atol=1e-12)
+    assert found["stable"] and len(found["poles"]) == 9 and found["residual"] == pytest.approx(1.499083e-3, rel=1e-5)
+
+
+def test_effort_is_that_of_the_lyapunov_equation():
+    from workbench.design.closed_loop import impulse_state
+    from workbench.design.spillover import effort
+
+    tried = try_out(RIG, replace(start(RIG), final_time=120.0))
+    exact = effort(RIG.modes, tried.law, impulse_state(RIG.modes, 6.3))
+    assert tried.effort == pytest.approx(exact, rel=1e-4)
+
+
+def test_sensors_close_the_loop_through_modal_filters():
+    design = start(RIG)
+    exact = shown(RIG, design)
+    many = shown(RIG, replace(design, sensors=tuple(np.linspace(0.5, 9.5, 15))))
+    few = shown(RIG, replace(design, sensors=(2.0, 3.5, 5.2, 8.1)))
+    assert many["residual"] == pytest.approx(exact["residual"], rel=0.05)
+    assert abs(few["residual"] / exact["residual"] - 1) > 0.2, "few sensors mistake residual modes for controlled ones"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"controlled": 0}, "at least 1; got 0"),
+        ({"controlled": True}, "at least 1"),
+        ({"controlled": 12, "weight": [1.0] * 12}, "12 modes controlled of 9"),
+        ({"controlled": 5, "weight": [1.0] * 5}, "5 controlled modes need as many actuators"),
+        ({"weight": [1.0, 1.0, 1.0]}, "each of the 4 controlled modes"),
+        ({"weight": [1.0, 1.0, 1.0, 0.0]}, "positive"),
+        ({"weight": [1.0, 1.0, 1.0, float("nan")]}, "finite numbers; got nan"),
+        ({"actuators": [2.0, 2.0, 6.0, 8.0]}, "both stand at x = 2"),
+        ({"actuators": [2.0] * 41}, "at most 40"),
+        ({"actuators": ["a"]}, "finite numbers; got 'a'"),
+        ({"struck_at": 11.0}, "outside the structure"),
+        ({"sensors": [3.0, 3.0]}, "increasing"),
+        ({"law": "bang"}, "law is one of"),
+        ({"final_time": 0}, "final_time must be positive"),
+        ({"extra": 1}, "a design has actuators"),
+    ],
+)
+def test_what_makes_no_design_is_refused(change, words):
+    with pytest.raises(ValueError, match=words):
+        shown(RIG, asked({**plain(start(RIG)), **change}))
+
+
+def test_a_loop_that_runs_away_is_said_to():
+    with pytest.raises(DesignError, match="runs away"):
+        try_out(RIG, replace(start(RIG), sensors=(1.0, 2.0, 3.0, 4.0), weight=(1e-4,) * 4, final_time=1e4))
+
+
+def test_a_saved_design_is_a_study_that_runs_and_agrees(tmp_path):
+    design = replace(start(RIG), actuators=(1.9, 4.2, 6.0, 8.0), sensors=tuple(np.linspace(1.0, 9.0, 11)))
+    path = save(RIG, TEXT, design, "found", tmp_path / "studies")
+    outcome = Outcome("found", figures_folder=tmp_path / "figures")
+    run_study(describe(path), None, outcome, tmp_path)
+    assert outcome.holds and len(outcome.checks) == 3 and len(outcome.figures) == 2
+    with pytest.raises(StudyError, match="is there already"):
+        save(RIG, TEXT, design, "found", tmp_path / "studies")
+    for name in ("../found", "Found", "", "a b", "a" * 50, "1a", "a\n"):
+        with pytest.raises(StudyError, match="a study's name"):
+            save(RIG, TEXT, design, name, tmp_path / "studies")
+
+
+def test_the_server_answers_its_own_page_and_nobody_else(bench):
+    design, own = plain(start(RIG)), {"Content_Type": "application/json"}
+    assert request(bench, "GET", "/")[0] == 200
+    status, text = request(bench, "POST", "/try", design, **own)
+    assert status == 200 and json.loads(text)["stable"]
+    for headers in ({"Host": "evil.example"}, {"Host": f"evil.example:{bench}"}, {"Origin": "http://evil.example"}):
+        assert request(bench, "GET", "/", **headers)[0] == 403
+        assert request(bench, "POST", "/try", design, **own, **headers)[0] == 403
+    assert request(bench, "POST", "/try", design, Content_Type="text/plain")[0] == 403, "what a form could send"
+    assert request(bench, "GET", "/etc/passwd")[0] == 404 and request(bench, "POST", "/other", {}, **own)[0] == 404
+    for content in (None, [], 3, {"name": 3}, {**design, "law": None}, {**design, "actuators": {}}):
+        status, text = request(bench, "POST", "/try", content, **own, **({} if content else {"Content_Length": "0"}))
+        assert status == 422 and json.loads(text)["error"]
+    assert request(bench, "POST", "/save", {"name": "x", "design": []}, **own)[0] == 422
+    assert request(bench, "POST", "/try", design, **own, Content_Length="99999999")[0] == 422
+    assert request(bench, "POST", "/try", design, **own)[0] == 200, "it lives on"
+
+
+def answered(browser, before):
+    until = time.monotonic() + 10
+    while int(browser.execute_script("return document.body.dataset.answers || 0")) <= before:
+        assert time.monotonic() < until, "no answer"
+        time.sleep(0.02)
+    time.sleep(0.1)
+    return int(browser.execute_script("return document.body.dataset.answers"))
+
+
+@pytest.mark.parametrize("width", [390, 1200])
+def test_it_can_be_played_on(bench, look, width, tmp_path):
+    from selenium.webdriver import ActionChains
+
+    browser = look(f"http://127.0.0.1:{bench}/", width)
+    n = answered(browser, 0)
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+
+    def card(name):
+        return browser.find_element("id", name).text
+
+    assert card("residual") == "1.499e−3" and card("stable") == "stable"
+    assert len(browser.find_elements("css selector", "#work .marks rect")) == 5
+    line = browser.find_element("css selector", ".stand .track")
+    seen = set()
+    for _ in range(4):
+        time.sleep(0.1)
+        seen.add(line.get_attribute("d"))
+    assert len(seen) >= 3, "it moves"
+
+    second = browser.find_elements("css selector", ".handle.actuators")[1]
+    length = browser.find_element("css selector", ".stand").size["width"] - 36
+    ActionChains(browser).click_and_hold(second).move_by_offset(round(0.05 * length), 0).release().perform()
+    n = answered(browser, n)
+    at = float(second.get_attribute("aria-valuenow"))
+    assert at == pytest.approx(4.5, abs=0.1)
+    moved = shown(RIG, replace(start(RIG), actuators=(2.0, at, 6.0, 8.0)))
+    assert float(card("residual").replace("−", "-")) == pytest.approx(moved["residual"], rel=1e-3)
+
+    count = browser.find_element("id", "controlled")
+    browser.execute_script("arguments[0].value = 3; arguments[0].dispatchEvent(new Event('input'))", count)
+    n = answered(browser, n)
+    assert len(browser.find_elements("css selector", "#work .marks rect")) == 6
+    browser.execute_script("arguments[0].value = 5; arguments[0].dispatchEvent(new Event('input'))", count)
+    n = answered(browser, n)
+    assert "5 controlled modes need as many actuators" in browser.find_element("css selector", ".say").text
+    browser.execute_script("arguments[0].value = 4; arguments[0].dispatchEvent(new Event('input'))", count)
+    n = answered(browser, n)
+
+    name = browser.find_element("id", "name")
+    name.clear()
+    name.send_keys(f"played_{width}")
+    name.submit()
+    time.sleep(0.3)
+    assert "saved as" in browser.find_element("id", "saved").text
+    assert (tmp_path / f"studies/played_{width}.py").is_file()
+    errors = [entry for entry in browser.get_log("browser") if "422" not in entry["message"]]
+    assert errors == []

@@ -1,0 +1,218 @@
+// The bench: each move asks the server for the design's answer, one question at a time, the last move never lost.
+"use strict";
+(function () {
+  var setting = JSON.parse(document.getElementById("setting").textContent), design = setting.design;
+  var svg = workbench.svg, html = workbench.html, shown = workbench.shown, by = function (id) { return document.getElementById(id); };
+  var stand = document.querySelector(".stand"), say = document.querySelector(".say"), hint = say.textContent;
+  var answer = null, busy = false, waiting = false, calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  var COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
+
+  document.querySelector(".theme").addEventListener("click", function () {
+    var root = document.documentElement, dark = matchMedia("(prefers-color-scheme: dark)").matches;
+    root.dataset.theme = (root.dataset.theme || (dark ? "dark" : "light")) === "dark" ? "light" : "dark";
+  });
+
+  function post(path, content) {
+    return fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(content) })
+      .then(function (r) { return r.json(); });
+  }
+  function ask() {
+    if (busy) { waiting = true; return; }
+    busy = true;
+    waiting = false;
+    var start = performance.now();
+    post("/try", design).then(function (found) {
+      if (found.error) { say.textContent = found.error; say.className = "say bad"; }
+      else { answer = found; say.textContent = hint; say.className = "say"; present(); }
+      document.body.dataset.ms = (performance.now() - start).toFixed(1);
+      document.body.dataset.answers = +(document.body.dataset.answers || 0) + 1;
+      document.querySelectorAll(".cards, .figures").forEach(function (e) { e.classList.toggle("stale", !!found.error); });
+    }).catch(function () { say.textContent = "The bench no longer answers: start it again with `workbench bench`."; say.className = "say bad"; })
+      .then(function () { busy = false; if (waiting) ask(); });
+  }
+
+  // numbers
+  var cards = {};
+  [["residual", "W_R, work spilled"], ["effort", "effort ∫ FᵀF dt"], ["peak_force", "largest force"], ["stable", "closed loop"]].forEach(function (card) {
+    var box = html("div", {}, document.querySelector(".cards"));
+    cards[card[0]] = html("b", { id: card[0] }, box, "–");
+    html("span", {}, box, card[1]);
+  });
+
+  // controls
+  var controls = document.querySelector(".controls"), count, law, sliders = [], master;
+  function row(text) { var label = html("label", {}, controls); html("span", {}, label, text); return label; }
+  function build() {
+    controls.textContent = "";
+    var a = row("control law");
+    law = html("select", { id: "law" }, a);
+    setting.laws.forEach(function (name) { html("option", {}, law, name); });
+    law.value = design.law;
+    law.addEventListener("change", function () { design.law = law.value; build(); ask(); });
+    var c = row("modes controlled"), told;
+    count = html("input", { id: "controlled", type: "range", min: 1, max: setting.frequencies_hz.length, value: design.controlled }, c);
+    told = html("output", {}, c, design.controlled);
+    count.addEventListener("input", function () {
+      design.controlled = +count.value;
+      while (design.weight.length < design.controlled) design.weight.push(design.weight[design.weight.length - 1]);
+      design.weight.length = design.controlled;
+      told.textContent = count.value;
+      weights();
+      ask();
+    });
+    ports("actuators", "actuators");
+    ports("sensors", "sensors (none: exact modes)");
+    var t = row("count until [s]"), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
+    time.addEventListener("change", function () { if (+time.value > 0) { design.final_time = +time.value; ask(); } });
+    weights();
+  }
+  function ports(kind, text) {
+    var label = row(text), told = html("output", {}, label, design[kind].length);
+    [["−", -1], ["+", 1]].forEach(function (way) {
+      html("button", { type: "button", "aria-label": (way[1] > 0 ? "add to " : "take from ") + kind }, label, way[0]).addEventListener("click", function () {
+        if (way[1] < 0 && design[kind].length > (kind === "actuators" ? 1 : 0)) design[kind].pop();
+        if (way[1] > 0 && design[kind].length < setting.most) design[kind].push(gap(design[kind]));
+        told.textContent = design[kind].length;
+        handles();
+        ask();
+      });
+    });
+  }
+  // the middle of the widest gap between those that stand already
+  function gap(places) {
+    var all = [0].concat(places.slice().sort(function (a, b) { return a - b; }), [setting.length]), best = 0;
+    for (var i = 1; i < all.length - 1; i++) if (all[i + 1] - all[i] > all[best + 1] - all[best]) best = i;
+    return 0.5 * (all[best] + all[best + 1]);
+  }
+  function weights() {
+    sliders.forEach(function (s) { s.remove(); });
+    sliders = [];
+    var imsc = design.law === "IMSC", n = imsc ? design.controlled : 1;
+    for (var r = 0; r < n; r++) (function (r) {
+      var label = row(imsc ? "R of mode " + (r + 1) : "R"), told;
+      var slider = html("input", { type: "range", min: -2, max: 4, step: 0.02, value: Math.log10(design.weight[r]), "aria-label": "weight " + (r + 1) }, label);
+      told = html("output", {}, label, shown(design.weight[r]));
+      slider.addEventListener("input", function () {
+        design.weight[r] = +Math.pow(10, +slider.value).toPrecision(4);
+        told.textContent = shown(design.weight[r]);
+        ask();
+      });
+      sliders.push(label);
+    })(r);
+  }
+
+  // the structure with what stands on it
+  var X, height, line, free, beamY, marks = [], reach = 1;
+  function layout() {
+    var width = stand.clientWidth;
+    if (!width) return;
+    height = Math.max(210, Math.min(300, 0.4 * width));
+    beamY = 0.42 * height;
+    X = workbench.scale([0, setting.length], false, 18, width - 18);
+    stand.setAttribute("viewBox", "0 0 " + width + " " + height);
+    stand.setAttribute("height", height);
+    stand.textContent = "";
+    svg("line", { x1: X(0), x2: X(setting.length), y1: beamY, y2: beamY, stroke: "var(--line)", "stroke-width": 2 }, stand);
+    workbench.ticks({}, [0, setting.length], Math.round(width / 90)).forEach(function (t) {
+      svg("text", { x: X(t[0]), y: height - 4, "text-anchor": "middle" }, stand, t[1]);
+    });
+    line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
+    free = svg("g", {}, stand);
+    handles();
+    swing();
+  }
+  function handles() {
+    if (!free) return;
+    free.textContent = "";
+    design.actuators.forEach(function (at, i) { handle("actuators", i, height - 42, "M0,-10L8,6H-8Z", "var(--bad)", "actuator " + (i + 1)); });
+    design.sensors.forEach(function (at, i) { handle("sensors", i, beamY, "M0,-6A6,6 0 1 1 -0.01,-6Z", "var(--paper)", "sensor " + (i + 1)); });
+    handle("struck_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", "var(--soft)", "hammer");
+  }
+  function handle(kind, i, y, path, fill, name) {
+    var g = svg("g", { class: "handle " + kind, tabindex: 0, role: "slider", "aria-label": name, "aria-valuemin": 0, "aria-valuemax": setting.length }, free);
+    svg("circle", { class: "halo", r: 20 }, g);
+    svg("path", { d: path, fill: fill, stroke: "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : 0 }, g);
+    var label = svg("text", { y: kind === "struck_at" ? 5 : kind === "sensors" ? 20 : 20, x: kind === "struck_at" ? 14 : 0, "text-anchor": kind === "struck_at" ? "start" : "middle" }, g);
+    function at() { return i === null ? design[kind] : design[kind][i]; }
+    function put() { g.setAttribute("transform", "translate(" + X(at()) + "," + y + ")"); g.setAttribute("aria-valuenow", at()); label.textContent = at().toPrecision(3); }
+    function move(v) {
+      v = +Math.max(0, Math.min(setting.length, v)).toPrecision(5);
+      if (i === null) design[kind] = v; else design[kind][i] = v;
+      put();
+      ask();
+    }
+    g.addEventListener("pointerdown", function (e) { g.setPointerCapture(e.pointerId); g.focus(); e.preventDefault(); g.dragged = true; });
+    g.addEventListener("pointermove", function (e) { if (g.dragged) move(X.back(e.clientX - stand.getBoundingClientRect().left)); });
+    ["pointerup", "pointercancel"].forEach(function (end) { g.addEventListener(end, function () { g.dragged = false; }); });
+    g.addEventListener("keydown", function (e) {
+      var way = { ArrowLeft: -1, ArrowRight: 1 }[e.key];
+      if (way) { e.preventDefault(); move(at() + way * setting.length / (e.shiftKey ? 1000 : 100)); }
+    });
+    put();
+  }
+
+  // what is found
+  function present() {
+    ["residual", "effort", "peak_force"].forEach(function (name) { cards[name].textContent = answer[name] === null ? "∞" : answer[name].toExponential(3).replace("e+0", "").replace("e-", "e−"); });
+    cards.stable.textContent = answer.stable ? "stable" : "unstable";
+    cards.stable.nextSibling.textContent = "closed loop; rightmost pole at " + (answer.stable ? "0 or less" : shown(answer.rightmost) + " rad/s");
+    cards.stable.className = answer.stable ? "good" : "bad";
+    reach = 1e-12;
+    for (var k = 0; k < answer.time.length; k += 5) displaced(k).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
+    swing();
+    var n = answer.by_mode.length, numbers = answer.by_mode.map(function (_, i) { return i + 1; }).slice(design.controlled);
+    var work = answer.by_mode.slice(design.controlled).map(function (w) { return w || 0; }), top = Math.max.apply(null, work.concat([1e-300]));
+    figure("work", { x: axis("residual mode", [design.controlled + 0.4, Math.max(n, design.controlled + 1) + 0.6], false, numbers.map(function (v) { return [v, String(v)]; })),
+      y: axis("work spilled, W_r", [Math.min(0, 1.1 * Math.min.apply(null, work.concat([0]))), 1.1 * top]), title: work.length ? "which mode the design feeds" : "no mode is left to spill into",
+      marks: [{ kind: "bars", boxes: work.map(function (w, i) { return [numbers[i] - 0.35, numbers[i] + 0.35, 0, w]; }), colours: [COLOURS[0]], label: "W_r" }] });
+    var re = answer.poles.map(function (p) { return p[0]; }), im = answer.poles.map(function (p) { return p[1]; });
+    var left = Math.min.apply(null, re), right = Math.max.apply(null, re), pad = 0.08 * (right - left || 1);
+    figure("poles", { x: axis("real part [rad/s]", [left - pad, Math.max(right, 0) + pad]), y: axis("imaginary part [rad/s]", [-0.03 * Math.max.apply(null, im), 1.08 * Math.max.apply(null, im)]),
+      title: "closed-loop poles", marks: [{ kind: "rule", axis: "x", at: 0, colour: "#8a8a8a", width: 1, dash: "", alpha: 1 },
+        { kind: "line", x: re, y: im, width: 0, marker: "x", size: 9, colour: COLOURS[1], alpha: 1, label: "poles" }] });
+    var energy = answer.energy.map(function (v) { return v > 0 ? v : null; }), seen = energy.filter(function (v) { return v; });
+    figure("energy", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("energy of all modes", [0.7 * Math.min.apply(null, seen), 1.4 * Math.max.apply(null, seen)], true),
+      title: "what is left of the blow", marks: [curve(answer.time, energy, 2)] });
+    var forces = [].concat.apply([], answer.forces), most = 1.1 * Math.max.apply(null, forces.map(Math.abs).concat([1e-300]));
+    figure("forces", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("force", [-most, most]), title: "what the actuators do", legend: answer.forces.length > 1,
+      marks: answer.forces.map(function (f, i) { var c = curve(answer.time, f, i); c.label = "F" + (i + 1); return c; }) });
+  }
+  function axis(label, limits, log, ticks) { var a = { label: label, limits: limits, log: !!log, group: 0 }; if (ticks) a.ticks = ticks; return a; }
+  function curve(x, y, i) { return { kind: "line", x: x, y: y, width: 1.8, dash: "", colour: COLOURS[i % COLOURS.length], alpha: 1, label: "" }; }
+  function figure(id, panel) {
+    panel.height = 200;
+    panel.x.group = panel.y.group = 0;
+    var root = by(id), stage = html("div", {});
+    root.replaceChildren(stage);
+    workbench.draw(stage, { columns: 1, width: 500, legend: false, panels: [panel] });
+  }
+
+  // motion
+  var clock = 0, last = null, playing = !calm;
+  function displaced(k) { return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * answer.modal[r][k]; return w; }); }
+  function swing() {
+    if (!answer || !X) return;
+    var k = Math.round(clock % 1 * (answer.time.length - 1)), size = (beamY - 40) / reach;
+    line.setAttribute("d", "M" + displaced(k).map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
+    by("clock").textContent = "t = " + shown(answer.time[k]) + " s";
+  }
+  function step(now) {
+    if (playing && last !== null) { clock += (now - last) / 10000; swing(); }
+    last = now;
+    requestAnimationFrame(step);
+  }
+  by("play").textContent = playing ? "pause" : "play";
+  by("play").addEventListener("click", function () { playing = !playing; by("play").textContent = playing ? "pause" : "play"; });
+  by("save").addEventListener("submit", function (e) {
+    e.preventDefault();
+    post("/save", { name: by("name").value, design: design }).then(function (found) {
+      by("saved").className = found.error ? "bad" : "good";
+      by("saved").textContent = found.error || "saved as " + found.saved + "; run it: workbench study " + by("name").value;
+    }).catch(function () { by("saved").textContent = "The bench no longer answers."; });
+  });
+  build();
+  var wide = 0;  // only a new width lays the stand out anew: a handle that is being dragged must live on
+  new ResizeObserver(function () { if (stand.clientWidth !== wide) { wide = stand.clientWidth; layout(); } }).observe(stand.parentNode);
+  requestAnimationFrame(step);
+  ask();
+})();

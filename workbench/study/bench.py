@@ -1,0 +1,124 @@
+"""The bench: a page on this machine alone, where a design is moved about and answers at once."""
+
+import json
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+from jinja2 import Environment
+
+from workbench.rig.rig import Rig
+from workbench.study.cases import StudyError
+from workbench.study.page import asset, in_script
+from workbench.study.saved_design import save
+from workbench.study.trying import asked, setting, shown
+
+HERE = "127.0.0.1"
+MOST_BYTES = 65536
+POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self';"
+    " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path("studies")) -> ThreadingHTTPServer:
+    """A server of the bench on 127.0.0.1, not yet serving; port 0 takes one that is free.
+
+    Args:
+        rig: that designs are tried on.
+        structure: TOML that describes it, saved with a design.
+        port: to listen on.
+        folder: where designs are saved as studies.
+
+    Raises:
+        StudyError: plain modal data, which know no places, or a port that cannot be had.
+    """
+    content = {**setting(rig), "folder": str(folder)}
+    template = Environment(autoescape=True, trim_blocks=True).from_string(asset("bench.html"))
+    page = template.render(
+        css=asset("page.css"), figures=asset("figure.js"), script=asset("bench.js"), setting=in_script(content)
+    )
+    handler = partial(_Handler, rig, structure, folder, page.encode())
+    try:
+        return ThreadingHTTPServer((HERE, port), handler)
+    except (OSError, OverflowError) as error:
+        raise StudyError(f"port {port} cannot be had ({error}); give another --port, or 0 for any") from error
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """Answers the bench's own page and no other: a name that leads here from elsewhere is turned away."""
+
+    server_version, sys_version, protocol_version = "workbench", "", "HTTP/1.1"
+    timeout = 30
+    wbufsize, disable_nagle_algorithm = -1, True  # an answer leaves whole and at once
+
+    def __init__(self, rig: Rig, structure: str, folder: Path, page: bytes, *arguments):
+        self.rig, self.structure, self.folder, self.page = rig, structure, folder, page
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        if not self._from_here():
+            return self._answer(HTTPStatus.FORBIDDEN, {"error": "this bench answers 127.0.0.1 only"})
+        if self.path != "/":
+            return self._answer(HTTPStatus.NOT_FOUND, {"error": "there is nothing here"})
+        self._send(HTTPStatus.OK, "text/html; charset=utf-8", self.page)
+
+    def do_POST(self) -> None:
+        if not self._from_here() or self.headers.get("Content-Type") != "application/json":
+            return self._answer(HTTPStatus.FORBIDDEN, {"error": "this bench answers its own page only"})
+        answers = {"/try": self._try, "/save": self._save}
+        if self.path not in answers:
+            return self._answer(HTTPStatus.NOT_FOUND, {"error": "there is nothing here"})
+        try:
+            answer = answers[self.path](self._content())
+        except (ValueError, OSError, ArithmeticError) as error:
+            self._answer(HTTPStatus.UNPROCESSABLE_ENTITY, {"error": str(error)})
+        else:
+            self._answer(HTTPStatus.OK, answer)
+
+    def _try(self, content: dict) -> dict:
+        return shown(self.rig, asked(content))
+
+    def _save(self, content: dict) -> dict:
+        if not isinstance(content, dict) or not isinstance(content.get("name"), str):
+            raise StudyError("a design is saved under a name")
+        path = save(self.rig, self.structure, asked(content.get("design")), content["name"], self.folder)
+        return {"saved": str(path)}
+
+    def _content(self):
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > MOST_BYTES:
+            self.close_connection = True
+            raise StudyError(f"a request has at most {MOST_BYTES} bytes")
+        try:
+            return json.loads(self.rfile.read(int(length)))
+        except RecursionError:
+            raise StudyError("that is no design") from None
+
+    def _from_here(self) -> bool:
+        port = self.server.server_address[1]
+        own = {f"{HERE}:{port}", f"localhost:{port}"}
+        origin = self.headers.get("Origin")
+        return self.headers.get("Host") in own and (origin is None or origin.removeprefix("http://") in own)
+
+    def _answer(self, status: HTTPStatus, content: dict) -> None:
+        if status in (HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND):
+            self.close_connection = True  # what was sent along has not been read
+        self._send(status, "application/json", json.dumps(content, allow_nan=False).encode())
+
+    def _send(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+        self.send_response(status)
+        for name, value in (
+            ("Content-Type", kind),
+            ("Content-Length", str(len(body))),
+            ("Content-Security-Policy", POLICY),
+            ("X-Content-Type-Options", "nosniff"),
+            ("Cache-Control", "no-store"),
+        ):
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *arguments) -> None:
+        """Say nothing: only the command prints."""

@@ -1,0 +1,70 @@
+"""A design found on the bench, saved as a study of its own."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from workbench.rig.rig import Rig
+from workbench.study.cases import StudyError
+from workbench.study.trying import Design, try_out
+
+NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
+SCRIPT = '''"""Does the design found on the bench do what the bench showed?"""
+
+from pathlib import Path
+
+import numpy as np
+
+from workbench.draw.beam import plot_motion
+from workbench.draw.design import plot_work
+from workbench.draw.motion import response_motion
+from workbench.gap.case import read_rig
+from workbench.study.trying import Design, try_out
+
+DESIGN = {design}
+SHOWN, STABLE = {shown}, {stable}  # on the bench
+
+
+def study(outcome, data=None):
+    rig = read_rig(Path(__file__).with_suffix(".toml"))
+    tried = try_out(rig, DESIGN)
+    found = {{"W_R": tried.work.residual_total, "effort": tried.effort}}
+    outcome.table("found", found)
+    for name, value in SHOWN.items():
+        outcome.check(f"{{name}}: against the bench, relative", abs(found[name] / value - 1.0) if value else 0.0, 1e-6)
+    outcome.check("stable or not, against the bench", float(tried.loop.stable is not STABLE), 0.0)
+    outcome.say(f"The closed loop is {{'stable' if tried.loop.stable else 'unstable'}}.")
+    outcome.say("W_R = {{W_R:.3e}} for an effort of {{effort:.3e}}.".format(**found))
+    motion = response_motion({{"controlled": tried.response}}, actuators=tried.law.actuators)
+    outcome.motion(motion, "The structure after the blow, controlled; triangles are actuators.")
+    outcome.figure("work", plot_work({{"this design": tried.work}}), "Work that control spills, by residual mode.")
+    x = np.linspace(0.0, rig.modes.length, 201)
+    outcome.figure("motion", plot_motion({{"controlled": tried.response}}, x), "Displacement over place and time.")
+'''
+
+
+def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> Path:
+    """Write a design as a study: folder/name.py, and the structure (TOML) beside it.
+
+    Raises:
+        StudyError: a name that is none, or that is taken.
+    """
+    if not NAME.fullmatch(name):
+        raise StudyError(
+            f"a study's name is made of small letters, digits and _, and begins with a letter: {name!r:.60}"
+        )
+    path = folder / f"{name}.py"
+    taken = next((file for file in (path, path.with_suffix(".toml")) if file.exists()), None)
+    if taken:
+        raise StudyError(f"{taken} is there already; choose another name")
+    tried = try_out(rig, design)
+    found = {"W_R": tried.work.residual_total, "effort": tried.effort}
+    folder.mkdir(parents=True, exist_ok=True)
+    path.with_suffix(".toml").write_text(structure, encoding="utf-8")
+    path.write_text(SCRIPT.format(design=_written(design), shown=found, stable=tried.loop.stable), encoding="utf-8")
+    return path
+
+
+def _written(design: Design) -> str:
+    parts = (f"    {field.name}={getattr(design, field.name)!r},\n" for field in fields(design))
+    return f"Design(\n{''.join(parts)})"

@@ -1,0 +1,205 @@
+"""A design tried out: what actuators, sensors and gains at these places do to a structure after a blow."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from math import isfinite
+from pathlib import Path
+
+import numpy as np
+from scipy.integrate import simpson
+
+from workbench.design.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
+from workbench.design.coupled import coupled_lqr
+from workbench.design.imsc import imsc
+from workbench.design.law import DesignError, Law
+from workbench.design.modal_filter import displacement_filter
+from workbench.design.spillover import Spillover, finite_spillover
+from workbench.gap.case import read_rig
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.study.cases import StudyError
+
+LAWS = ("IMSC", "coupled LQR")
+MOST_PORTS = 40
+N_TIMES, N_FRAMES, N_PLACES = 2001, 251, 121
+MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
+
+
+@dataclass(frozen=True)
+class Design:
+    """What can be moved on the bench.
+
+    Attributes:
+        actuators: places, m.
+        sensors: places, m, of displacement sensors whose modal filters feed the law; none for exact modal coordinates.
+        controlled: how many of the lowest modes.
+        weight: R of force against motion, one for each controlled mode; coupled LQR takes the first.
+        law: one of LAWS.
+        struck_at: place of a unit blow, m.
+        final_time: until which the work is counted, s.
+    """
+
+    actuators: tuple[float, ...]
+    sensors: tuple[float, ...]
+    controlled: int
+    weight: tuple[float, ...]
+    law: str
+    struck_at: float
+    final_time: float
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """What a design does.
+
+    Attributes:
+        law: in force.
+        loop: closed.
+        response: to the blow, at N_TIMES instants.
+        work: in every mode, residual modes at rest at first.
+        effort: ∫ FᵀF dt up to the final time.
+    """
+
+    law: Law
+    loop: ClosedLoop
+    response: Response
+    work: Spillover
+    effort: float
+
+
+def asked(content: Mapping) -> Design:
+    """A design from JSON.
+
+    Raises:
+        StudyError: naming what is missing, unknown or no number.
+    """
+    names = {field.name for field in fields(Design)}
+    if not isinstance(content, Mapping) or set(content) != names:
+        raise StudyError(f"a design has {', '.join(sorted(names))}")
+    for name in ("actuators", "sensors", "weight"):
+        if not isinstance(content[name], list) or len(content[name]) > MOST_PORTS:
+            raise StudyError(f"{name} is a list of at most {MOST_PORTS} numbers")
+    lists = {name: tuple(_number(v, name) for v in content[name]) for name in ("actuators", "sensors", "weight")}
+    count = content["controlled"]
+    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
+        raise StudyError(f"controlled is how many modes are controlled, at least 1; got {count!r:.40}")
+    if content["law"] not in LAWS:
+        raise StudyError(f"law is one of {', '.join(LAWS)}; got {content['law']!r:.40}")
+    if len(lists["weight"]) != count or min(lists["weight"]) <= 0:
+        raise StudyError(f"weight is one positive number for each of the {count} controlled modes")
+    final_time = _number(content["final_time"], "final_time")
+    if final_time <= 0:
+        raise StudyError(f"final_time must be positive; got {final_time:g}")
+    return Design(
+        **lists, controlled=count, law=content["law"], struck_at=_number(content["struck_at"], "struck_at"),
+        final_time=final_time,
+    )  # fmt: skip
+
+
+def _number(value, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise StudyError(f"{name} is made of finite numbers; got {value!r:.40}")
+    return float(value)
+
+
+def start(rig: Rig) -> Design:
+    """The design that a rig begins with: its actuators, as many modes as these, its hammer, exact modal coordinates.
+
+    Raises:
+        StudyError: plain modal data, which know no places, or no mode that swings.
+    """
+    if rig.structure is None:
+        raise StudyError("plain modal data know no places; describe the structure as a beam or a rod")
+    elastic = rig.modes.omega[rig.modes.omega > 0]
+    if elastic.size == 0:
+        raise StudyError("the structure has no mode that swings; ask for more modes")
+    places = sorted({a.at for a in rig.actuators if not a.direct}) or [0.37 * rig.modes.length]
+    struck = next((a.at for a in rig.actuators if a.direct), 0.63 * rig.modes.length)
+    count = min(len(places), rig.modes.n_modes)
+    return Design(tuple(places), (), count, (20.0,) * count, LAWS[0], struck, float(2.0 * np.pi / elastic[0]))
+
+
+def try_out(rig: Rig, design: Design) -> Tried:
+    """Design the law, close the loop through the sensors' modal filters, strike, and add up.
+
+    Raises:
+        ValueError: places, weights or numbers that make no design, and the way out.
+    """
+    modes = rig.modes
+    if design.controlled > modes.n_modes:
+        raise DesignError(f"{design.controlled} modes controlled of {modes.n_modes} at hand; control fewer")
+    actuators = [Actuator(f"F{i + 1}", at) for i, at in enumerate(design.actuators)]
+    if design.law == "IMSC":
+        law = imsc(modes, design.controlled, actuators, weight=design.weight)
+    else:
+        law = coupled_lqr(modes, design.controlled, actuators, weight=design.weight[0])
+    through = None
+    if design.sensors:
+        kept = modes.select(range(design.controlled))
+        through = displacement_filter(kept, sorted(design.sensors), rig.structure.mass_per_length)
+    loop = close_loop(modes, law, through)
+    fastest = float(loop.poles.real.max())
+    if fastest * design.final_time > MOST_GROWTH:
+        raise DesignError(
+            f"the loop runs away: a pole at {fastest:+.3g} rad/s, because the sensors mistake residual modes for"
+            " controlled ones; move or add sensors, or raise R"
+        )
+    state = impulse_state(modes, design.struck_at)
+    at_rest = state.copy()
+    at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is what control puts there
+    response = respond(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
+    effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
+    return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
+
+
+def shown(rig: Rig, design: Design) -> dict:
+    """What the bench shows of a design, as plain numbers."""
+    tried = try_out(rig, design)
+    step = (N_TIMES - 1) // (N_FRAMES - 1)
+    poles = tried.loop.poles
+    energy = tried.response.energy[:, ::step].sum(axis=0)
+    return {
+        "residual": _plain(tried.work.residual_total),
+        "by_mode": _plain(tried.work.by_mode),
+        "effort": _plain(tried.effort),
+        "peak_force": _plain(np.abs(tried.response.forces).max()),
+        "stable": tried.loop.stable,
+        "rightmost": _plain(poles.real.max()),
+        "poles": [[_plain(p.real), _plain(p.imag)] for p in poles if p.imag >= 0],
+        "time": _plain(tried.response.time[::step]),
+        "modal": _plain(tried.response.modal[: rig.modes.n_modes, ::step]),
+        "energy": _plain(energy),
+        "forces": _plain(tried.response.forces[:, ::step]),
+    }
+
+
+def setting(rig: Rig) -> dict:
+    """What the bench needs to know once: the structure, its modes and its shapes."""
+    x = np.linspace(0.0, rig.modes.length, N_PLACES)
+    return {
+        "length": rig.modes.length,
+        "x": _plain(x),
+        "shapes": _plain(rig.modes.phi(x)),
+        "frequencies_hz": _plain(rig.modes.frequencies_hz),
+        "most": MOST_PORTS,
+        "laws": LAWS,
+        "design": {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(start(rig)).items()},
+    }
+
+
+def _plain(values):
+    """Six digits of each number, as JSON holds them; what is not finite is null."""
+    values = np.asarray(values, float).tolist()
+    return _short(values) if isinstance(values, list) else _short([values])[0]
+
+
+def _short(values: list) -> list:
+    if values and isinstance(values[0], list):
+        return [_short(row) for row in values]
+    return [float(f"{value:.6g}") if isfinite(value) else None for value in values]
+
+
+def read_structure(path: Path | None) -> tuple[Rig, str]:
+    """A rig and the TOML that describes it; the hinged beam of the dissertation unless a path is given."""
+    path = Path(__file__).with_name("assets") / "bench.toml" if path is None else path
+    return read_rig(path), path.read_text(encoding="utf-8")
