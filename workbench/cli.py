@@ -25,6 +25,24 @@ app = typer.Typer(
     help="From the measured response of a flexible structure to a controlled one, and a diagnosis of the gap between"
     " simulation and test.",
 )
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        from workbench.study.versions import versions
+
+        for name, version in versions().items():
+            typer.echo(f"{name:<16} {version}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say versions.")] = False,
+) -> None:
+    """Options of the command itself."""
+
+
 console = Console(soft_wrap=True, highlight=False)
 errors = Console(stderr=True, soft_wrap=True, highlight=False)
 

@@ -3,11 +3,11 @@
 import base64
 import hashlib
 import json
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
+
+from workbench.study.whole_file import write_whole
 
 ARRAY, COMPLEX = "__array__", "__complex__"
 KINDS = "biufc"  # of arrays: booleans, integers, floats, complex numbers
@@ -54,16 +54,8 @@ def decoded(value):
 
 def write_record(path: Path, record: dict) -> None:
     """Put a record in its place at once: a reader, or a run that resumes, sees all of it or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     text = _text(record)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump({"sha256": _sum(text), "record": text}, file)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    write_whole(path, json.dumps({"sha256": _sum(text), "record": text}))
 
 
 def read_record(path: Path) -> dict | None:

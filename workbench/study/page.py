@@ -12,6 +12,7 @@ from workbench.draw.interactive import drawable
 from workbench.study.cases import StudyError
 from workbench.study.outcome import Outcome
 from workbench.study.versions import versions
+from workbench.study.whole_file import write_whole
 
 ASSETS = Path(__file__).with_name("assets")
 SCRIPTS = ("figure.js", "motion.js", "table.js")
@@ -91,11 +92,8 @@ def write_page(path: Path, story: Story) -> Path:
         scripts=Markup("\n").join(map(asset, SCRIPTS)),
         data=in_script(moving),
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(html, encoding="utf-8")
-    text = json.dumps(story.to_json(), separators=(",", ":"))
-    path.with_suffix(".page.json").write_text(text + "\n", encoding="utf-8")
-    return path
+    write_whole(path.with_suffix(".page.json"), json.dumps(story.to_json(), separators=(",", ":")) + "\n")
+    return write_whole(path, html)
 
 
 def asset(name: str) -> Markup:

@@ -11,6 +11,7 @@ import numpy as np
 
 from workbench.study.cases import StudyError
 from workbench.study.versions import versions
+from workbench.study.whole_file import write_whole
 
 ENDINGS = (".csv", ".parquet", ".json")
 
@@ -112,9 +113,9 @@ class Results(Sequence):
         if path.suffix == ".parquet":
             _write_parquet(path, rows)
         elif path.suffix == ".json":
-            path.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+            write_whole(path, json.dumps(rows, indent=1) + "\n")
         else:
-            path.write_text(_csv(rows), encoding="utf-8", newline="")
+            write_whole(path, _csv(rows))
         return path
 
     def frame(self):

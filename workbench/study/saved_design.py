@@ -7,6 +7,7 @@ from pathlib import Path
 from workbench.rig.rig import Rig
 from workbench.study.cases import StudyError
 from workbench.study.trying import Design, try_out
+from workbench.study.whole_file import write_whole
 
 NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 SCRIPT = '''"""Does the design found on the bench do what the bench showed?"""
@@ -59,10 +60,8 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
         raise StudyError(f"{taken} is there already; choose another name")
     tried = try_out(rig, design)
     found = {"W_R": tried.work.residual_total, "effort": tried.effort}
-    folder.mkdir(parents=True, exist_ok=True)
-    path.with_suffix(".toml").write_text(structure, encoding="utf-8")
-    path.write_text(SCRIPT.format(design=_written(design), shown=found, stable=tried.loop.stable), encoding="utf-8")
-    return path
+    write_whole(path.with_suffix(".toml"), structure)
+    return write_whole(path, SCRIPT.format(design=_written(design), shown=found, stable=tried.loop.stable))
 
 
 def _written(design: Design) -> str:
