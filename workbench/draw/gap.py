@@ -53,29 +53,36 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 
 
 def plot_where(verdict: Verdict) -> Figure:
-    """The gap taken apart: by mode, by sensor, by record and level, and the likelihood of a place."""
+    """The gap taken apart: by mode, band, sensor, level and time, and the likelihood of a place."""
     where = verdict.where
-    figure, axes = new_figure(2, 2, width=10, height=6.4)
+    figure, axes = new_figure(3, 2, width=10, height=9.2)
     modes = np.arange(1, where.mode_shares.size + 1)
     axes[0, 0].bar(modes, 100 * where.mode_shares, color=COLOURS[0])
     axes[0, 0].set(title="by mode: the band around each frequency", xlabel="mode", ylabel="share of the gap [%]")
+    axes[0, 1].bar([f"{top:.3g}" for top in where.band_edges_hz[1:]], 100 * where.band_shares, color=COLOURS[0])
+    axes[0, 1].set(title="by octave", xlabel="up to [Hz]", ylabel="share of the gap [%]")
     names = [s.name for s in verdict.nominal.sensors]
-    axes[0, 1].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
-    axes[0, 1].set(title="by sensor", ylabel="share of the gap [%]")
+    axes[1, 0].bar(names, 100 * where.sensor_shares, color=COLOURS[2])
+    axes[1, 0].set(title="by sensor", ylabel="share of the gap [%]")
     order = np.argsort(where.input_levels)
-    axes[1, 0].plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
+    axes[1, 1].plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
     for i in order:
-        axes[1, 0].annotate(f" {where.record_names[i]}", (where.input_levels[i], where.record_gaps[i]), fontsize=8)
-    axes[1, 0].set(title="by record and level", xlabel="input level [N rms]", ylabel="gap", xscale="log", yscale="log")
+        axes[1, 1].annotate(f" {where.record_names[i]}", (where.input_levels[i], where.record_gaps[i]), fontsize=8)
+    axes[1, 1].set(title="by record and level", xlabel="input level [N rms]", ylabel="gap", xscale="log", yscale="log")
+    axes[2, 0].imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
+    axes[2, 0].set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
+    axes[2, 0].set_xticks(np.arange(8) + 0.5, np.arange(1, 9))
+    axes[2, 0].set_yticks(np.arange(len(order)) + 0.5, where.record_names)
+    axes[2, 0].grid(False)
     evidence = verdict.attribution.evidence
     profile = evidence.profile - evidence.profile.max()
-    axes[1, 1].plot(evidence.places, profile, color=COLOURS[3])
-    axes[1, 1].axvline(where.at, color=GREY, linestyle=":")
+    axes[2, 1].plot(evidence.places, profile, color=COLOURS[3])
+    axes[2, 1].axvline(where.at, color=GREY, linestyle=":")
     for effect in verdict.effects:
         if "at" in effect.values and effect.kind.path in ("structure", "environment"):
-            axes[1, 1].axvline(effect.values["at"], color=COLOURS[0])
+            axes[2, 1].axvline(effect.values["at"], color=COLOURS[0])
     low = max(profile.min(), -50.0 * max(1.0, abs(profile[np.argsort(profile)[-3]])))
-    axes[1, 1].set(
+    axes[2, 1].set(
         title="where a missing force would stand",
         xlabel="x [m]",
         ylabel="log-likelihood, less its peak",

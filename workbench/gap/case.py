@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -129,7 +130,7 @@ def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
         raise CaseError(f"[structure]: kind is beam, rod or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
     _check_ports(inputs, outputs, "at")
-    common = {
+    common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
         "left": text(table, "left", "[structure]"),
@@ -238,7 +239,7 @@ def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
     if not file.is_relative_to(folder.resolve()):
         raise CaseError(f"{where}: file {entry['file']!r} lies outside the case folder")
     arrays = _arrays(file, where)
-    names = {part.name for part in (*rig.actuators, *rig.sensors)}
+    names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
     if missing:
         raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; it holds {shown(sorted(arrays))}")

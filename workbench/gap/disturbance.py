@@ -89,7 +89,7 @@ def fit_random_force(
         for share in (3e-3, 3e-2, 3e-1)
         for memory, stages in COLOURS
     ]
-    start, stages = min(grid, key=lambda candidate: loss(*candidate, quick))
+    start, stages = min(grid, key=lambda candidate: loss(candidate[0], candidate[1], quick))
     simplex = np.array([start, start + (0.03, 0, 0), start + (0, 0.5, 0), start + (0, 0, 0.7)])
     options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 160}
     found = minimize(loss, start, args=(stages, residuals), method="Nelder-Mead", options=options)

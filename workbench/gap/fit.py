@@ -125,20 +125,20 @@ def fit(rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int =
         jacobian = problem.jacobian(free, residual)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
-        improved = False
+        improved: np.ndarray | None = None
         for _ in range(7):
             step = -np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
             step = np.clip(step, -_LONGEST * _reach(problem), _LONGEST * _reach(problem))
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
-                improved = True
+                improved = trial
                 break
             damping *= 6.0
-        if not improved:
+        if improved is None:
             status = "no step lowers the cost"
             break
-        decrease = 1.0 - (trial @ trial) / cost
-        free, residual, cost = free + step, trial, trial @ trial
+        decrease = 1.0 - (improved @ improved) / cost
+        free, residual, cost = free + step, improved, improved @ improved
         damping = max(damping / 8.0, 1e-9)
         idle = idle + 1 if decrease < tolerance else 0
         if idle >= 1:

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import csd
 
+from workbench.gap.coherence import linear_share
 from workbench.gap.effects.effect import Effect
 from workbench.gap.evidence import Evidence
 from workbench.gap.prediction import FitData
 
 MODE_SHARE = 0.05
+OCTAVES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,11 +25,13 @@ class Where:
         modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies.
         amplitude_dependent: whether the gap changes with level.
         mode_shares: (n_modes,) share of the gap in the band around each natural frequency.
+        band_edges_hz: (n_bands + 1,) of octaves down from half the sample rate, the lowest open to zero.
+        band_shares: (n_bands,) share of the gap in each.
         sensor_shares: (n_outputs,).
         time_shares: (n_records, 8) of each record's gap, by eighths of its length.
         record_gaps: (n_records,) gap as the case format defines it.
         input_levels: (n_records,) root mean square of the inputs.
-        linear_share: of the gap's power, what is coherent with the inputs.
+        linear_share: of the gap's power, what one linear reply to the inputs explains.
         at, at_std: the likeliest place of a missing force at a point and its standard deviation, m.
         point_share: share of the gap's log-likelihood that one force at that place accounts for.
     """
@@ -37,6 +40,8 @@ class Where:
     modes: tuple[int, ...]
     amplitude_dependent: bool
     mode_shares: np.ndarray
+    band_edges_hz: np.ndarray
+    band_shares: np.ndarray
     sensor_shares: np.ndarray
     time_shares: np.ndarray
     record_names: tuple[str, ...]
@@ -58,7 +63,10 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
     floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.counted]
     excess = np.array([(s**2).mean(axis=1) - f for s, f in zip(scaled, floors, strict=True)])
     by_sensor = np.maximum(excess, 0.0).sum(axis=0)
-    mode_shares = _mode_shares(evidence, scaled)
+    frequencies = evidence.rig.modes.frequencies_hz
+    between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
+    mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
+    octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - OCTAVES, 1)]
     profile = evidence.profile
     at, at_std, point_share = _place(evidence, profile)
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
@@ -68,29 +76,29 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
         modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > MODE_SHARE)),
         amplitude_dependent=_amplitude_dependent(effects, excess, data),
         mode_shares=mode_shares,
+        band_edges_hz=octaves,
+        band_shares=_shares_between(octaves, evidence, scaled),
         sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
         time_shares=np.array([_by_eighths(s) for s in scaled]),
         record_names=tuple(record.name for record in data.counted),
         record_gaps=gaps,
         input_levels=levels,
-        linear_share=_linear_share(data, scaled),
+        linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
         at=at,
         at_std=at_std,
         point_share=point_share,
     )
 
 
-def _mode_shares(evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
-    """Share of the residual's power in the band around each natural frequency, bands meeting half way between."""
-    frequencies = evidence.rig.modes.frequencies_hz
-    edges = np.r_[0.0, np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0)), np.inf]
-    power = np.zeros(frequencies.size)
+def _shares_between(edges: np.ndarray, evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
+    """Share of the residual's power above the noise between each edge (Hz) and the next."""
+    power = np.zeros(edges.size - 1)
     for record, s in zip(evidence.data.counted, scaled, strict=True):
         spectrum = (np.abs(np.fft.rfft(s, axis=1)) ** 2).sum(axis=0) / s.shape[1]
         grid = np.fft.rfftfreq(s.shape[1], record.sample_time)
-        band = np.clip(np.searchsorted(edges, grid, side="right") - 1, 0, frequencies.size - 1)
+        band = np.clip(np.searchsorted(edges, grid, side="right") - 1, 0, power.size - 1)
         floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).sum()
-        power += np.bincount(band, spectrum - floor, frequencies.size)
+        power += np.bincount(band, spectrum - floor, power.size)
     power = np.maximum(power, 0.0)
     return power / max(power.sum(), 1e-300)
 
@@ -98,29 +106,6 @@ def _mode_shares(evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
 def _by_eighths(scaled: np.ndarray) -> np.ndarray:
     power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
     return power / max(power.sum(), 1e-300)
-
-
-def _linear_share(data: FitData, scaled: list[np.ndarray]) -> float:
-    """Multiple coherence of the residual with the inputs, averaged over power."""
-    coherent = total = 0.0
-    for record, s in zip(data.counted, scaled, strict=True):
-        active = [row for row in record.inputs if np.any(row)]
-        length = min(256, record.n_samples // 4)
-        if not active or length < 16:
-            continue
-        inputs = np.array(active)
-        options = {"fs": 1.0 / record.sample_time, "nperseg": length}
-        suu = np.array([[csd(a, b, **options)[1] for b in inputs] for a in inputs]).transpose(2, 0, 1)
-        suu = suu + 1e-9 * np.trace(suu, axis1=1, axis2=2).real.max() * np.eye(len(active))
-        segments = 2 * record.n_samples / length - 1
-        for row in s:
-            sur = np.array([csd(a, row, **options)[1] for a in inputs]).T
-            explained = np.einsum("fi,fi->f", sur.conj(), np.linalg.solve(suu, sur[..., None])[..., 0]).real
-            power = csd(row, row, **options)[1].real
-            bias = len(active) / segments * power
-            coherent += np.maximum(explained - bias, 0.0).sum() * (1.0 + len(active) / segments)
-            total += power.sum()
-    return float(min(coherent / max(total, 1e-300), 1.0))
 
 
 def _place(evidence: Evidence, profile: np.ndarray) -> tuple[float, float, float]:
@@ -133,7 +118,7 @@ def _place(evidence: Evidence, profile: np.ndarray) -> tuple[float, float, float
     if places.size > 2:
         bend = profile[i - 1] - 2.0 * profile[i] + profile[i + 1]
         if bend < 0:
-            spread = max(spread * 0.0, float((places[1] - places[0]) / np.sqrt(-bend)))
+            spread = float((places[1] - places[0]) / np.sqrt(-bend))
     # the likelihood cannot tell more than the grid and the model of the force allow
     spread = max(spread, 0.1 * float(np.diff(places).mean()) if places.size > 1 else 0.0)
     n_samples = sum(record.n_samples for record in data.counted)

@@ -89,7 +89,7 @@ def _words(effects: list[dict]) -> str:
 def _matched(hidden: list[dict], told: list[dict], length: float) -> list[tuple[dict, dict]]:
     """Hidden and told effects of one kind side by side, two of a kind by their places."""
 
-    def cost(order: tuple[dict, ...]) -> float:
+    def cost(order: Iterable[dict]) -> float:
         pairs = list(zip(hidden, order, strict=True))
         if any(h["kind"] != t["kind"] for h, t in pairs):
             return float("inf")

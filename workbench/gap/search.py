@@ -106,7 +106,9 @@ def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begi
 
 def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
     """The fits in their order, at most so many whose last effect is of one kind, none twice."""
-    chosen, counts, keys = [], {}, set()
+    chosen: list[Fit] = []
+    counts: dict[str, int] = {}
+    keys = set()
     for candidate in fits:
         name = candidate.effects[-1].kind.name
         if candidate.cost < HOPELESS and counts.get(name, 0) < most and candidate.key not in keys:
@@ -147,7 +149,8 @@ def _started(search: Search, rig: Rig, evidence: Evidence, kind: Kind, target) -
 
 def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[list[tuple[float, Effect]]]:
     """The tasks in the order of their costs, at most so many targets of a kind."""
-    kept, counts = [], {}
+    kept = []
+    counts: dict[str, int] = {}
     for task in sorted(started, key=lambda s: s[0][0]):
         name = task[0][1].kind.name
         counts[name] = counts.get(name, 0) + (task[0][0] >= 0)

@@ -68,7 +68,7 @@ def measure(
         floor=floor,
         share={n: _closed(before[n] ** 2, after[n] ** 2, floor[n] ** 2) for n in before},
         overall=_closed(*table.mean(axis=0)),
-        ci95=tuple(float(q) for q in np.quantile(draws, (0.025, 0.975))),
+        ci95=(float(np.quantile(draws, 0.025)), float(np.quantile(draws, 0.975))),
     )
 
 

@@ -109,7 +109,9 @@ def _case(
 ) -> tuple[Case, dict]:
     nominal = Plant.of(bench.rig).rooted()
     real = hide(Plant.of(bench.rig), effects).rooted()
-    fit, validation, figures = [], [], {}
+    fit: list[Record] = []
+    validation: list[Record] = []
+    figures = {}
     for test, commands in tests.items():
         moved, sent = tested(real, bench, test, commands, rng)
         measured = real.readings(moved, bench.sample_time, rng)
@@ -168,7 +170,7 @@ def draw_kinds(n: int, seed: int, *, like: Case | None = None) -> list[tuple[str
     rng = np.random.default_rng(seed)
     pool = list(KINDS) if like is None else [k for k in KINDS if k != "truncated_modes"]
     singles = [(str(kind),) for _ in range(n // len(pool) + 1) for kind in rng.permutation(pool)]
-    drawn = []
+    drawn: list[tuple[str, ...]] = []
     for i in range(n):
         turn = (i * 7 + 3) % 60  # spreads the families over the list, whatever n is
         if turn < 5:

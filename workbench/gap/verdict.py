@@ -60,7 +60,7 @@ class Verdict:
         return tuple(told)
 
     @property
-    def nominal_figures(self) -> dict[str, float]:
+    def nominal_figures(self) -> dict[str, float | None]:
         """Factors on the nominal figures that were fitted along with the effects; empty where none were."""
         freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES]
         return _rounded_all(freed[0].values) if freed else {}
@@ -126,7 +126,7 @@ def effect_json(effect: Effect, nominal: Rig) -> dict:
     """One effect: kind, parameters with their standard deviations, place, input or output."""
     values = {name: value for name, value in effect.values.items() if name != "at"}
     if effect.kind.name == "truncated_modes":
-        values = {"kept": nominal.modes.n_modes, "needed": int(effect.target)}
+        values = {"kept": nominal.modes.n_modes, "needed": int(effect.target or 0)}
     if "phase" in values:
         values["phase"] = float((values["phase"] + np.pi) % (2.0 * np.pi) - np.pi)
     entry: dict = {"kind": effect.kind.name, "parameters": {n: _rounded(v) for n, v in values.items()}}
@@ -152,6 +152,10 @@ def where_json(where: Where) -> dict:
         "linear_share": _rounded(where.linear_share),
         "point": {"at": _rounded(where.at), "at_std": _rounded(where.at_std), "share": _rounded(where.point_share)},
         "by_mode": [_rounded(s) for s in where.mode_shares],
+        "by_band": {
+            "edges_hz": [_rounded(f) for f in where.band_edges_hz],
+            "shares": [_rounded(s) for s in where.band_shares],
+        },
         "by_sensor": [_rounded(s) for s in where.sensor_shares],
         "by_record": {
             name: {"gap": _rounded(gap), "input_rms": _rounded(level), "by_eighth": [_rounded(s) for s in shares]}

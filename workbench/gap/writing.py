@@ -1,6 +1,7 @@
 """Writing a case folder."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +26,8 @@ def write_case(case: Case, folder: str | Path) -> Path:
     blocks = [f"title = {_text(case.name)}", _structure(case.rig), *_ports(case.rig)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         file = f"records/{record.name}.npz"
-        np.savez_compressed(folder / file, t=record.time, **_arrays(record))
+        arrays: dict[str, Any] = {"t": record.time, **_arrays(record)}
+        np.savez_compressed(folder / file, **arrays)
         blocks.append(_table("[[record]]", name=record.name, file=file, sample_time=record.sample_time, use=use))
     path = folder / "case.toml"
     path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
@@ -49,8 +51,8 @@ def _structure(rig: Rig) -> str:
     if not isinstance(member.damping, ModalDamping) or damping.size != 1:
         raise ValueError("the case format knows one damping ratio for all modes; use ModalDamping(ratio)")
     beam = isinstance(member, Beam)
-    stiffness = {"bending_stiffness": member.bending_stiffness} if beam else {"axial_stiffness": member.axial_stiffness}
-    profiles = {"mass_per_length": member.mass_per_length, **stiffness}
+    stiffness = "bending_stiffness" if beam else "axial_stiffness"
+    profiles = {"mass_per_length": member.mass_per_length, stiffness: getattr(member, stiffness)}
     return _table(
         "[structure]",
         kind="beam" if beam else "rod",
@@ -59,7 +61,7 @@ def _structure(rig: Rig) -> str:
         left=_end(member.left, beam),
         right=_end(member.right, beam),
         damping_ratio=float(damping[0]),
-        **({"tension": member.tension} if beam and member.tension else {}),
+        **({"tension": member.tension} if isinstance(member, Beam) and member.tension else {}),
         modes=rig.modes.n_modes,
     )
 
@@ -94,7 +96,7 @@ def _table(header: str, **entries: object) -> str:
     return "\n".join([header, *(f"{key} = {_value(value)}" for key, value in entries.items())])
 
 
-def _value(value: object) -> str:
+def _value(value: Any) -> str:
     if isinstance(value, str):
         return _text(value)
     if isinstance(value, dict):

@@ -149,7 +149,7 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
     return force
 
 
-def _participation(rig: Rig) -> np.ndarray:
+def participation_of(rig: Rig) -> np.ndarray:
     """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
     shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
     for derivative, kind in enumerate(("force", "moment")):
@@ -160,7 +160,7 @@ def _participation(rig: Rig) -> np.ndarray:
 
 
 def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
-    modes, participation = rig.modes, _participation(rig)
+    modes, participation = rig.modes, participation_of(rig)
     system = modal_poles(modes.omega, modes.damping)
     n_samples = inputs.shape[1]
     response = np.zeros((system.poles.size, n_samples), complex)
@@ -193,7 +193,7 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
         coupling = np.zeros((0, 0))
     n_samples = inputs.shape[1]
     forces, at_samples = _forces_on_substeps(rig, inputs, sample_time, substeps)
-    participation = _participation(rig)
+    participation = participation_of(rig)
     for element in rig.elements:
         if isinstance(element, PeriodicForce):
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)

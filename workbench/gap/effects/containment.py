@@ -19,6 +19,6 @@ def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
         return (Effect(GROUND_SPRING, None, {"at": v["at"], "stiffness": v["stiffness"]}),)
     if effect.kind is BOUC_WEN:
         return (Effect(GROUND_SPRING, None, {"at": v["at"], "stiffness": v["stiffness"]}),)
-    if effect.kind is TRUNCATED_MODES and effect.target - 1 > rig.modes.n_modes:
+    if effect.kind is TRUNCATED_MODES and isinstance(effect.target, int) and effect.target - 1 > rig.modes.n_modes:
         return (Effect(TRUNCATED_MODES, effect.target - 1, {}),)
     return ()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -63,9 +64,9 @@ class Kind:
 
     name: str
     path: str
-    parameters: Callable[[Rig, object], tuple[Parameter, ...]]
-    apply: Callable[[Rig, object, dict[str, float]], Rig]
-    starts: Callable[[object, object], Iterable[dict[str, float]]]
+    parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
+    apply: Callable[[Rig, Any, dict[str, float]], Rig]
+    starts: Callable[[Any, Any], Iterable[dict[str, float]]]
     targets: Callable[[Rig], tuple] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
@@ -88,7 +89,7 @@ class Effect:
     """
 
     kind: Kind
-    target: object
+    target: str | int | None
     values: dict[str, float]
     deviations: dict[str, float] = field(default_factory=dict)
 

@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from workbench.gap.effects.effect import Kind, Parameter
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
+from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
 from workbench.structure.supports import HELD, End, PointDamper, PointMass, PointSpring
@@ -32,6 +33,18 @@ def resolved(rig: Rig, structure) -> Rig:
     return replace(rig, structure=structure, modes=structure.modes(rig.modes.n_modes, tolerance=RESOLUTION))
 
 
+def _member(rig: Rig) -> Structure:
+    if rig.structure is None:
+        raise ValueError("plain modal data have no structure to change; describe it as a beam or a rod")
+    return rig.structure
+
+
+def _beam(rig: Rig) -> Beam:
+    if not isinstance(rig.structure, Beam):
+        raise ValueError("only a beam bends; describe the structure as one")
+    return rig.structure
+
+
 def _with_attachment(rig: Rig, part) -> Rig:
     if rig.structure is None:
         return replace(rig, modes=attach(rig.modes, (part,)))
@@ -48,13 +61,12 @@ def stiffness_name(structure) -> str:
 
 def _modulus(rig: Rig, _, values) -> Rig:
     factor = values["factor"]
-    if rig.structure is None or rig.structure.attachments or getattr(rig.structure, "tension", 0.0):
-        if rig.structure is None:
-            return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
-        name = stiffness_name(rig.structure)
-        return resolved(rig, replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)}))
+    if rig.structure is None:
+        return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
     name = stiffness_name(rig.structure)
     structure = replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)})
+    if structure.attachments or (isinstance(structure, Beam) and structure.tension):
+        return resolved(rig, structure)
     if any(0 < s < HELD for end in (structure.left, structure.right) for s in (end.translation, end.rotation)):
         return resolved(rig, structure)
     return replace(rig, structure=structure, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
@@ -107,7 +119,10 @@ def _point_starts(name: str, series: str, typical):
 
 def _total_mass(rig: Rig) -> float:
     if rig.structure is None:
-        return 1.0 / float(np.mean(rig.modes.phi(known_places(rig))[:, 0] ** 2))
+        places = known_places(rig)
+        if places is None:
+            raise ValueError("neither a structure nor the places of the modes are known; the mass cannot be told")
+        return 1.0 / float(np.mean(rig.modes.phi(places)[:, 0] ** 2))
     x = (np.arange(50) + 0.5) / 50 * rig.structure.length
     return float(np.mean(rig.structure.mass_per_length(x)) * rig.structure.length)
 
@@ -161,11 +176,12 @@ POINT_DAMPER = Kind(
 
 
 def _softened(rig: Rig, _, values) -> Rig:
-    name, length = stiffness_name(rig.structure), rig.structure.length
+    member = _member(rig)
+    name, length = stiffness_name(member), member.length
     start = max(values["at"] - 0.5 * values["width"], 0.0)
     stop = min(values["at"] + 0.5 * values["width"], length)
-    profile = getattr(rig.structure, name).scaled(1.0 - values["loss"], start, stop)
-    return resolved(rig, replace(rig.structure, **{name: profile}))
+    profile = getattr(member, name).scaled(1.0 - values["loss"], start, stop)
+    return resolved(rig, replace(member, **{name: profile}))
 
 
 def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
@@ -206,12 +222,13 @@ def _ends(rig: Rig) -> tuple:
 
 
 def _rotated(rig: Rig, end: str, values) -> Rig:
-    support = End(HELD, values["rotational_stiffness"])
-    return resolved(rig, replace(rig.structure, **{end: support}))
+    support: Any = End(HELD, values["rotational_stiffness"])
+    return resolved(rig, replace(_beam(rig), **{end: support}))
 
 
 def _end_stiffness(rig: Rig) -> float:
-    return float(rig.structure.bending_stiffness(0.5 * rig.structure.length)) / rig.structure.length
+    beam = _beam(rig)
+    return float(beam.bending_stiffness(0.5 * beam.length)) / beam.length
 
 
 SUPPORT_ROTATION = Kind(
@@ -233,10 +250,15 @@ SUPPORT_ROTATION = Kind(
 
 
 def _buckling(rig: Rig) -> float:
-    structure = rig.structure
-    x = (np.arange(40) + 0.5) / 40 * structure.length
-    held = sum(end.rotation == HELD for end in (structure.left, structure.right))
-    return float(np.min(structure.bending_stiffness(x))) * (np.pi / structure.length) ** 2 * (1.0 + held)
+    beam = _beam(rig)
+    x = (np.arange(40) + 0.5) / 40 * beam.length
+    held = sum(end.rotation == HELD for end in (beam.left, beam.right))
+    return float(np.min(beam.bending_stiffness(x))) * (np.pi / beam.length) ** 2 * (1.0 + held)
+
+
+def _pulled(rig: Rig, _, values) -> Rig:
+    beam = _beam(rig)
+    return resolved(rig, replace(beam, tension=beam.tension + values["tension"]))
 
 
 AXIAL_LOAD = Kind(
@@ -245,7 +267,7 @@ AXIAL_LOAD = Kind(
     parameters=lambda rig, _: (
         Parameter("tension", "N", -4.0 * _buckling(rig), 200.0 * _buckling(rig), scale=0.05 * _buckling(rig)),
     ),
-    apply=lambda rig, _, v: resolved(rig, replace(rig.structure, tension=rig.structure.tension + v["tension"])),
+    apply=_pulled,
     starts=lambda evidence, _: [
         {"tension": share * _buckling(evidence.rig)}
         for share in (
@@ -277,7 +299,7 @@ AXIAL_LOAD = Kind(
 
 
 def _truncated(rig: Rig, count, _) -> Rig:
-    return replace(rig, modes=rig.structure.modes(count, tolerance=RESOLUTION))
+    return replace(rig, modes=_member(rig).modes(count, tolerance=RESOLUTION))
 
 
 TRUNCATED_MODES = Kind(

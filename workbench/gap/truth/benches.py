@@ -67,7 +67,7 @@ def bench_of(case: Case) -> Bench:
     if not rows:
         raise ValueError("every input of the case is a hammer; a trial needs an actuator to command")
     level = {record: np.sqrt(np.mean(record.inputs[rows] ** 2, axis=1)).max() for record in case.fit}
-    loudest = max(level, key=level.get)
+    loudest = max(level, key=lambda record: level[record])
     if not level[loudest] > 0:
         raise ValueError("no actuator acts in any record to fit; a trial takes its level and band from there")
     row = rows[int(np.argmax(np.mean(loudest.inputs[rows] ** 2, axis=1)))]
@@ -81,7 +81,8 @@ def _suited(rig: Rig, rng: np.random.Generator) -> Bench:
     """A bench with sample time, band, level and noise that suit a rig."""
     top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
     band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
-    bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, float(rng.choice([30.0, 40.0, 50.0])), None)
+    snr_db = float(rng.choice([30.0, 40.0, 50.0]))
+    bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, snr_db, None)
     plant = Plant.of(rig).rooted()
     commands = multisine(bench, rng)
     moved, _ = plant.move(commands, bench.sample_time)
@@ -89,7 +90,7 @@ def _suited(rig: Rig, rng: np.random.Generator) -> Bench:
     level = float(f"{rig.modes.length * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
     fastest = np.sqrt(np.mean((plant.at_actuators @ moved[1].T) ** 2, axis=1)).max()
     low = plant.readings(moved, bench.sample_time).std(axis=1) * level * LEVELS["low"]
-    noise = [float(f"{10 ** (-bench.snr_db / 20) * value:.6g}") for value in low]
+    noise = [float(f"{10 ** (-snr_db / 20) * value:.6g}") for value in low]
     sensors = tuple(replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True))
     feedback = float(rng.uniform(0.2, 0.6)) / fastest if rng.random() < 0.6 else None
     return replace(bench, rig=replace(rig, sensors=sensors), level=level, feedback=feedback)
@@ -141,7 +142,7 @@ def tested(
     plant: RootedPlant, bench: Bench, name: str, commands: np.ndarray, rng: np.random.Generator | None = None
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
     """The motion of a plant in one of the experiments, and the commands that were sent."""
-    feedback = bench.feedback if name == "closed_loop" else 0.0
+    feedback = (bench.feedback or 0.0) if name == "closed_loop" else 0.0
     return plant.move(commands, bench.sample_time, feedback=feedback, rng=rng)
 
 

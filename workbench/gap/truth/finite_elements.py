@@ -76,7 +76,7 @@ def element_modes(
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
     special += [at + side * width / 2 for at, width, _ in altered.losses for side in (-1, 1)]
-    profile = member.bending_stiffness if beam else member.axial_stiffness
+    profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
     special += [*member.mass_per_length.breaks, *profile.breaks, *(part.at for part in member.attachments)]
     nodes = _nodes(np.array(special, float), member.length, elements)
     basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
@@ -190,6 +190,6 @@ def _attached(member: Structure, name: str) -> list[tuple[float, float]]:
 def _typical(member: Structure) -> float:
     """A frequency of the size of the first elastic one, rad/s."""
     order = 2 if isinstance(member, Beam) else 1
-    profile = member.bending_stiffness if order == 2 else member.axial_stiffness
+    profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
     x = np.linspace(0.05, 0.95, 19) * member.length
     return float(np.sqrt(profile(x).mean() / member.mass_per_length(x).mean()) * (np.pi / member.length) ** order)

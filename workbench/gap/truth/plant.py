@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.special import ndtr
@@ -60,7 +61,7 @@ class Plant:
         gauss, weights = np.polynomial.legendre.leggauss(DRAG_POINTS)
         length = self.nominal.modes.length
         field_places = 0.5 * length * (gauss + 1.0) if self.drag else np.zeros(0)
-        groups = [
+        groups: list[list[float] | np.ndarray] = [
             [a.at for a in self.actuators],
             [s.at for s in self.sensors],
             [at for _, at, _ in self.laws],
@@ -74,7 +75,9 @@ class Plant:
         else:
             modes = element_modes(self.nominal.structure, places, self.n_modes, altered=self.altered)
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
-        return RootedPlant(self, modes, *shapes[:5], np.c_[shapes[5], 0.5 * length * weights[: len(field_places)]])
+        inputs, sensors, laws, tones, noises, field = shapes
+        drag = np.c_[field, 0.5 * length * weights[: len(field_places)]]
+        return RootedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +155,10 @@ class RootedPlant:
         return np.array([moved[k] @ shape for k, shape in zip(order, self.at_sensors, strict=True)])
 
     def readings(
-        self, moved: tuple[np.ndarray, ...], sample_time: float, rng: np.random.Generator | None = None
+        self,
+        moved: tuple[np.ndarray, np.ndarray, np.ndarray],
+        sample_time: float,
+        rng: np.random.Generator | None = None,
     ) -> np.ndarray:
         """What the sensors read, (n_outputs, n_samples); without `rng` the mean of what rounding makes of noise."""
         y = self.truth(moved)
@@ -215,5 +221,5 @@ def with_ports(plant: Plant, side: str, name: str, **changes) -> Plant:
     def meant(port) -> bool:
         return port.name == name or (name == "all" and not getattr(port, "direct", False))
 
-    ports = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
+    ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
     return replace(plant, **{side: ports})

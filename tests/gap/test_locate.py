@@ -1,0 +1,92 @@
+"""Where a gap lies, on gaps put in by hand: a tone on one sensor late in one record, and a force that nobody modelled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.evidence import Evidence
+from workbench.gap.locate import locate
+from workbench.gap.prediction import FitData
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CoulombFriction, PeriodicForce
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+DT, SAMPLES, NOISE = 0.01, 2000, 1e-5
+
+
+@pytest.fixture(scope="module")
+def rig():
+    beam = Beam(
+        length=2.0,
+        mass_per_length=1.0,
+        bending_stiffness=4.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    sensors = [Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
+    return Rig(beam.modes(6), (Actuator("F", 0.45),), sensors, structure=beam)
+
+
+def measured(real, name, level, seed):
+    rng = np.random.default_rng(seed)
+    command = np.repeat(level * rng.normal(size=SAMPLES // 10), 10)[None]
+    clean = simulate(real, command, sample_time=DT).outputs
+    return Record(
+        sample_time=DT,
+        outputs=clean + NOISE * rng.normal(size=clean.shape),
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in real.sensors),
+        inputs=command,
+        input_channels=(Channel("F", "force", at=0.45),),
+        name=name,
+    )
+
+
+def where(rig, records):
+    return locate(Evidence.of(rig, FitData(tuple(records), np.full(4, NOISE))), ())
+
+
+def test_a_tone_on_one_sensor_late_in_one_record(rig):
+    quiet, loud = measured(rig, "quiet", 0.1, 0), measured(rig, "loud", 1.0, 1)
+    tone = 0.05 * loud.outputs[2].std() * np.sin(2 * np.pi * 20.0 * loud.time) * (loud.time > 7 / 8 * loud.time[-1])
+    loud = replace(loud, outputs=loud.outputs + np.array([[0.0], [0.0], [1.0], [0.0]]) * tone)
+    found = where(rig, (quiet, loud))
+    assert found.sensor_shares[2] > 0.99 and found.path == "sensor"
+    inside = (found.band_edges_hz[:-1] <= 20.0) & (found.band_edges_hz[1:] > 20.0)
+    assert inside.sum() == 1 and found.band_shares[inside][0] > 0.95
+    assert found.band_shares.sum() == pytest.approx(1.0) and found.mode_shares.sum() == pytest.approx(1.0)
+    assert found.time_shares[1].argmax() == 7 and found.time_shares[1, 7] > 0.9
+    assert found.linear_share < 0.2
+    assert found.record_gaps[1] > 10 * NOISE / loud.outputs.std()
+
+
+def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig):
+    frequency = 1.1 * rig.modes.frequencies_hz[1]
+    real = replace(rig, elements=(PeriodicForce(1.37, frequency, 0.05, 0.3),))
+    found = where(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert found.at == pytest.approx(1.37, abs=0.02 * rig.modes.length)
+    assert found.at_std < 0.05 * rig.modes.length
+    assert 2 in found.modes and found.point_share > 0.95
+    assert found.path == "structure" and found.linear_share < 0.1
+
+
+def test_no_gap_has_no_path(rig):
+    found = where(rig, [measured(rig, "a", 0.3, 4)])
+    assert found.path == "none"
+
+
+@pytest.mark.parametrize(
+    "changed", [{"actuators": (Actuator("F", 0.45, gain=1.2),)}, {"actuators": (Actuator("F", 0.52),)}]
+)
+def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed):
+    levels = (0.1, 0.3, 1.0)
+    linear = where(rig, [measured(replace(rig, **changed), f"{u}", u, 5) for u in levels])
+    assert linear.linear_share > 0.95
+    softening = replace(rig, elements=(CoulombFriction(0.9, 0.05, 0.005),))
+    assert where(rig, [measured(softening, f"{u}", u, 5) for u in levels]).linear_share < 0.6
