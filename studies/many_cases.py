@@ -17,8 +17,9 @@ from workbench.design.spillover import effort, spillover
 from workbench.draw.many import plot_cases
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
+from workbench.study.engines import packed, unpacked
 
-N_TIMED, PAUSE, ROUNDS = 100, 0.05, 3
+N_TIMED, PAUSE, ROUNDS = 200, 0.05, 3
 WEIGHTS = np.geomspace(1.0, 100.0, 9)
 SHIFTS = np.linspace(-0.9, 0.9, 19)
 
@@ -35,27 +36,34 @@ def spilled(weight, shift):
 
 
 def busy(number):
-    """50 ms of one core: a fixed amount of time worked, however fast the core."""
+    """50 ms of one core, however fast the core."""
     until = time.process_time() + PAUSE
     while time.process_time() < until:
         number = (number * 48271) % 2147483647
     return number
 
 
-def timed() -> list[float]:
+def waiting(number):
+    """50 ms that need no core: what is lost then is lost by the runner, whoever else works on the machine."""
+    time.sleep(PAUSE)
+    return number
+
+
+def timed(function) -> list[float]:
     """Times as shares of a plain loop's: one process, two, two bare loops side by side, and a second run."""
     cases = many.grid(number=range(1, N_TIMED + 1))
     with TemporaryDirectory() as folder:
-        loop = seconds(lambda: [busy(**case) for case in cases])
-        one = seconds(lambda: many.run(cases, busy, cache=f"{folder}/one", workers=1))
-        two = seconds(lambda: many.run(cases, busy, cache=f"{folder}/two", workers=2))
-        kept = seconds(lambda: many.run(cases, busy, cache=f"{folder}/two", workers=2))
-    bare = seconds(lambda: Parallel(2)(delayed(half)(cases[i::2]) for i in (0, 1)))
+        loop = seconds(lambda: [function(**case) for case in cases])
+        one = seconds(lambda: many.run(cases, function, cache=f"{folder}/one", workers=1))
+        two = seconds(lambda: many.run(cases, function, cache=f"{folder}/two", workers=2))
+        kept = seconds(lambda: many.run(cases, function, cache=f"{folder}/two", workers=2))
+    halves = packed(function)
+    bare = seconds(lambda: Parallel(2)(delayed(half)(halves, cases[i::2]) for i in (0, 1)))
     return [one / loop, two / loop, bare / loop, kept / loop]
 
 
-def half(cases):
-    return [busy(**case) for case in cases]
+def half(function, cases):
+    return [unpacked(function)(**case) for case in cases]
 
 
 def seconds(call) -> float:
@@ -73,20 +81,24 @@ def study(outcome, data=None):
     outcome.check("run, run again and a plain loop: largest difference of any result", apart, 0.0)
     outcome.check("cases that failed", len(found.failed), 0)
 
-    shares = np.median([timed() for _ in outcome.track(range(ROUNDS), "rounds of timing")], axis=0)
     names = (
         "one process, every result kept",
         "two processes, every result kept",
         "two bare loops side by side",
         "again",
     )
-    outcome.table("speed", [{"what": n, "share of a plain loop's time": round(s, 4)} for n, s in zip(names, shares)])
-    one, two, bare, kept = shares
-    outcome.say(
-        f"{N_TIMED} cases of {1000 * PAUSE:g} ms: {100 * (one - 1):.1f} % over a plain loop, every result kept."
-    )
-    outcome.say(f"Two processes: {1 / two:.2f} times as fast; two bare loops side by side: {1 / bare:.2f} times.")
-    outcome.say(f"A second run finds all that was kept in {100 * kept:.2g} % of the time.")
+    rows = [{"what": name} for name in names]
+    for what, function in (("work", busy), ("wait", waiting)):
+        rounds = outcome.track(range(ROUNDS), f"rounds of timing, cases that {what}")
+        one, two, bare, kept = shares = np.median([timed(function) for _ in rounds], axis=0)
+        for row, share in zip(rows, shares):
+            row[f"share of a plain loop's time, cases that {what}"] = round(share, 4)
+        outcome.say(
+            f"{N_TIMED} cases that {what} {1000 * PAUSE:g} ms: {100 * (one - 1):.1f} % over a plain loop, all results"
+            f" kept; two processes {1 / two:.2f} times as fast, two bare loops side by side {1 / bare:.2f} times;"
+            f" a second run takes {100 * kept:.2g} %."
+        )
+    outcome.table("speed", rows)
     outcome.figure(
         "spillover",
         plot_cases(found.rows(), x="shift", y="W_R", by="weight"),

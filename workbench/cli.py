@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -105,7 +104,10 @@ def study(
             needs = f" (needs --data: {entry.needs_data})" if entry.needs_data else ""
             console.print(f"{entry.name:<{width}}  {entry.question}{needs}", markup=False)
         return
-    chosen = [entry for entry in list_studies() if not entry.needs_data] if every else [find_study(name)]
+    if name is None or every:
+        chosen = [entry for entry in list_studies() if not entry.needs_data]
+    else:
+        chosen = [find_study(name)]
     held = [_run(entry, data, scheduler) for entry in chosen]
     if not all(held):
         raise typer.Exit(FAILURE)
@@ -484,4 +486,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

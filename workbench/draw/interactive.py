@@ -1,12 +1,14 @@
 """A figure as plain numbers, for a page to draw: to zoom, to hover over, to read on a phone and in the dark."""
 
 import base64
+from collections.abc import Callable
 from io import BytesIO
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection, QuadMesh
-from matplotlib.colors import to_hex
+from matplotlib.colors import to_hex, to_rgba
 from matplotlib.container import BarContainer
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
@@ -107,7 +109,7 @@ def _described(ax: Axes, artist) -> list[dict]:
 
 def _line(ax: Axes, line: Line2D) -> list[dict]:
     style = {"colour": _colour(line.get_color()), "label": _label(line), "alpha": _alpha(line)}
-    style |= {"width": round(line.get_linewidth() * POINTS, 2), "dash": DASHES.get(line.get_linestyle(), "")}
+    style |= {"width": round(line.get_linewidth() * POINTS, 2), "dash": DASHES.get(str(line.get_linestyle()), "")}
     for transform, axis, values in (
         (ax.get_xaxis_transform(), "x", line.get_xdata()),
         (ax.get_yaxis_transform(), "y", line.get_ydata()),
@@ -153,7 +155,7 @@ def _box(ax: Axes, patch: Rectangle) -> list[float | None]:
 
 
 def _rectangle(ax: Axes, patch: Rectangle) -> list[dict]:
-    faint = patch.get_facecolor()
+    faint = to_rgba(patch.get_facecolor())
     look = {"colours": [_colour(faint)], "alpha": float(faint[3]), "label": _label(patch)}
     if faint[3] == 0:
         look = {"colours": ["none"], "edge": _colour(patch.get_edgecolor()), "label": _label(patch)}
@@ -161,9 +163,10 @@ def _rectangle(ax: Axes, patch: Rectangle) -> list[dict]:
 
 
 def _points(ax: Axes, points: PathCollection) -> list[dict]:
-    x, y = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float).T
-    faces, sizes = points.get_facecolors(), points.get_sizes()
-    colours = [_colour(face) for face in faces] or [_colour(c) for c in points.get_edgecolors()]
+    places = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float)
+    x, y = places[:, 0], places[:, 1]
+    faces, sizes = np.atleast_2d(points.get_facecolor()), points.get_sizes()
+    colours = [_colour(face) for face in faces] or [_colour(c) for c in np.atleast_2d(points.get_edgecolor())]
     same = {"colour": colours[0]} if len(colours) <= 1 else {"colours": colours, "colour": colours[0]}
     size = round(float(np.sqrt(np.mean(sizes))) * POINTS, 2)
     return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "width": 0, "marker": "o", "size": size, **same,
@@ -171,37 +174,39 @@ def _points(ax: Axes, points: PathCollection) -> list[dict]:
 
 
 def _polygons(ax: Axes, areas: PolyCollection) -> list[dict]:
-    face = areas.get_facecolors()
+    face = np.atleast_2d(areas.get_facecolor())
     if len(face) == 0:
         raise Undescribed("areas without a colour")
     return [
-        {"kind": "area", **dict(zip("xy", map(_numbers, path.vertices.T))), "colour": _colour(face[0]),
+        {"kind": "area", **dict(zip("xy", map(_numbers, np.asarray(path.vertices).T))), "colour": _colour(face[0]),
          "alpha": float(face[0][3]), "label": _label(areas)}
         for path in areas.get_paths()
     ]  # fmt: skip
 
 
 def _polygon(ax: Axes, patch: Polygon) -> list[dict]:
-    face = patch.get_facecolor()
-    x, y = patch.get_xy().T
+    face = to_rgba(patch.get_facecolor())
+    corners = np.asarray(patch.get_xy())
+    x, y = corners[:, 0], corners[:, 1]
     return [{"kind": "area", "x": _numbers(x), "y": _numbers(y), "colour": _colour(face), "alpha": float(face[3]),
              "label": _label(patch)}]  # fmt: skip
 
 
 def _segments(ax: Axes, lines: LineCollection) -> list[dict]:
     gap = np.full((1, 2), np.nan)
-    x, y = np.concatenate([part for segment in lines.get_segments() for part in (segment, gap)]).T
-    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "colour": _colour(lines.get_colors()[0]),
-             "width": round(float(np.mean(lines.get_linewidths())) * POINTS, 2), "dash": "", "label": _label(lines),
+    points = np.concatenate([part for segment in lines.get_segments() for part in (np.asarray(segment), gap)])
+    x, y = points[:, 0], points[:, 1]
+    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "colour": _colour(np.atleast_2d(lines.get_color())[0]),
+             "width": round(float(np.mean(lines.get_linewidth())) * POINTS, 2), "dash": "", "label": _label(lines),
              "alpha": _alpha(lines)}]  # fmt: skip
 
 
 def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict]:
-    corners = mesh.get_coordinates()
+    corners = np.asarray(mesh.get_coordinates(), float)
     x, y = corners[0, :, 0], corners[:, 0, 1]
     if not (np.allclose(corners[..., 0], x) and np.allclose(corners[..., 1].T, y)):
         raise Undescribed("a mesh that is no grid")
-    values = np.ma.filled(mesh.get_array().astype(float), np.nan)
+    values = np.ma.filled(np.ma.asarray(mesh.get_array()).astype(float), np.nan)
     return [_field(mesh, values.reshape(values.shape[-2:]), (x[0], x[-1]), (y[0], y[-1]))]
 
 
@@ -215,8 +220,8 @@ def _image(ax: Axes, image: AxesImage) -> list[dict]:
 
 def _field(artist, values: np.ndarray, x, y) -> dict:
     """Values over a grid, in 255 steps of its colours; 255 means none."""
-    steps = [max(1, -(-n // most)) for n, most in zip(values.shape, MOST_CELLS)]
-    values = values[:: steps[0], :: steps[1]]
+    every = [max(1, -(-n // most)) for n, most in zip(values.shape, MOST_CELLS)]
+    values = values[:: every[0], :: every[1]]
     low, high = (float(v) for v in artist.get_clim())
     shares = np.clip((values - low) / ((high - low) or 1.0), 0.0, 1.0)
     steps = np.where(np.isfinite(values), np.round(254 * np.nan_to_num(shares)), 255).astype(np.uint8)
@@ -257,7 +262,7 @@ def _words(ax: Axes, text) -> list[dict]:
              "across": text.get_ha(), "up": text.get_va(), "size": round(text.get_fontsize() * POINTS, 1)}]  # fmt: skip
 
 
-KINDS = {
+KINDS: dict[type, Callable[[Axes, Any], list[dict]]] = {
     Line2D: _line,
     Rectangle: _rectangle,
     Polygon: _polygon,

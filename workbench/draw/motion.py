@@ -59,7 +59,7 @@ def mode_motion(
 
     Sampled modes are shown at their sensors, with the phase that each sensor has.
     """
-    tracks = []
+    tracks: list[dict] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
             placed = np.isfinite(found.positions).all()

@@ -1,6 +1,9 @@
 """The look of every figure: quiet axes, few colours that colour-blind readers can tell apart."""
 
+from typing import Any
+
 import matplotlib
+from cycler import cycler
 from matplotlib.figure import Figure
 
 matplotlib.use("Agg")
@@ -9,9 +12,9 @@ matplotlib.use("Agg")
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#8a8a8a"
 
-SETTINGS = {
+SETTINGS: Any = {
     "axes.grid": True,
-    "axes.prop_cycle": matplotlib.cycler(color=COLOURS),
+    "axes.prop_cycle": cycler(color=COLOURS),
     "axes.spines.right": False,
     "axes.spines.top": False,
     "axes.titlesize": 11,

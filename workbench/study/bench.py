@@ -83,7 +83,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _save(self, content: dict) -> dict:
         if not isinstance(content, dict) or not isinstance(content.get("name"), str):
             raise StudyError("a design is saved under a name")
-        path = save(self.rig, self.structure, asked(content.get("design")), content["name"], self.folder)
+        path = save(self.rig, self.structure, asked(content.get("design", {})), content["name"], self.folder)
         return {"saved": str(path)}
 
     def _content(self):
@@ -97,7 +97,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise StudyError("that is no design") from None
 
     def _from_here(self) -> bool:
-        port = self.server.server_address[1]
+        port = self.connection.getsockname()[1]
         own = {f"{HERE}:{port}", f"localhost:{port}"}
         origin = self.headers.get("Origin")
         return self.headers.get("Host") in own and (origin is None or origin.removeprefix("http://") in own)

@@ -91,6 +91,8 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
     if data is not None and not data.exists():
         raise StudyError(f"--data {data}: there is no such file or folder")
     spec = importlib.util.spec_from_file_location(f"study_{study.name}", study.path)
+    if spec is None or spec.loader is None:
+        raise StudyError(f"{study.path} is no Python file")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     module.study(outcome, data)

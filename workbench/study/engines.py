@@ -42,7 +42,7 @@ def work(function: Callable, job: Job, running: Path | None = None) -> dict:
     if running is not None:
         (running / job.key).touch()
     start = time.perf_counter()
-    record = {"result": None, "error": None, "trace": None, "workbench": own_source()}
+    record: dict = {"result": None, "error": None, "trace": None, "workbench": own_source()}
     try:
         found = function(**job.arguments)
         record["result"] = encoded(found if isinstance(found, dict) else {"result": found})
@@ -96,12 +96,12 @@ def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tup
     A case whose process dies takes the others' processes with it. Those that were running then are worked again, each
     on its own; what dies alone has only itself to blame.
     """
-    waiting, function = {job.key: job for job in jobs}, packed(function)
+    waiting, sent = {job.key: job for job in jobs}, packed(function)
     with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
         running = Path(folder)
         while waiting:
             try:
-                for key, record in _parallel(function, waiting.values(), workers, running):
+                for key, record in _parallel(sent, waiting.values(), workers, running):
                     del waiting[key]
                     yield key, record
             except TerminatedWorkerError:
@@ -110,7 +110,7 @@ def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tup
                     path.unlink()
                 for job in suspects:
                     del waiting[job.key]
-                    yield job.key, _alone(function, job, running)
+                    yield job.key, _alone(sent, job, running)
 
 
 def _parallel(function: bytes, jobs, workers: int, running: Path) -> Iterator[tuple[str, dict]]:

@@ -31,8 +31,8 @@ class Outcome:
     name: str
     title: str = ""
     figures_folder: Path = Path("figures")
-    on_say: object = None
-    on_track: object = None
+    on_say: Callable[[str], None] | None = None
+    on_track: Callable[[Iterable, str], Iterator] | None = None
     on_report: Callable[[str, float], None] | None = None
     cache: Path = CACHE
     scheduler: str | None = None

@@ -43,8 +43,7 @@ def case_story(folder: Path) -> Story:
     """What a case holds before any diagnosis: its nominal model, in motion, and its records beside what that says."""
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
-    places = {"actuators": rig.actuators, "sensors": rig.sensors}
-    blocks = [block(mode_motion({"nominal": rig.modes}, **places), MOVING)]
+    swinging = mode_motion({"nominal": rig.modes}, actuators=rig.actuators, sensors=rig.sensors)
     beside = plot_responses({"nominal": rig}, records)
     told = "Measured beside the nominal model, at the sensor and in the stretch where they differ most."
     rows = [
@@ -55,7 +54,7 @@ def case_story(folder: Path) -> Story:
     return Story(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
-        blocks=[*(blocks if rig.structure is not None else []), block(beside, told)],
+        blocks=[*([block(swinging, MOVING)] if rig.structure is not None else []), block(beside, told)],
         tables=[
             ("Records", ("record", "use", "samples", "sample rate [Hz]", "input rms"), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
@@ -91,9 +90,8 @@ def story_in(path: Path) -> Story:
     try:
         told = tell(content)
     except (KeyError, TypeError, AttributeError, ValueError, IndexError, ArithmeticError) as error:
-        raise StudyError(
-            f"{path} looks like {tell.__doc__[0].lower()}{tell.__doc__[1:-1]}, but is damaged: {error!r:.120}"
-        ) from error
+        looks = (tell.__doc__ or "").rstrip(".")
+        raise StudyError(f"{path} looks like {looks[:1].lower()}{looks[1:]}, but is damaged: {error!r:.120}") from error
     story = {"title": path.stem.replace("_", " "), "tables": _tables(content), **told}
     return Story(made_by=f"workbench report {path.name}", **story)
 

@@ -40,7 +40,8 @@ def _without_noise_modes(record: Record, found: Refined) -> Refined:
     price = (2 * m + 2) * np.log(n * m)
     while found.modes.n_modes > 1:
         strength = (np.abs(found.amplitudes[0]) / found.noise_std[:, None]).max(axis=0)
-        others = np.delete(np.arange(found.modes.n_modes), np.argmin(strength))
+        weakest = int(np.argmin(strength))
+        others = [r for r in range(found.modes.n_modes) if r != weakest]
         without = refine(record, found.modes.select(others))
         if 2.0 * n * np.log(without.noise_std / found.noise_std).sum() > price:
             return found

@@ -45,19 +45,19 @@ def run(
         StudyError: no cases; a case or function whose result could not be told from another's; a cluster that does
             not answer.
     """
-    cases = [checked(case, number) for number, case in enumerate(cases, 1)]
-    if not cases:
+    told = [checked(case, number) for number, case in enumerate(cases, 1)]
+    if not told:
         raise StudyError("there are no cases to run")
     if workers is not None and workers < 1:
         raise StudyError(f"workers must be at least 1; got {workers}")
-    seeds = _seeds(cases, function, seed)
+    seeds = _seeds(told, function, seed)
     print_ = fingerprint(function) if cache is not None else ""
-    keys = [key_of(case, print_, s) for case, s in zip(cases, seeds)]
+    keys = [key_of(case, print_, s) for case, s in zip(told, seeds)]
     folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{print_[:12]}"
     records = {} if folder is None else _kept(folder, keys)
     jobs = {
         key: Job(key, _arguments(case, s), None if folder is None or scheduler else _file(folder, key))
-        for key, case, s in zip(keys, cases, seeds)
+        for key, case, s in zip(keys, told, seeds)
         if key not in records
     }
     _tell(report, len(records), len(set(keys)))
@@ -69,7 +69,7 @@ def run(
     return Results(
         tuple(
             Result(case, _seed_shown(case, s), _values(records[key]), *_ending(records[key]))
-            for case, s, key in zip(cases, seeds, keys)
+            for case, s, key in zip(told, seeds, keys)
         )
     )
 

@@ -134,7 +134,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     else:
         law = coupled_lqr(modes, design.controlled, actuators, weight=design.weight[0])
     through = None
-    if design.sensors:
+    if design.sensors and rig.structure is not None:
         kept = modes.select(range(design.controlled))
         through = displacement_filter(kept, sorted(design.sensors), rig.structure.mass_per_length)
     loop = close_loop(modes, law, through)

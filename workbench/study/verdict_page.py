@@ -59,7 +59,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         for name, value in effect["parameters"].items()
     ]
     rivals = [(r["kind"], r["probability"]) for r in shown["alternatives"]]
-    tables = [
+    tables: list[tuple[str, tuple[str, ...], list]] = [
         ("Gap on records kept out of the fit", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Effects", ("effect", "parameter", "value", "standard deviation", "x", "input or output"), effects),
         ("Rivals", ("set of effects", "probability"), rivals),
