@@ -1,4 +1,4 @@
-"""Where a gap lies, on gaps put in by hand: a tone on one sensor late in one record, and a force that nobody modelled."""
+"""Where a gap lies, on gaps put in by hand: a tone on a late stretch of one sensor, a force that nobody modelled."""
 
 from dataclasses import replace
 
@@ -82,11 +82,14 @@ def test_no_gap_has_no_path(rig):
 
 
 @pytest.mark.parametrize(
-    "changed", [{"actuators": (Actuator("F", 0.45, gain=1.2),)}, {"actuators": (Actuator("F", 0.52),)}]
+    "changed, low, high",
+    [
+        ({"actuators": (Actuator("F", 0.45, gain=1.2),)}, 0.95, 1.0),
+        ({"actuators": (Actuator("F", 0.52),)}, 0.95, 1.0),
+        ({"elements": (CoulombFriction(0.9, 0.05, 0.005),)}, 0.0, 0.6),
+    ],
 )
-def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed):
-    levels = (0.1, 0.3, 1.0)
-    linear = where(rig, [measured(replace(rig, **changed), f"{u}", u, 5) for u in levels])
-    assert linear.linear_share > 0.95
-    softening = replace(rig, elements=(CoulombFriction(0.9, 0.05, 0.005),))
-    assert where(rig, [measured(softening, f"{u}", u, 5) for u in levels]).linear_share < 0.6
+def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed, low, high):
+    real = replace(rig, **changed)
+    found = where(rig, [measured(real, f"{level}", level, seed) for seed, level in enumerate((0.1, 0.3, 1.0))])
+    assert low <= found.linear_share <= high
