@@ -22,7 +22,7 @@ def study(outcome, data=None):
     best = place(task, effort_limit=1.5 * nodes.effort, spacing=SPACING)
     on_grid, tried = scan(task, effort_limit=1.5 * nodes.effort, spacing=SPACING, n_places=50)
 
-    work, effort = symbolic_work(task)(best.positions)
+    work, effort, *_ = symbolic_work(task)(best.positions)
     outcome.table(
         "front",
         [

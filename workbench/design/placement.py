@@ -1,114 +1,80 @@
 """Where actuators should stand: the nodes of mode n+1, and CasADi against the spillover work W_R.
 
-With IMSC the modal forces do not depend on the places, so W_R = ½ Σ_r |φ_r(x)ᵀ B(x)⁻¹ f̂_r|² with f̂_r = f̂(iω_r) known
-once and for all. W_R alone has no useful minimum: the optimiser drives the outer actuators onto the supports, where B
-is singular and the forces grow without bound. So a placement here always limits what the actuators must do.
+W_R alone has no useful minimum: the optimiser drives the outer actuators onto the supports, where B is singular and the
+forces grow without bound. So a placement here is sought under limits on what the actuators must do.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
-from typing import Any
+from itertools import combinations, islice
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
-from scipy.linalg import solve_continuous_lyapunov
 from scipy.optimize import brentq
 
-from workbench.design.imsc import imsc, riccati_gains
+from workbench.design.imsc import imsc
 from workbench.design.law import DesignError, Law
+from workbench.design.placement_task import Placement, PlacementTask, batch_figures, placement_task
 from workbench.rig.actuators import Actuator
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes
+
+__all__ = ["Limits", "Placement", "PlacementTask", "law_at", "nodes_of_mode", "place", "placement_task", "scan"]
 
 SPLINE_DEGREE = 7
-SINGULAR_SHARE = 1e-14
+KEPT = 1e-6
+BATCH = 20000
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
-    """Places of the actuators and what they cost.
-
-    Attributes:
-        positions: (n_actuators,) m, increasing.
-        residual_work: W_R.
-        by_mode: (n_residual,) W_r.
-        effort: ∫ FᵀF dt.
-        condition: of B.
-        status: why the search stopped.
-        local_optima: distinct local optima met from all starts, (positions, W_R), best first.
-    """
-
-    positions: np.ndarray
-    residual_work: float
-    by_mode: np.ndarray
-    effort: float
-    condition: float
-    status: str
-    local_optima: tuple[tuple[np.ndarray, float], ...] = ()
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "positions", frozen(self.positions))
-        object.__setattr__(self, "by_mode", frozen(self.by_mode))
-
-
-@dataclass(frozen=True, eq=False)
-class PlacementTask:
-    """What is asked of a placement: modes, disturbance and control weight, all that does not depend on the places.
+@dataclass(frozen=True)
+class Limits:
+    """What a placement must keep to.
 
     Attributes:
-        modes: controlled first, then residual; undamped or nearly so.
-        n_controlled: n; as many actuators are placed.
-        transforms: (n_residual, n_controlled) complex f̂(iω_r), modal control forces at the residual frequencies.
-        force_gramian: (n_controlled, n_controlled) ∫ f fᵀ dt.
+        effort: largest ∫ FᵀF dt.
+        peak_force: largest force of any actuator.
+        condition: of B, largest ‖B‖‖B⁻¹‖ in the Frobenius norm (n where B is orthogonal).
+        spacing: least distance between neighbours, m.
+        margin: least distance from the ends, m.
+        forbidden: stretches (from, to) where no actuator can stand, m.
     """
 
-    modes: Modes
-    n_controlled: int
-    transforms: np.ndarray
-    force_gramian: np.ndarray
+    effort: float = np.inf
+    peak_force: float = np.inf
+    condition: float = np.inf
+    spacing: float = 0.0
+    margin: float = 0.0
+    forbidden: tuple[tuple[float, float], ...] = ()
 
-    def evaluate(self, positions: ArrayLike) -> tuple[float, np.ndarray, float, float]:
-        """W_R, W_r (n_residual,), effort and condition of B for actuators at `positions`."""
-        shapes = self.modes.phi(np.asarray(positions, float)).T
-        b = shapes[: self.n_controlled]
-        condition = float(np.linalg.cond(b))
-        if not condition < 1e13:
-            return np.inf, np.full(self.transforms.shape[0], np.inf), np.inf, np.inf
-        inverse = np.linalg.inv(b)
-        by_mode = 0.5 * np.abs(np.einsum("rj,jk,rk->r", shapes[self.n_controlled :], inverse, self.transforms)) ** 2
-        effort = float(np.trace(inverse @ self.force_gramian @ inverse.T))
-        return float(by_mode.sum()), by_mode, effort, condition
+    def allowed(self, length: float) -> list[tuple[float, float]]:
+        """Stretches where an actuator may stand, m.
 
-    def placed(self, positions: ArrayLike, status: str, optima=()) -> Placement:
-        """A `Placement` of given positions."""
-        total, by_mode, effort, condition = self.evaluate(positions)
-        return Placement(
-            np.sort(np.asarray(positions, float)), total, by_mode, effort, condition, status, tuple(optima)
-        )
+        Raises:
+            DesignError: none is left, or a stretch that is none.
+        """
+        at, stretches = self.margin, []
+        for low, high in sorted(self.forbidden):
+            if not low < high:
+                raise DesignError(f"forbidden stretch ({low:g}, {high:g}) must run from less to more")
+            if low > at:
+                stretches.append((at, min(low, length - self.margin)))
+            at = max(at, high)
+        stretches.append((at, length - self.margin))
+        stretches = [(low, high) for low, high in stretches if low <= high]
+        if not stretches:
+            raise DesignError(f"margin {self.margin:g} and the forbidden stretches leave no place of {length:g} m")
+        return stretches
 
-
-def placement_task(modes: Modes, n_controlled: int, *, impulse_at: float, weight: float, impulse: float = 1.0):
-    """The task for an impulse (N s) at a place, IMSC with control weight R; t_f to infinity (5.43).
-
-    Raises:
-        DesignError: no residual mode, or a rigid-body mode that no impulse response of this kind settles.
-    """
-    if not 1 <= n_controlled < modes.n_modes:
-        raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
-    omega = modes.omega[:n_controlled]
-    g1, g2 = riccati_gains(omega, weight)
-    rate = impulse * modes.phi(impulse_at)[0, :n_controlled]
-    s = 1j * modes.omega[n_controlled:, None]
-    displacement = rate / (s**2 + g2 * s + omega**2 + g1)
-    transforms = -(g1 + g2 * s) * displacement
-    n = n_controlled
-    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2 + g1), -np.diag(g2)]])
-    start = np.r_[np.zeros(n), rate]
-    gramian = solve_continuous_lyapunov(a, -np.outer(start, start))
-    gains = np.hstack([np.diag(g1), np.diag(g2)])
-    return PlacementTask(modes, n_controlled, frozen(transforms, complex), frozen(gains @ gramian @ gains.T))
+    def broken(self, positions: np.ndarray, figures) -> dict[str, np.ndarray]:
+        """By name of limit, by how much each of many placements (n_placements, n) breaks it, relative; <= 0 is kept."""
+        gaps = np.diff(positions, axis=1).min(axis=1, initial=np.inf)
+        return {
+            "effort": figures.effort / self.effort - 1.0,
+            "peak force": figures.peak_force / self.peak_force - 1.0,
+            "condition": figures.condition / self.condition - 1.0,
+            "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(len(positions)),
+        }
 
 
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
@@ -123,9 +89,12 @@ def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
 def place(
     task: PlacementTask,
     *,
-    effort_limit: float,
-    spacing: float,
+    effort_limit: float = np.inf,
+    spacing: float = 0.0,
     margin: float = 0.0,
+    peak_limit: float = np.inf,
+    condition_limit: float = np.inf,
+    forbidden: Iterable[tuple[float, float]] = (),
     starts: int = 12,
     seed: int = 0,
 ) -> Placement:
@@ -133,92 +102,147 @@ def place(
 
     Args:
         task: from `placement_task`.
-        effort_limit: largest ∫ FᵀF dt allowed.
-        spacing: least distance between neighbours, m.
-        margin: least distance from the ends, m.
+        effort_limit, peak_limit, condition_limit, spacing, margin, forbidden: see `Limits`.
         starts: random starts besides the evenly spaced places and the nodes of mode n+1.
         seed: of the random starts.
 
     Raises:
         DesignError: limits that no start can meet, with the one that conflicts.
     """
+    limits = Limits(effort_limit, peak_limit, condition_limit, spacing, margin, tuple(forbidden))
     n, length = task.n_controlled, task.modes.length
-    if 2 * margin + (n - 1) * spacing > length:
-        raise DesignError(
-            f"{n} actuators {spacing:g} apart and {margin:g} from the ends need {2 * margin + (n - 1) * spacing:g} m;"
-            f" the structure has {length:g}: lower spacing or margin"
-        )
-    solver = _solver(task, effort_limit, spacing, margin)
+    stretches = _checked_room(limits, n, length)
+    solver = _solver(task, limits)
     rng = np.random.default_rng(seed)
-    guesses = [margin + (length - 2 * margin) * (np.arange(n) + 1) / (n + 1)]
+    guesses = [length * (np.arange(n) + 1) / (n + 1)]
     nodes = nodes_of_mode(task.modes, n)
     if nodes.size == n:
         guesses.append(np.sort(nodes))
     guesses += [np.sort(rng.uniform(margin + 0.02 * length, length - margin - 0.02 * length, n)) for _ in range(starts)]
     optima: list[tuple[np.ndarray, float]] = []
-    status, least_effort = "no start ended inside the limits", np.inf
+    status = "no start ended inside the limits"
     for guess in guesses:
-        positions, message = solver(guess)
-        total, _, effort, _ = task.evaluate(positions)
-        least_effort = min(least_effort, effort)
-        inside = effort <= effort_limit * (1 + 1e-6) and (np.diff(positions) >= spacing * (1 - 1e-6) - 1e-12).all()
-        if inside and np.isfinite(total) and not any(np.abs(positions - p).max() < 1e-4 * length for p, _ in optima):
-            optima.append((positions, total))
+        # each actuator keeps to the stretch nearest its start
+        homes = [min(stretches, key=lambda s, x=x: max(s[0] - x, x - s[1], 0.0)) for x in guess]
+        positions, message = solver(guess, homes)
+        positions = np.sort(positions)
+        found = task.placed(positions, message)
+        if not np.isfinite(found.residual_work) or not _kept(task, limits, positions):
+            continue
+        if not any(np.abs(positions - p).max() < 1e-4 * length for p, _ in optima):
+            optima.append((positions, found.residual_work))
             status = message
     if not optima:
-        raise DesignError(
-            f"no placement of {n} actuators meets the effort limit {effort_limit:.4g} with spacing {spacing:g};"
-            f" the least effort met was {least_effort:.4g}: raise the limit or lower the spacing"
-        )
+        raise DesignError(conflict(task, limits))
     optima.sort(key=lambda optimum: optimum[1])
     return task.placed(optima[0][0], status, optima)
 
 
 def scan(
-    task: PlacementTask, *, effort_limit: float, spacing: float, margin: float = 0.0, n_places: int = 60
+    task: PlacementTask,
+    *,
+    effort_limit: float = np.inf,
+    spacing: float = 0.0,
+    margin: float = 0.0,
+    peak_limit: float = np.inf,
+    condition_limit: float = np.inf,
+    forbidden: Iterable[tuple[float, float]] = (),
+    n_places: int = 60,
+    candidates: ArrayLike | None = None,
 ) -> tuple[Placement, int]:
-    """The best of all placements on a grid, and how many were tried: the check that an optimum is global.
-
-    For up to four actuators the grid of `n_places` candidate places is searched whole, in batches.
-    """
-    n, length = task.n_controlled, task.modes.length
-    grid = np.linspace(max(margin, length / n_places / 2), length - max(margin, length / n_places / 2), n_places)
-    shapes = task.modes.phi(grid)
-    every = np.array(list(combinations(range(n_places), n)))
-    every = every[(np.diff(grid[every], axis=1) >= spacing - 1e-12).all(axis=1)]
-    best, best_at = np.inf, None
-    for batch in np.array_split(every, max(1, len(every) // 20000)):
-        work, effort = batch_work(task, shapes[batch])
-        work = np.where(effort <= effort_limit, work, np.inf)
-        i = int(np.argmin(work)) if work.size else 0
-        if work.size and work[i] < best:
-            best, best_at = work[i], grid[batch[i]]
-    if best_at is None:
-        raise DesignError(f"no placement on the grid meets the effort limit {effort_limit:.4g}; raise it")
-    return task.placed(best_at, f"best of {len(every)} placements on a grid"), len(every)
-
-
-def batch_work(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """W_R and effort of many placements at once.
+    """The best of all placements on a grid or on given candidate places, and how many were tried.
 
     Args:
-        shapes: (n_placements, n_actuators, n_modes) of the modes at the actuators.
+        effort_limit, peak_limit, condition_limit, spacing, margin, forbidden: see `Limits`.
+        n_places: of the grid.
+        candidates: (n_candidates,) places, instead of a grid, m.
 
-    Returns:
-        W_R (n_placements,) and effort (n_placements,); inf where B is singular.
+    Raises:
+        DesignError: fewer places than actuators, or limits that none meets, with the one that conflicts.
     """
-    n = task.n_controlled
-    b = shapes[:, :, :n].transpose(0, 2, 1)
-    # Hadamard: |det B| against the product of its row lengths, so that mass and units do not matter
-    singular = np.abs(np.linalg.det(b)) <= SINGULAR_SHARE * np.linalg.norm(b, axis=2).prod(axis=1)
-    b = np.where(singular[:, None, None], np.eye(n), b)
-    inverse = np.linalg.inv(b)
-    spread = shapes[:, :, n:].transpose(0, 2, 1) @ inverse
-    real = np.einsum("prk,rk->pr", spread, task.transforms.real)
-    imaginary = np.einsum("prk,rk->pr", spread, task.transforms.imag)
-    work = 0.5 * (real**2 + imaginary**2).sum(axis=1)
-    effort = np.einsum("pik,kl,pil->p", inverse, task.force_gramian, inverse)
-    return np.where(singular, np.inf, work), np.where(singular, np.inf, effort)
+    limits = Limits(effort_limit, peak_limit, condition_limit, spacing, margin, tuple(forbidden))
+    n, length = task.n_controlled, task.modes.length
+    stretches = _checked_room(limits, n, length)
+    if candidates is None:
+        edge = max(margin, length / n_places / 2)
+        grid = np.linspace(edge, length - edge, n_places)
+    else:
+        grid = np.sort(np.asarray(candidates, float))
+    grid = grid[np.any([(grid >= low - 1e-12) & (grid <= high + 1e-12) for low, high in stretches], axis=0)]
+    if grid.size < n:
+        raise DesignError(f"{n} actuators need as many places; the limits leave {grid.size}: allow more")
+    shapes = task.shapes(grid)
+    best, best_at, tried = np.inf, None, 0
+    every = combinations(range(grid.size), n)
+    while batch := list(islice(every, BATCH)):
+        index = np.array(batch)
+        index = index[(np.diff(grid[index], axis=1) >= spacing - 1e-12).all(axis=1)]
+        if not index.size:
+            continue
+        tried += len(index)
+        figures = batch_figures(task, shapes[index])
+        broken = limits.broken(grid[index], figures)
+        work = np.where(np.all([b <= KEPT for b in broken.values()], axis=0), figures.work, np.inf)
+        i = int(np.argmin(work))
+        if work[i] < best:
+            best, best_at = work[i], grid[index[i]]
+    if best_at is None:
+        raise DesignError(conflict(task, limits, grid))
+    return task.placed(best_at, f"best of {tried} placements"), tried
+
+
+def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None) -> str:
+    """Which limit cannot be met, or which two not together, and what could be: the words of a refusal."""
+    n, length = task.n_controlled, task.modes.length
+    if grid is None:
+        grid = np.concatenate([np.linspace(*stretch, 40) for stretch in limits.allowed(length)])
+    rng = np.random.default_rng(0)
+    draws = np.sort(np.array([rng.choice(grid.size, n, replace=False) for _ in range(BATCH)]), axis=1)
+    positions = np.sort(grid[draws], axis=1)
+    figures = batch_figures(task, task.shapes(positions))
+    broken = limits.broken(positions, figures)
+    within = {name: excess <= KEPT for name, excess in broken.items()}
+    measured = {"effort": figures.effort, "peak force": figures.peak_force, "condition": figures.condition}
+    asked = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
+    head = f"no placement of {n} actuators meets the limits"
+    spaced = within["spacing"]
+    if not spaced.any():
+        return f"{head}: spacing {limits.spacing:g} leaves no room; lower it"
+    for name, values in measured.items():
+        if not (within[name] & spaced).any():
+            least = values[spaced].min()
+            return (
+                f"{head}: {name} limit {asked[name]:.4g} with spacing {limits.spacing:g}; the least met was"
+                f" {least:.4g}: raise the limit or lower the spacing"
+            )
+    for one, other in combinations(measured, 2):
+        if not (within[one] & within[other] & spaced).any():
+            least = measured[other][within[one] & spaced].min()
+            return (
+                f"{head}: {one} {asked[one]:.4g} and {other} {asked[other]:.4g} conflict; with the first the least"
+                f" {other} met was {least:.4g}: raise one of them"
+            )
+    return f"{head} together, though any two can be met; raise one of them"
+
+
+def _checked_room(limits: Limits, n: int, length: float) -> list[tuple[float, float]]:
+    for name in ("effort", "peak_force", "condition"):
+        if not getattr(limits, name) > 0:
+            raise DesignError(f"the limit of {name.replace('_', ' ')} must be positive; got {getattr(limits, name):g}")
+    if min(limits.spacing, limits.margin) < 0:
+        raise DesignError(f"spacing and margin must be 0 or more; got {limits.spacing:g} and {limits.margin:g}")
+    if 2 * limits.margin + (n - 1) * limits.spacing > length:
+        needed = 2 * limits.margin + (n - 1) * limits.spacing
+        raise DesignError(
+            f"{n} actuators {limits.spacing:g} apart and {limits.margin:g} from the ends need {needed:g} m; the"
+            f" structure has {length:g}: lower spacing or margin"
+        )
+    return limits.allowed(length)
+
+
+def _kept(task: PlacementTask, limits: Limits, positions: np.ndarray) -> bool:
+    broken = limits.broken(positions[None], batch_figures(task, task.shapes(positions)[None]))
+    return all(excess[0] <= 2 * KEPT for excess in broken.values())
 
 
 def law_at(task: PlacementTask, positions: ArrayLike, *, weight: float) -> Law:
@@ -231,7 +255,7 @@ def law_at(task: PlacementTask, positions: ArrayLike, *, weight: float) -> Law:
 
 
 def symbolic_work(task: PlacementTask):
-    """CasADi function positions -> (W_R, effort), with exact derivatives: shapes as splines of degree seven."""
+    """CasADi function positions -> (W_R, effort, B⁻¹, ‖B‖²), derivatives exact: shapes as splines of degree seven."""
     n, modes = task.n_controlled, task.modes
     grid = np.linspace(0.0, modes.length, 60 * modes.n_modes // 4 + 120)
     spline = make_interp_spline(grid, modes.phi(grid), k=SPLINE_DEGREE)
@@ -243,44 +267,52 @@ def symbolic_work(task: PlacementTask):
     shapes = ca.horzcat(*columns)
     inverse = ca.inv(shapes[:n, :])
     residual = shapes[n:, :] @ inverse
-    real = ca.sum2(residual * ca.DM(task.transforms.real))
-    imaginary = ca.sum2(residual * ca.DM(task.transforms.imag))
-    work = 0.5 * ca.sum1(real**2 + imaginary**2)
+    work = 0.5 * sum(ca.sumsqr(ca.sum2(residual * ca.DM(task.roots[:, :, j]))) for j in range(task.roots.shape[2]))
     effort = ca.trace(inverse @ ca.DM(task.force_gramian) @ inverse.T)
-    return ca.Function("work", [x], [work, effort], ["positions"], ["work", "effort"])
+    outputs = [work, effort, inverse, ca.sumsqr(shapes[:n, :])]
+    return ca.Function("work", [x], outputs, ["positions"], ["work", "effort", "inverse", "size"])
 
 
-def _solver(task: PlacementTask, effort_limit: float, spacing: float, margin: float):
+def _solver(task: PlacementTask, limits: Limits):
     n, length = task.n_controlled, task.modes.length
     function = symbolic_work(task)
 
     # variables: positions in units of the length
     z = ca.MX.sym("z", n)
-    work, effort = function(length * z)
+    work, effort, inverse, size = function(float(length) * z)
 
-    # objective and constraints, each of order one
-    reference = task.evaluate(length * (np.arange(n) + 1) / (n + 1))[0]
-    gaps = z[1:] - z[:-1]
-    constraints = ca.vertcat(effort / effort_limit, gaps)
-    problem: dict[str, ca.MX] = {"x": z, "f": ca.log(work / max(reference, 1e-300)), "g": constraints}
-    options: dict[str, Any] = {
-        "ipopt.print_level": 0,
-        "print_time": 0,
-        "ipopt.sb": "yes",
-        "ipopt.max_iter": 200,
-        "ipopt.tol": 1e-9,
-    }
+    # objective and constraints, each of order one; those without a limit are left out
+    reference = task.placed(length * (np.arange(n) + 1) / (n + 1), "").residual_work
+    scale = float(reference) if np.isfinite(reference) and reference > 0 else 1.0
+    bounded = [effort / float(limits.effort)] if np.isfinite(limits.effort) else []
+    if np.isfinite(limits.peak_force):
+        forces = ca.reshape(inverse @ ca.DM(_telling(task.forces)), -1, 1) / float(limits.peak_force)
+        bounded += [forces, -forces]
+    if np.isfinite(limits.condition):
+        bounded.append(ca.sumsqr(inverse) * size / float(limits.condition) ** 2)
+    bounded = ca.vertcat(*bounded) if bounded else ca.MX(0, 1)
+    gaps = ca.reshape(z[1:] - z[:-1], -1, 1) if n > 1 else ca.MX(0, 1)
+    problem = {"x": z, "f": ca.log(work / scale + 1e-300), "g": ca.vertcat(bounded, gaps)}
+    options = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes", "ipopt.max_iter": 200, "ipopt.tol": 1e-9}
     solver = ca.nlpsol("placement", "ipopt", problem, options)
-    low, high = max(margin / length, 1e-3), 1.0 - max(margin / length, 1e-3)
+    count = bounded.shape[0]
 
-    def solve(guess: Sequence[float]) -> tuple[np.ndarray, str]:
+    def solve(guess: Sequence[float], homes: Sequence[tuple[float, float]]) -> tuple[np.ndarray, str]:
+        low, high = np.clip(np.array(homes).T / length, 1e-3, 1.0 - 1e-3)
         result = solver(
-            x0=np.asarray(guess) / length,
+            x0=np.clip(np.asarray(guess) / length, low, high),
             lbx=low,
             ubx=high,
-            lbg=np.r_[-np.inf, np.full(n - 1, spacing / length)],
-            ubg=np.r_[1.0, np.full(n - 1, np.inf)],
+            lbg=np.r_[np.full(count, -np.inf), np.full(n - 1, limits.spacing / length)],
+            ubg=np.r_[np.ones(count), np.full(n - 1, np.inf)],
         )
-        return length * np.asarray(result["x"]).ravel(), solver.stats()["return_status"]
+        # IPOPT keeps its bounds but for 1e-8 of their size
+        return length * np.clip(result["x"].full().ravel(), low, high), solver.stats()["return_status"]
 
     return solve
+
+
+def _telling(forces: np.ndarray) -> np.ndarray:
+    """The instants that can decide the peak of any combination B⁻¹f: those on the hull of ±f, as directions see it."""
+    directions = np.random.default_rng(0).standard_normal((400 * forces.shape[0], forces.shape[0]))
+    return forces[:, np.unique(np.abs(directions @ forces).argmax(axis=1))]
