@@ -10,6 +10,8 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.records.record import Record
 from workbench.structure.modes import Modes
 
+MOST_INSTANTS = 700  # more than a picture has columns for
+
 
 def plot_ring_down(record: Record, *, stretch: float) -> Figure:
     """Every output over time, one above the other, each at its place; the first `stretch` seconds."""
@@ -64,10 +66,11 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
 def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
     """Displacement over place and time as colour, one panel a response, all on one scale."""
     figure, axes = new_figure(len(responses), 1, width=9, height=2.1 * len(responses), sharex=True, squeeze=False)
-    fields = {name: response.displacement(x) for name, response in responses.items()}
+    steps = {name: -(-response.time.size // MOST_INSTANTS) for name, response in responses.items()}
+    fields = {name: response.displacement(x)[:, :: steps[name]] for name, response in responses.items()}
     limit = max(np.abs(field).max() for field in fields.values())
     for ax, (name, field) in zip(axes[:, 0], fields.items(), strict=True):
-        time = responses[name].time
+        time = responses[name].time[:: steps[name]]
         image = ax.pcolormesh(
             time, x, field, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud", rasterized=True
         )

@@ -44,7 +44,7 @@ def described(figure: Figure) -> dict:
     Raises:
         Undescribed: naming the artist that has no plain description.
     """
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     axes = [ax for ax in figure.axes if ax.get_visible() and not hasattr(ax, "_colorbar")]
     width, height = figure.get_size_inches() * 96
     starts = {ax: ax.get_subplotspec() for ax in axes}
