@@ -91,6 +91,17 @@ def test_a_case_that_kills_its_process_takes_no_other_with_it(tmp_path):
     assert [r["at"] for r in found.failed] == [2] and "process died" in found[2].error
 
 
+class Bomb:
+    def __reduce__(self):
+        return os._exit, (9,)
+
+
+def test_processes_that_die_before_they_begin_end_the_run(tmp_path):
+    bomb = Bomb()
+    with pytest.raises(StudyError, match="before they began a case"):
+        study.run(study.grid(at=range(3)), lambda at: (at, bomb), cache=None, workers=2)
+
+
 def test_a_seed_belongs_to_its_case_and_not_to_the_order(tmp_path):
     cases = study.grid(at=range(5))
     first = study.run(cases, drawn, cache=None, **HERE)

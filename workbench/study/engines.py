@@ -13,13 +13,14 @@ import cloudpickle
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from workbench.study.cache import encoded, write_record
+from workbench.study.cache import encoded, read_record, write_record
 from workbench.study.cases import StudyError
 from workbench.study.fingerprint import is_own
 from workbench.study.versions import own_source
 
 DIED = "its process died: out of memory, killed, or crashed in compiled code"
 CONNECT_SECONDS = 10.0
+MOST_BARREN = 2
 
 
 @dataclass(frozen=True)
@@ -95,22 +96,42 @@ def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tup
 
     A case whose process dies takes the others' processes with it. Those that were running then are worked again, each
     on its own; what dies alone has only itself to blame.
+
+    Raises:
+        StudyError: processes die before they begin a case.
     """
     waiting, sent = {job.key: job for job in jobs}, packed(function)
+    barren = 0
     with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
         running = Path(folder)
         while waiting:
+            before = len(waiting)
             try:
                 for key, record in _parallel(sent, waiting.values(), workers, running):
                     del waiting[key]
                     yield key, record
             except TerminatedWorkerError:
+                for key, record in _already_kept(waiting.values()):
+                    del waiting[key]
+                    yield key, record
                 suspects = [waiting[path.name] for path in running.iterdir() if path.name in waiting]
                 for path in list(running.iterdir()):
                     path.unlink()
                 for job in suspects:
                     del waiting[job.key]
                     yield job.key, _alone(sent, job, running)
+                barren = barren + 1 if len(waiting) == before else 0
+                if barren == MOST_BARREN:
+                    raise StudyError(
+                        f"the processes of this run died {barren} times before they began a case: what the function"
+                        " reaches cannot be sent to them; run it with workers=1"
+                    ) from None
+
+
+def _already_kept(jobs) -> list[tuple[str, dict]]:
+    """Results that a process had put away before it could hand them over."""
+    records = [(job.key, read_record(job.file)) for job in jobs if job.file is not None]
+    return [(key, record) for key, record in records if record is not None]
 
 
 def _parallel(function: bytes, jobs, workers: int, running: Path) -> Iterator[tuple[str, dict]]:

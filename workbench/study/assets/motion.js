@@ -3,7 +3,7 @@
 workbench.COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
 workbench.move = function (root, spec) {
   var svg = workbench.svg, html = workbench.html, calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  var modes = spec.kind === "modes", playing = !calm, seen = false, clock = 0, last = null, mode = 0;
+  var modes = spec.kind === "modes", playing = !calm, seen = false, clock = modes ? 0 : 0.05 * spec.seconds, last = null, mode = 0;
   var legend = html("div", { class: "legend" }, root);
   var tracks = spec.tracks.map(function (track, i) {
     var entry = html("button", { type: "button", title: "hide or show" }, legend), t = { spec: track, on: true };
