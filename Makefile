@@ -23,7 +23,7 @@ figures: $(BIN)/workbench  ## every study that makes its own data, with its figu
 	$(BIN)/workbench study --all
 
 bench: $(BIN)/workbench  ## speeds, as ratios
-	$(BIN)/workbench study speed
+	$(BIN)/workbench study design_scaling
 
 lint: $(BIN)/workbench  ## style and types
 	$(BIN)/ruff check workbench studies tests

@@ -14,7 +14,7 @@ SHARED = Path(os.environ.get("WORKBENCH_SHARED", ROOT.parent / "shared"))
 DATA = {"ruler": SHARED / "measured/ruler/ruler.mat", "blind_trials": SHARED / "gap-trials/blind"}
 DATA["arm_change"] = SHARED / "measured/arm-change"
 DATA["silverbox"] = SHARED / "measured/silverbox/SNLS80mV.mat"
-LONG = {"blind_trials", "own_trials", "false_alarms", "many_cases"}
+LONG = {"blind_trials", "own_trials", "false_alarms", "many_cases", "design_scaling", "placement_front"}
 STUDIES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
     for path in sorted((ROOT / "studies").glob("*.py"))

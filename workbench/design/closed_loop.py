@@ -12,6 +12,8 @@ from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, frozen
 
 UNSEEN = 1e-9
+WELL_CONDITIONED = 1e6
+RESONANT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,8 +113,8 @@ def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> np.ndarray:
 def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
     """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
 
-    A state (2 n_modes,) of the modes alone starts an observer from zero. Uniform instants share one matrix
-    exponential; others cost one each.
+    A state (2 n_modes,) of the modes alone starts an observer from zero. Through exact modal coordinates every instant
+    has a closed form; else uniform instants share one matrix exponential, and others cost one each.
 
     Raises:
         ValueError: times that do not increase from zero or later.
@@ -121,11 +123,65 @@ def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndar
     if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
         raise ValueError("times must increase, from zero or later")
     state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    modal = _cascade(loop, state, time)
+    if modal is None:
+        modal = _stepped(loop.matrix, state, time)
+    fed = np.flatnonzero(loop.feedback.any(axis=0))
+    return Response(time, modal[: 2 * loop.modes.n_modes], loop.feedback[:, fed] @ modal[fed], loop.modes)
+
+
+def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """e^{At} x0 (n_states, n_times), from instant to instant; even instants doubled up, x_{k+m} = (e^{Ah})^m x_k."""
     modal = np.empty((state.size, time.size))
-    modal[:, 0] = expm(loop.matrix * time[0]) @ state
+    modal[:, 0] = expm(matrix * time[0]) @ state
     steps = np.diff(time)
-    uniform = steps.size > 0 and np.ptp(steps) <= 1e-12 * time[-1]
-    step = expm(loop.matrix * steps[0]) if uniform else np.zeros((0, 0))
+    if steps.size and np.ptp(steps) <= 1e-12 * time[-1]:
+        step, known = expm(matrix * steps[0]), 1
+        while known < time.size:
+            more = min(known, time.size - known)
+            modal[:, known : known + more] = step @ modal[:, :more]
+            known += more
+            if known < time.size:
+                step = step @ step
+        return modal
     for k in range(1, time.size):
-        modal[:, k] = (step if uniform else expm(loop.matrix * steps[k - 1])) @ modal[:, k - 1]
-    return Response(time, modal[: 2 * loop.modes.n_modes], loop.feedback @ modal, loop.modes)
+        modal[:, k] = expm(matrix * steps[k - 1]) @ modal[:, k - 1]
+    return modal
+
+
+def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarray | None:
+    """The same in closed form where nothing residual is fed back: the controlled modes drive the others, one by one.
+
+    With z = q' - p* q of a residual mode, z' = p z + g and g = Σ_k g_k e^{λ_k t} of the controlled loop,
+    z = e^{pt} z0 + Σ_k g_k (e^{λ_k t} - e^{pt}) / (λ_k - p). None where the loop is not of this kind.
+    """
+    modes, n = loop.modes, loop.modes.n_modes
+    own = [*loop.law.controlled, *(n + r for r in loop.law.controlled)]
+    rest = np.setdiff1d(np.arange(n), loop.law.controlled)
+    c = np.diag(modes.damping)
+    others = np.setdiff1d(np.arange(loop.matrix.shape[0]), own)
+    apart = loop.matrix.shape[0] == 2 * n and modes.proportional and not loop.feedback[:, others].any()
+    if not apart or not (modes.omega[rest] > 0.5 * c[rest]).all():
+        return None
+    values, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
+    if not np.linalg.cond(vectors) < WELL_CONDITIONED:
+        return None
+    held = np.linalg.solve(vectors, state[own].astype(complex))
+    swing = np.exp(np.outer(values, time))
+    modal = np.empty((2 * n, time.size))
+    modal[own] = ((vectors * held) @ swing).real
+    if not rest.size:
+        return modal
+    sigma, damped = 0.5 * c[rest], np.sqrt(modes.omega[rest] ** 2 - 0.25 * c[rest] ** 2)
+    pole = -sigma + 1j * damped
+    push = loop.matrix[np.ix_(n + rest, own)] @ (vectors * held)
+    apart = values - pole[:, None]
+    if np.abs(apart).min() < RESONANT * np.abs(pole).max():
+        return None
+    driven = push / apart
+    free = state[n + rest] + (sigma + 1j * damped) * state[rest] - driven.sum(axis=1)
+    for few in np.array_split(np.arange(rest.size), max(1, rest.size * time.size // 400_000)):
+        z = driven[few] @ swing + free[few, None] * np.exp(np.outer(pole[few], time))
+        q = z.imag / damped[few, None]
+        modal[rest[few]], modal[n + rest[few]] = q, z.real - sigma[few, None] * q
+    return modal

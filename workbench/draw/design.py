@@ -184,3 +184,36 @@ def plot_how_many(found: dict[str, HowMany], share: float) -> Figure:
         ax.legend()
     axes[0, 0].set_ylabel("share of the disturbance's energy left")
     return figure
+
+
+def plot_placement_fronts(fronts: dict[str, Sequence[Placement]], rule: dict[str, Placement]) -> Figure:
+    """Least spillover against effort for each disturbance, the rule of the nodes beside it, and the places taken."""
+    figure, axes = new_figure(2, len(fronts), width=11, height=7, sharex=True, sharey="row", squeeze=False)
+    for (name, front), (above, below) in zip(fronts.items(), axes.T, strict=True):
+        effort = [p.effort for p in front]
+        above.plot(effort, [p.residual_work for p in front], "o-", color=COLOURS[0], label="optimum at each effort")
+        above.loglog(
+            rule[name].effort, rule[name].residual_work, "s", color=COLOURS[1], markersize=9, label="nodes rule"
+        )
+        below.plot(effort, np.array([p.positions for p in front]), "o-", color=COLOURS[0], markersize=4)
+        below.plot(np.full(rule[name].positions.size, rule[name].effort), rule[name].positions, "s", color=COLOURS[1])
+        alone = np.ptp(effort) < 1e-3 * effort[0]
+        above.set_title(f"{name}: one placement is best at any effort" if alone else name)
+        above.set_ylim(bottom=0.0)
+        above.legend()
+        below.set(xlabel="effort ∫ FᵀF dt [N² s]")
+    axes[0, 0].set_ylabel("spillover work W_R")
+    axes[1, 0].set_ylabel("places of the actuators [m]")
+    return figure
+
+
+def plot_scaling(times: dict[str, dict[int, float]], slopes: dict[str, float]) -> Figure:
+    """Time to design against the number of modes, one line a way, each with its slope on the log-log scale."""
+    figure, ax = new_figure(width=9, height=5)
+    for (name, series), colour, mark in zip(times.items(), COLOURS, "osD^v", strict=False):
+        label = f"{name}: slope {slopes[name]:.1f}"
+        ax.loglog(list(series), list(series.values()), mark + "-", color=colour, label=label)
+    ax.set(xlabel="number of modes", ylabel="time to design [s]")
+    ax.set_title("one mode at a time, or all together")
+    ax.legend()
+    return figure

@@ -1,0 +1,145 @@
+"""How does the time to design grow with the number of modes, one by one and all together?"""
+
+from time import perf_counter, process_time
+
+import control
+import numpy as np
+
+from workbench.design.closed_loop import close_loop, impulse_state, respond
+from workbench.design.coupled import controlled_plant
+from workbench.design.imsc import riccati_gains
+from workbench.design.placement import law_at, nodes_of_mode, place
+from workbench.design.placement_task import batch_work, placement_task
+from workbench.design.pole_assignment import assign
+from workbench.draw.design import plot_scaling
+from workbench.rig.actuators import Actuator
+from workbench.structure.modes import Modes
+
+LENGTH = 10.0
+ACTUATORS = 5
+
+
+def hinged(n):
+    """Modes of the uniform hinged beam in closed form (5.47), as many as are asked for."""
+    r = np.arange(1, n + 1)
+    k = r * np.pi / LENGTH
+
+    def shapes(x, derivative):
+        turns = (np.sin, np.cos, lambda a: -np.sin(a), lambda a: -np.cos(a))
+        return turns[derivative % 4](np.outer(x, k)) * k**derivative / np.sqrt(LENGTH / 2)
+
+    return Modes(k**2, np.zeros(n), shapes, LENGTH, ((0.0, 0), (LENGTH, 0)))
+
+
+def seconds(action, least=0.05):
+    """Least time of one run out of several, so that a busy machine counts less."""
+    best, spent = np.inf, 0.0
+    while spent < least or np.isinf(best):
+        start = perf_counter()
+        action()
+        took = perf_counter() - start
+        best, spent = min(best, took), spent + took
+    return best
+
+
+def slope(sizes, times):
+    """Of log time on log size, over the three largest, where overhead no longer counts."""
+    return float(np.polyfit(np.log(sizes[-3:]), np.log(times[-3:]), 1)[0])
+
+
+def design_times(outcome):
+    modal = {n: seconds(lambda n=n: riccati_gains(hinged_omega(n), 20.0)) for n in (10**k for k in range(1, 7))}
+    coupled, places, mine = {}, {}, {}
+    for n in outcome.track((5, 10, 20, 40, 80, 160), "sizes"):
+        modes = hinged(n)
+        x = LENGTH * (0.5 + np.arange(ACTUATORS)) / (ACTUATORS + 0.37)
+        a, b = controlled_plant(modes, range(n), [Actuator(f"F{i}", at) for i, at in enumerate(x)])
+        q = np.diag(np.r_[modes.omega**2, np.ones(n)])
+        poles = modes.omega * (-0.02 + 1j)
+        coupled[n] = seconds(lambda a=a, b=b, q=q: control.lqr(a, b, q, 20 * np.eye(ACTUATORS)))
+        names = [f"mode {r + 1}" for r in range(n)]
+        mine[n] = seconds(lambda a=a, b=b, p=poles, names=names, n=n: assign(a, b, p, b[n:].T.astype(complex), names))
+        if n <= 20:
+            places[n] = seconds(lambda a=a, b=b, p=poles: quiet_place(a, b, np.r_[p, p.conj()]))
+    return {"IMSC": modal, "coupled LQR": coupled, "coupled poles": mine, "coupled poles, control.place": places}
+
+
+def hinged_omega(n):
+    return (np.arange(1, n + 1) * np.pi / LENGTH) ** 2
+
+
+def quiet_place(a, b, poles):
+    import warnings
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return control.place(a, b, poles)
+
+
+def study(outcome, data=None):
+    times = design_times(outcome)
+    slopes = {name: slope(*map(np.array, zip(*series.items(), strict=True))) for name, series in times.items()}
+    for name, value in slopes.items():
+        outcome.say(f"{name}: time grows as the number of modes to the {value:.1f}")
+    hundred_thousand = times["IMSC"][100_000]
+
+    # placements: W_R and effort of many at once, on one core
+    modes = hinged(64)
+    task = placement_task(modes, 4, impulse_at=6.3, weight=20.0)
+    grid = np.linspace(0.1, 9.9, 60)
+    on_grid = task.shapes(grid)
+    rng = np.random.default_rng(0)
+    picks = np.sort(np.array([rng.choice(60, 4, replace=False) for _ in range(20_000)]), axis=1)
+    rate = len(picks) / seconds(lambda: [batch_work(task, on_grid[p]) for p in np.array_split(picks, 20)], 1.0)
+
+    # the closed loop of a thousand modes, four of them controlled
+    thousand = hinged(1000)
+    busy = process_time()
+    loop_seconds = seconds(lambda: simulated(thousand, 100_000), 0.0)
+    busy = process_time() - busy
+
+    # eight actuators against a hundred residual modes
+    many = hinged(108)
+    task = placement_task(many, 8, impulse_at=6.3, weight=20.0)
+    nodes = task.placed(nodes_of_mode(many, 8), "")
+    start = perf_counter()
+    best = place(task, effort_limit=1.5 * nodes.effort, spacing=0.3, starts=10)
+    place_seconds = perf_counter() - start
+
+    shared = sorted(set(times["coupled LQR"]))
+    one_by_one = {n: seconds(lambda n=n: riccati_gains(hinged_omega(n), 20.0)) for n in shared}
+    outcome.table("seconds", times)
+    outcome.table("slopes", slopes)
+    outcome.table("coupled_lqr_over_imsc", {n: times["coupled LQR"][n] / one_by_one[n] for n in shared})
+    outcome.table(
+        "place_over_coupled_poles",
+        {n: t / times["coupled poles"][n] for n, t in times["coupled poles, control.place"].items()},
+    )
+    outcome.table(
+        "speeds",
+        {
+            "imsc_100000_modes_s": hundred_thousand,
+            "placements_per_second": rate,
+            "loop_1000_modes_100000_steps_s": loop_seconds,
+            "the_same_in_processor_s": busy,
+            "place_8_against_100_s": place_seconds,
+            "optima_met": len(best.local_optima),
+        },
+    )
+    outcome.say(f"IMSC for 100,000 modes: {hundred_thousand:.2g} s")
+    outcome.say(f"W_R of {rate:,.0f} placements a second (4 actuators, 60 residual modes, one core)")
+    outcome.say(f"closed loop of 1,000 modes over 100,000 steps: {loop_seconds:.2g} s, {busy:.2g} s of processor time")
+    outcome.say(
+        f"8 actuators against 100 residual modes from 12 starts: {place_seconds:.2g} s, W_R"
+        f" {best.residual_work / nodes.residual_work:.2f} of the nodes'"
+    )
+    outcome.check(
+        "placement of 8 actuators: W_R over that of the nodes of mode 9", best.residual_work / nodes.residual_work, 1.0
+    )
+    outcome.figure("time", plot_scaling(times, slopes), "Time to design against the number of modes, log-log.")
+
+
+def simulated(modes, steps):
+    """The loop of all modes through four actuators, at even instants."""
+    law = law_at(placement_task(modes, 4, impulse_at=6.3, weight=20.0), [2.0, 4.0, 6.0, 8.0], weight=20.0)
+    return respond(close_loop(modes, law), impulse_state(modes, 6.3), np.linspace(0.0, 1000.0, steps))
