@@ -187,3 +187,14 @@ def test_it_can_be_played_on(bench, look, width, tmp_path):
     assert (tmp_path / f"studies/played_{width}.py").is_file()
     errors = [entry for entry in browser.get_log("browser") if "422" not in entry["message"]]
     assert errors == []
+
+
+def test_plain_modal_data_know_no_places_to_stand(tmp_path):
+    path = tmp_path / "modal.toml"
+    path.write_text(
+        '[structure]\nkind = "modal"\nnatural_frequencies_hz = [1.0]\ndamping_ratios = [0.01]\n'
+        '[[input]]\nname = "F"\nkind = "actuator"\nshape = [1.0]\n'
+        '[[output]]\nname = "y"\nquantity = "displacement"\nshape = [1.0]\nnoise_std = 0.001\n'
+    )
+    with pytest.raises(StudyError, match="plain modal data know no places"):
+        bench_server(*read_structure(path))

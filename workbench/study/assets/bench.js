@@ -50,7 +50,7 @@
     law.value = design.law;
     law.addEventListener("change", function () { design.law = law.value; build(); ask(); });
     var c = row("modes controlled"), told;
-    count = html("input", { id: "controlled", type: "range", min: 1, max: setting.frequencies_hz.length, value: design.controlled }, c);
+    count = html("input", { id: "controlled", type: "range", min: 1, max: setting.omega.length, value: design.controlled }, c);
     told = html("output", {}, c, design.controlled);
     count.addEventListener("input", function () {
       design.controlled = +count.value;
@@ -102,7 +102,7 @@
   }
 
   // the structure with what stands on it
-  var X, height, line, free, beamY, marks = [], reach = 1;
+  var X, height, line, still, free, beamY, marks = [], reach = 1;
   function layout() {
     var width = stand.clientWidth;
     if (!width) return;
@@ -116,6 +116,7 @@
     workbench.ticks({}, [0, setting.length], Math.round(width / 90)).forEach(function (t) {
       svg("text", { x: X(t[0]), y: height - 4, "text-anchor": "middle" }, stand, t[1]);
     });
+    still = svg("path", { fill: "none", stroke: "var(--soft)", "stroke-width": 1.2, opacity: 0.6 }, stand);
     line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
     free = svg("g", {}, stand);
     handles();
@@ -158,7 +159,7 @@
     cards.stable.nextSibling.textContent = "closed loop; rightmost pole at " + (answer.stable ? "0 or less" : shown(answer.rightmost) + " rad/s");
     cards.stable.className = answer.stable ? "good" : "bad";
     reach = 1e-12;
-    for (var k = 0; k < answer.time.length; k += 5) displaced(k).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
+    for (var k = 0; k < answer.time.length; k += 5) displaced(k).concat(idle(k)).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
     swing();
     var n = answer.by_mode.length, numbers = answer.by_mode.map(function (_, i) { return i + 1; }).slice(design.controlled);
     var work = answer.by_mode.slice(design.controlled).map(function (w) { return w || 0; }), top = Math.max.apply(null, work.concat([1e-300]));
@@ -190,10 +191,22 @@
   // motion
   var clock = 0, last = null, playing = !calm;
   function displaced(k) { return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * answer.modal[r][k]; return w; }); }
+  // the same blow with nobody at the controls: each mode rings by itself
+  function idle(k) {
+    var t = answer.time[k], s = design.struck_at / setting.length * (setting.x.length - 1), i = Math.min(setting.x.length - 2, Math.floor(s));
+    var q = setting.omega.map(function (w, r) {
+      var hit = setting.shapes[i][r] + (s - i) * (setting.shapes[i + 1][r] - setting.shapes[i][r]), z = setting.zeta[r];
+      var ring = w * Math.sqrt(Math.max(0, 1 - z * z));
+      return hit * Math.exp(-z * w * t) * (ring > 0 ? Math.sin(ring * t) / ring : t);
+    });
+    return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * q[r]; return w; });
+  }
   function swing() {
     if (!answer || !X) return;
     var k = Math.round(clock % 1 * (answer.time.length - 1)), size = (beamY - 40) / reach;
-    line.setAttribute("d", "M" + displaced(k).map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
+    [[line, displaced(k)], [still, idle(k)]].forEach(function (shape) {
+      shape[0].setAttribute("d", "M" + shape[1].map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
+    });
     by("clock").textContent = "t = " + shown(answer.time[k]) + " s";
   }
   function step(now) {
