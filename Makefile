@@ -27,7 +27,7 @@ bench: $(BIN)/workbench  ## speeds, as ratios
 
 lint: $(BIN)/workbench  ## style and types
 	$(BIN)/ruff check workbench studies tests
-	$(BIN)/mypy workbench/structure workbench/records workbench/rig workbench/identification
+	$(BIN)/mypy
 
 clean:
 	rm -rf $(VENV) out

@@ -174,7 +174,7 @@ def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarra
         return modal
     sigma, damped = 0.5 * c[rest], np.sqrt(modes.omega[rest] ** 2 - 0.25 * c[rest] ** 2)
     pole = -sigma + 1j * damped
-    push = loop.matrix[np.ix_(n + rest, own)] @ (vectors * held)
+    push = loop.matrix[np.ix_(n + rest, np.asarray(own))] @ (vectors * held)
     apart = values - pole[:, None]
     if np.abs(apart).min() < RESONANT * np.abs(pole).max():
         return None

@@ -81,7 +81,7 @@ def how_many_modes(
     spilled, spent = np.full(counts.size, np.nan), np.full(counts.size, np.nan)
     for i, n in enumerate(counts):
         try:
-            at = nodes_of_mode(modes, n) if places is None else places(n)
+            at = np.asarray(nodes_of_mode(modes, int(n)) if places is None else places(int(n)), float)
             law = imsc(modes, int(n), [Actuator(f"F{j + 1}", float(x)) for j, x in enumerate(at)], weight=weight)
         except (DesignError, ValueError):
             continue

@@ -6,7 +6,9 @@ forces grow without bound. So a placement here is sought under limits on what th
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations, islice
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -77,6 +79,10 @@ class Limits:
         }
 
 
+def _apart(x: float, stretch: tuple[float, float]) -> float:
+    return max(stretch[0] - x, x - stretch[1], 0.0)
+
+
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
     """Interior nodes (n_nodes,) of a mode (zero-based), m: zeros of its shape away from the held ends (5.6)."""
     x = np.linspace(0.0, modes.length, 40 * (mode + 2) + 1)[1:-1]
@@ -123,7 +129,7 @@ def place(
     status = "no start ended inside the limits"
     for guess in guesses:
         # each actuator keeps to the stretch nearest its start
-        homes = [min(stretches, key=lambda s, x=x: max(s[0] - x, x - s[1], 0.0)) for x in guess]
+        homes = [min(stretches, key=partial(_apart, x)) for x in guess]
         positions, message = solver(guess, homes)
         positions = np.sort(positions)
         found = task.placed(positions, message)
@@ -290,12 +296,18 @@ def _solver(task: PlacementTask, limits: Limits):
         bounded += [forces, -forces]
     if np.isfinite(limits.condition):
         bounded.append(ca.sumsqr(inverse) * size / float(limits.condition) ** 2)
-    bounded = ca.vertcat(*bounded) if bounded else ca.MX(0, 1)
+    limited = ca.vertcat(*bounded) if bounded else ca.MX(0, 1)
     gaps = ca.reshape(z[1:] - z[:-1], -1, 1) if n > 1 else ca.MX(0, 1)
-    problem = {"x": z, "f": ca.log(work / scale + 1e-300), "g": ca.vertcat(bounded, gaps)}
-    options = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes", "ipopt.max_iter": 200, "ipopt.tol": 1e-9}
+    problem: dict[str, ca.MX] = {"x": z, "f": ca.log(work / scale + 1e-300), "g": ca.vertcat(limited, gaps)}
+    options: dict[str, Any] = {
+        "ipopt.print_level": 0,
+        "print_time": 0,
+        "ipopt.sb": "yes",
+        "ipopt.max_iter": 200,
+        "ipopt.tol": 1e-9,
+    }
     solver = ca.nlpsol("placement", "ipopt", problem, options)
-    count = bounded.shape[0]
+    count = limited.shape[0]
 
     def solve(guess: Sequence[float], homes: Sequence[tuple[float, float]]) -> tuple[np.ndarray, str]:
         low, high = np.clip(np.array(homes).T / length, 1e-3, 1.0 - 1e-3)

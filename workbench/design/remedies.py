@@ -5,6 +5,7 @@ Every change is a new design, and every margin is that of the new loop on the fu
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -79,6 +80,9 @@ def remedies(
         controller = redesign(setting.actuators, setting.sensors, setting.share)
         return Remedy(kind, change, size, stability_margin(close_with(modes, controller)), controller)
 
+    def moved(move: Callable[[float], _Setting], way: float, distance: float) -> float:
+        return met(move(way * distance))
+
     found = []
     given_up = _least(lambda size: met(replace(start, share=1.0 - size)), 1.0)
     if given_up is not None:
@@ -89,7 +93,7 @@ def remedies(
         for name, at, move in moves:
             for way in (-1.0, 1.0):
                 room = at if way < 0 else modes.length - at
-                size = _least(lambda d, move=move, way=way: met(move(way * d)), min(room, best[0] if best else room))
+                size = _least(partial(moved, move, way), min(room, best[0] if best else room))
                 if size is not None and (best is None or size < best[0]):
                     best = size, name, at + way * size, move(way * size)
         if best is not None:
