@@ -129,7 +129,8 @@ def _run(found, data: Path | None, scheduler: str | None) -> bool:
             name=found.name,
             title=found.question,
             figures_folder=root / "figures",
-            on_say=lambda text: console.print(f"  {text}", markup=False),
+            # where both go to one terminal, the progress bar makes room for the line
+            on_say=lambda text: (errors if console.is_terminal else console).print(f"  {text}", markup=False),
             on_track=track,
             on_report=lambda text, share: progress.update(cases, description=text, completed=share, visible=True),
             cache=root / "out" / "cache",
@@ -344,10 +345,10 @@ def diagnose(
         console.print(f"  rival      {label} ({probability:.2g})", markup=False)
     for note in verdict.notes:
         console.print(f"  {note}", markup=False)
-    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)
     if json_path is not None:
         write_whole(json_path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
         console.print(f"  verdict    {_short(json_path)}", markup=False)
+    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)
     console.print(f"  page       {_short(target)}", markup=False)
 
 
