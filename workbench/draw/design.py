@@ -192,9 +192,7 @@ def plot_placement_fronts(fronts: dict[str, Sequence[Placement]], rule: dict[str
     for (name, front), (above, below) in zip(fronts.items(), axes.T, strict=True):
         effort = [p.effort for p in front]
         above.plot(effort, [p.residual_work for p in front], "o-", color=COLOURS[0], label="optimum at each effort")
-        above.loglog(
-            rule[name].effort, rule[name].residual_work, "s", color=COLOURS[1], markersize=9, label="nodes rule"
-        )
+        above.plot(rule[name].effort, rule[name].residual_work, "s", color=COLOURS[1], markersize=9, label="nodes rule")
         below.plot(effort, np.array([p.positions for p in front]), "o-", color=COLOURS[0], markersize=4)
         below.plot(np.full(rule[name].positions.size, rule[name].effort), rule[name].positions, "s", color=COLOURS[1])
         alone = np.ptp(effort) < 1e-3 * effort[0]
@@ -216,4 +214,40 @@ def plot_scaling(times: dict[str, dict[int, float]], slopes: dict[str, float]) -
     ax.set(xlabel="number of modes", ylabel="time to design [s]")
     ax.set_title("one mode at a time, or all together")
     ax.legend()
+    return figure
+
+
+def plot_survival(scales: Sequence[float], shares: dict, spreads: dict) -> Figure:
+    """Share of draws survived, and median W_R with its 90 % interval, against the size of the errors."""
+    figure, axes = new_figure(2, 1, width=9, height=7, sharex=True)
+    for (name, values), colour, mark in zip(shares.items(), COLOURS, "osD^", strict=False):
+        axes[0].semilogx(scales, values, mark + "-", color=colour, label=name)
+        low, middle, high = np.array(spreads[name]).T
+        axes[1].loglog(scales, middle, mark + "-", color=colour)
+        axes[1].fill_between(scales, low, high, color=colour, alpha=0.15)
+    axes[0].set(ylabel="share of draws that stay stable", ylim=(-0.03, 1.05))
+    axes[0].set_title("structures that the measurement leaves possible, and larger errors than it made")
+    axes[0].legend(loc="lower left")
+    axes[1].set(xlabel="errors, as multiples of the identified standard errors", ylabel="W_R, median and 90 %")
+    return figure
+
+
+def plot_drift(rows: Sequence[dict]) -> Figure:
+    """Frequencies found in the loop over the true ones, and what keeping the old law costs, as the stiffness drifts."""
+    figure, axes = new_figure(1, 2, width=11, height=4.3)
+    drift = [100 * (row["stiffness"] - 1) for row in rows]
+    first = np.array(rows[0]["omega"])
+    for r in range(first.size):
+        axes[0].plot(drift, [row["omega"][r] / first[r] for row in rows], color=GREY, label="true" if r == 0 else None)
+        found = [row["found"][r] / first[r] for row in rows]
+        axes[0].plot(drift, found, "osD"[r % 3], color=COLOURS[r], label=f"mode {r + 1}, found in the loop")
+    axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency, to that before")
+    axes[0].legend()
+    for key, label, mark in (
+        ("cost_of_the_old_law", "law kept", "o-"),
+        ("cost_of_the_new_law", "law designed anew", "s-"),
+    ):
+        axes[1].plot(drift, [1e6 * row[key] for row in rows], mark, label=label)
+    axes[1].set(xlabel="drift of the stiffness [%]", ylabel="cost above the best, parts per million")
+    axes[1].legend()
     return figure
