@@ -213,4 +213,12 @@ def test_a_table_says_what_it_cannot_do(tmp_path):
     clash = study.run([{"at": 1}], lambda at: {"at": 2}, cache=None, **HERE)
     with pytest.raises(StudyError, match="'at' is a parameter and a result of another value"):
         clash.rows()
+    twice = study.run([{}], lambda: {"a.b": 1, "a": {"b": 2}}, cache=None, **HERE)
+    with pytest.raises(StudyError, match=r"in one column, 'a.b'"):
+        twice.rows()
+    for name in ("error", "seconds", "versions", "seed"):
+        found = study.run([{}], lambda name=name: {name: 0.1}, cache=None, **HERE)
+        assert (
+            found[0].error == f"TypeError: a result cannot be called {name!r}: the table has a column of it; rename it"
+        )
     assert not list(Path(tmp_path).iterdir())

@@ -14,7 +14,7 @@ from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
 from workbench.study.cache import encoded, read_record, write_record
-from workbench.study.cases import StudyError
+from workbench.study.cases import RESERVED, StudyError
 from workbench.study.fingerprint import is_own
 from workbench.study.versions import own_source
 
@@ -46,7 +46,11 @@ def work(function: Callable, job: Job, running: Path | None = None) -> dict:
     record: dict = {"result": None, "error": None, "trace": None, "workbench": own_source()}
     try:
         found = function(**job.arguments)
-        record["result"] = encoded(found if isinstance(found, dict) else {"result": found})
+        found = found if isinstance(found, dict) else {"result": found}
+        taken = (RESERVED | {"seed"}) & found.keys()
+        if taken:
+            raise TypeError(f"a result cannot be called {min(taken)!r}: the table has a column of it; rename it")
+        record["result"] = encoded(found)
     except KeyboardInterrupt:
         raise
     except BaseException as error:

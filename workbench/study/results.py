@@ -82,7 +82,7 @@ class Results(Sequence):
         What a dict holds has a column of its own, `outer.inner`; a value that no case of this row has is None.
 
         Raises:
-            StudyError: a value of the name of a parameter that means something else.
+            StudyError: two values of one name.
         """
         used = ", ".join(f"{name} {version}" for name, version in versions().items())
         parts = [(_flat(r.parameters), _flat(r.values)) for r in self.every]
@@ -134,10 +134,11 @@ class Results(Sequence):
 def _flat(values: Mapping, before: str = "") -> dict:
     flat = {}
     for name, value in values.items():
-        if isinstance(value, Mapping):
-            flat.update(_flat(value, f"{before}{name}."))
-        else:
-            flat[before + name] = value
+        part = _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name: value}
+        twice = part.keys() & flat.keys()
+        if twice:
+            raise StudyError(f"two values would stand in one column, {min(twice)!r}; rename one")
+        flat.update(part)
     return flat
 
 

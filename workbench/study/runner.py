@@ -29,7 +29,8 @@ def run(
 
     A result is kept under a name made of the function (its code and all that reaches), the versions of what computes,
     the case and its seed, so that a second run works only what is new, changed, failed, or was not finished. What a
-    case raises is kept beside the results of the others. Cases that are equal are worked once.
+    case raises is kept beside the results of the others. Cases that are equal are worked once. A file counts with what
+    it holds only where a case names it as a `Path`.
 
     Args:
         cases: dicts of plain parameters; `grid` and `samples` make them.
