@@ -213,12 +213,12 @@ def design(
     final_time: Annotated[float | None, typer.Option(help="Time for the work, s; 20 periods of mode 1.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Design IMSC beside coupled LQR: cost, effort, peak force, and which residual mode each feeds.
+    """Design IMSC beside coupled control: cost, effort, spillover, and on the full plant which mode is unsettled.
 
     Example: workbench design case.toml --control 3 --weight 20
     """
     from workbench.design.closed_loop import impulse_state
-    from workbench.design.comparison import compare
+    from workbench.design.comparison import compare, through_sensors
     from workbench.design.coupled import coupled_lqr
     from workbench.design.imsc import imsc
 
@@ -228,7 +228,9 @@ def design(
     modes, at = found.modes, _blow(found, impulse_at)
     state = impulse_state(modes, at)
     state[modes.n_modes + n :] = 0.0
-    laws = [imsc(modes, n, actuators, weight=weight), coupled_lqr(modes, n, actuators, weight=weight)]
+    laws = [coupled_lqr(modes, n, actuators, weight=weight)]
+    if n <= len(actuators):
+        laws.insert(0, imsc(modes, n, actuators, weight=weight))
     end = final_time or 20 * TURN / modes.omega[modes.omega > 0][0]
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "feeds", box=None, pad_edge=False)
@@ -238,6 +240,22 @@ def design(
         shown.add_row(row.law.name, *(f"{value:.5g}" for value in figures), feeds)
     console.print(f"{n} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold")
     console.print(shown)
+    if n > len(actuators):
+        console.print(f"  IMSC needs as many actuators as modes; there are {len(actuators)} for {n}")
+    mass = None if found.structure is None else found.structure.mass_per_length
+    tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
+    console.print("displacement and velocity read at the sensors' places:", style="bold")
+    sensed = Table("design", "margin [1/s]", "worst residual mode", "by the path", box=None, pad_edge=False)
+    for controller, explained, why in tried:
+        if explained is None:
+            console.print(f"  {why}")
+            continue
+        worst = explained.moved[0] if explained.moved else None
+        mode = f"mode {worst.mode + 1}: {worst.closed_pole.real:+.3g} 1/s" if worst else ""
+        path = f"sensor at {worst.paths[0].sensor_at:g} to {worst.paths[0].actuator}" if worst else ""
+        verdict = "" if explained.margin > 0 else " unstable"
+        sensed.add_row(controller.name, f"{explained.margin:.3g}{verdict}", mode, path)
+    console.print(sensed)
     _write_json(
         json_path,
         {
@@ -258,6 +276,11 @@ def design(
                 }
                 for r in rows
             ],
+            "through_sensors": [
+                {"design": c.name, "margin": e.margin, "poles_real": e.poles.real, "poles_imag": e.poles.imag}
+                for c, e, _ in tried
+                if e is not None
+            ],
         },
     )
 
@@ -271,11 +294,15 @@ def place(
     impulse_at: Annotated[float | None, typer.Option(help="Place of a unit blow; the hammer's unless given.")] = None,
     effort: Annotated[float, typer.Option(help="Effort allowed, as a multiple of evenly spaced actuators'.")] = 1.5,
     spacing: Annotated[float | None, typer.Option(help="Least distance apart; a twentieth of the length.")] = None,
+    peak_force: Annotated[float, typer.Option(help="Largest force of any actuator, N.")] = math.inf,
+    condition: Annotated[float, typer.Option(help="Largest condition of B (Frobenius).")] = math.inf,
+    forbid: Annotated[list[str] | None, typer.Option(help="Stretch FROM:TO without actuators; repeat.")] = None,
+    proof: Annotated[float | None, typer.Option(help="Prove the optimum global within this share, e.g. 0.05.")] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Place actuators where control spills the least work, under a limit of effort.
+    """Place actuators where control spills the least work, under the limits of a rig.
 
-    Example: workbench place case.toml --control 4 --weight 20 --effort 1.2
+    Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --proof 0.05
     """
     import numpy as np
 
@@ -287,7 +314,11 @@ def place(
     task = placement_task(modes, control, impulse_at=at, weight=weight)
     even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
     apart = modes.length / 20 if spacing is None else spacing
-    rows = [least_work(task, effort_limit=effort * even.effort, spacing=apart), even]
+    limits = {"effort_limit": effort * even.effort, "spacing": apart}
+    best = least_work(
+        task, **limits, peak_limit=peak_force, condition_limit=condition, forbidden=[_stretch(s) for s in forbid or ()]
+    )
+    rows = [best, even]
     nodes = nodes_of_mode(modes, control)
     if nodes.size == control:
         rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
@@ -447,6 +478,14 @@ def bench(
             server.serve_forever()
         except KeyboardInterrupt:
             console.print("  ended")
+
+
+def _stretch(text: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise ValueError(f"a forbidden stretch is FROM:TO in m, as 0.2:0.3; got {text!r}") from None
+    return low, high
 
 
 def _structure_rig(path: Path):

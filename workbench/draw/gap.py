@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.gap.effects.structural import known_places, place_name
 from workbench.gap.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -74,21 +75,25 @@ def plot_where(verdict: Verdict) -> Figure:
     axes[2, 0].set_xticks(np.arange(8) + 0.5, np.arange(1, 9))
     axes[2, 0].set_yticks(np.arange(len(order)) + 0.5, where.record_names)
     axes[2, 0].grid(False)
+    _plot_places(axes[2, 1], verdict)
+    return figure
+
+
+def _plot_places(ax, verdict: Verdict) -> None:
+    """How likely each place is for one missing force: a curve along the structure, or bars at named places."""
     evidence = verdict.attribution.evidence
     profile = evidence.profile - evidence.profile.max()
-    axes[2, 1].plot(evidence.places, profile, color=COLOURS[3])
-    axes[2, 1].axvline(where.at, color=GREY, linestyle=":")
+    ax.set(title="where a missing force would stand", ylabel="log-likelihood, less its peak")
+    if known_places(verdict.nominal) is not None:
+        ax.bar([place_name(verdict.nominal, at) for at in evidence.places], profile, color=COLOURS[3])
+        return
+    ax.plot(evidence.places, profile, color=COLOURS[3])
+    ax.axvline(verdict.where.at, color=GREY, linestyle=":")
     for effect in verdict.effects:
         if "at" in effect.values and effect.kind.path in ("structure", "environment"):
-            axes[2, 1].axvline(effect.values["at"], color=COLOURS[0])
-    low = max(profile.min(), -50.0 * max(1.0, abs(profile[np.argsort(profile)[-3]])))
-    axes[2, 1].set(
-        title="where a missing force would stand",
-        xlabel="x [m]",
-        ylabel="log-likelihood, less its peak",
-        ylim=(low, None),
-    )
-    return figure
+            ax.axvline(effect.values["at"], color=COLOURS[0])
+    near = abs(np.sort(profile)[-min(3, profile.size)])
+    ax.set(xlabel="x [m]", ylim=(max(profile.min(), -50.0 * max(1.0, near)), None))
 
 
 def plot_missing_force(verdict: Verdict) -> Figure:
@@ -104,7 +109,7 @@ def plot_missing_force(verdict: Verdict) -> Figure:
         (axes[1], place.velocity, "velocity [m/s]"),
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
-        ax.set_xlabel(f"{name} at x = {place.at:.3g}")
+        ax.set_xlabel(f"{name} at {place_name(verdict.nominal, place.at)}")
         law = _law(chosen, series, name)
         if law is not None:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")

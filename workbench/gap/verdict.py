@@ -10,6 +10,7 @@ from workbench.gap.effects.effect import ALL, Effect
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
+from workbench.gap.effects.structural import known_places, place_name
 from workbench.gap.experiment import Experiment
 from workbench.gap.locate import Where
 from workbench.gap.shrinkage import Shrinkage
@@ -183,7 +184,9 @@ def _described(effect: Effect, nominal: Rig) -> str:
         text += ", all of them" if effect.target == ALL else f", {effect.target}"
     elif effect.kind.name == "support_rotation":
         text += f" at the {effect.target} end"
-    if "at" in effect.values:
+    if "at" in effect.values and known_places(nominal) is not None:
+        text += f" at {place_name(nominal, effect.values['at'])}"
+    elif "at" in effect.values:
         text += f" at x = {_with_deviation(effect.values['at'], effect.deviations.get('at', 0.0))}"
     return text
 

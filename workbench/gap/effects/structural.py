@@ -28,6 +28,12 @@ def known_places(rig: Rig) -> np.ndarray | None:
     return getattr(rig.modes.shapes, "places", None)
 
 
+def place_name(rig: Rig, at: float) -> str:
+    """What to call a place: the input or output that stands there, for a rig of plain modal data; else x = at."""
+    names = getattr(rig.modes.shapes, "names", None)
+    return f"x = {at:.3g}" if names is None else names[round(at)]
+
+
 def resolved(rig: Rig, structure) -> Rig:
     """The rig with a changed structure and the modes it then has."""
     return replace(rig, structure=structure, modes=structure.modes(rig.modes.n_modes, tolerance=RESOLUTION))
