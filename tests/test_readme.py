@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import re
 from pathlib import Path
 
@@ -36,3 +37,59 @@ def test_every_file_and_target_named_is_there():
         assert (ROOT / figure).is_file()
     for study in re.findall(r"workbench study ([a-z]\w*)", README):
         assert (ROOT / "studies" / f"{study}.py").is_file()
+
+
+# For each row of the results: the study that wrote the number, and how it is found there.
+ROWS = {
+    "Table 4.1": lambda r: _largest(r, "Table 4.1"),
+    "the same bar by stacked delays": lambda r: _largest(r, "stacked delays"),
+    "Tables 4.2, 4.3": lambda r: _largest(r, "Tables 4.2-4.3: default"),
+    "Table 5.1": lambda r: _largest(r, "Table 5.1"),
+    "W_r of section 5.8": lambda r: _largest(r, "W_r, set", "quadrature"),
+    "closed-form Riccati gains": lambda r: _largest(r, "gains against control.lqr"),
+    "coupled poles": lambda r: _largest(r, "its gain norm over"),
+    "CasADi's W_R": lambda r: _largest(r, "CasADi's W_R"),
+    "W_R of the optimum over the best of a full grid": lambda r: _largest(r, "W_R of the optimum over the best"),
+    "a hundred thousand modes": lambda r: r["speeds"]["imsc_100000_modes_s"],
+    "ruler": lambda r: _largest(r, "MAC with the free-free beam"),
+    "Silverbox": lambda r: 1e3 * r["rmse"]["multisines"]["after"],
+    "the same on the arrow": lambda r: 1e3 * r["rmse"]["arrow"]["after"],
+    "a robot arm": lambda r: 1e3 * r["mass"]["kg"],
+    "median share": lambda r: _largest(r, "median share"),
+}
+
+
+def _largest(results: dict, *words: str) -> float:
+    found = [c["value"] for c in results["checks"] if all(word in c["name"] for word in words)]
+    assert found, words
+    return max(found)
+
+
+def test_every_result_is_what_its_study_wrote():
+    section = README[README.index("## Results") : README.index("## Gallery")]
+    rows = [line.strip("| ").split(" | ") for line in section.splitlines() if "`workbench study" in line]
+    unseen = set(ROWS)
+    for what, found, command in rows:
+        (key,) = [key for key in ROWS if what.startswith(key)]
+        unseen.discard(key)
+        study = re.search(r"study (\w+)", command).group(1)
+        value = ROWS[key](json.loads((ROOT / "studies/results" / f"{study}.json").read_text(encoding="utf-8")))
+        words, number = re.match(r"(below|at most|at least)? ?([\d.e-]+)", found).groups()
+        if words is None:
+            digits = len(number.split(".")[1])
+            assert f"{value:.{digits}f}" == number, what
+        else:
+            limit = float(number)
+            assert value >= limit if words == "at least" else value <= limit, what
+    assert not unseen
+
+
+def test_every_room_has_a_page_that_the_readme_shows():
+    rooms = [path.parent.name for path in (ROOT / "workbench").glob("*/__init__.py")]
+    assert sorted(re.findall(r"\(workbench/(\w+)/README.md\)", README)) == sorted(rooms)
+    for room in rooms:
+        text = (ROOT / "workbench" / room / "README.md").read_text(encoding="utf-8")
+        named = re.findall(r"`([a-z_/]+\.py)`", text)
+        assert named and all((ROOT / "workbench" / room / name).is_file() for name in named), room
+        for function in re.findall(r"`wb\.(\w+)", text):
+            assert function in workbench.__all__, (room, function)
