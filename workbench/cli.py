@@ -306,9 +306,14 @@ def place(
     """
     import numpy as np
 
+    from workbench.design.certificate import certify
     from workbench.design.placement import nodes_of_mode, placement_task
     from workbench.design.placement import place as least_work
 
+    if proof is not None and (forbid or math.isfinite(peak_force) or math.isfinite(condition)):
+        raise ValueError("a proof covers the limits of effort and spacing alone; leave out the others or the --proof")
+    if proof is not None and not 0 < proof < 1:
+        raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
     found = _structure_rig(rig)
     modes, at = found.modes, _blow(found, impulse_at)
     task = placement_task(modes, control, impulse_at=at, weight=weight)
@@ -331,8 +336,24 @@ def place(
         f"{control} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold"
     )
     console.print(shown)
-    keys = ("positions", "residual_work", "by_mode", "effort", "condition", "status")
-    _write_json(json_path, {"placements": [{key: getattr(row, key) for key in keys} for row in rows]})
+    proven = None
+    if proof is not None:
+        proven = certify(task, best, gap=proof, **limits)
+        if proven.better is not None:
+            where = ", ".join(f"{x:.4g}" for x in proven.better)
+            console.print(f"  not the best there is: actuators at {where} spill less; ask again with them in mind")
+        else:
+            console.print(
+                f"  no placement spills less than {1 - proven.gap:.1%} of this, shown on {proven.cells} cells"
+            )
+    keys = ("positions", "residual_work", "by_mode", "effort", "peak_force", "condition", "status")
+    _write_json(
+        json_path,
+        {
+            "placements": [{key: getattr(row, key) for key in keys} for row in rows],
+            "lower_bound": None if proven is None else proven.lower_bound,
+        },
+    )
 
 
 @app.command()

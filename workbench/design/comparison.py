@@ -6,10 +6,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.design.closed_loop import close_loop, respond
+from workbench.design.controller import Controller, filtered
+from workbench.design.explain import Explanation, explain
 from workbench.design.law import Law
+from workbench.design.modal_filter import displacement_filter
+from workbench.design.observers import luenberger
 from workbench.design.spillover import Spillover, effort, finite_spillover, quadratic_cost
+from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.profile import ProfileLike
 
+# as fast as the mode that is watched, and damped enough to forget where it started within two periods
+OBSERVER_POLES = -0.3 + 1j
 SHOWN_INSTANTS = 2000
 
 
@@ -70,3 +78,37 @@ def compare(
             )
         )
     return tuple(rows)
+
+
+def through_sensors(
+    modes: Modes, laws: Sequence[Law], places: Sequence[float], mass_per_length: ProfileLike | None
+) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
+    """Each law on what sensors of displacement and velocity at the places tell: a modal filter, a Luenberger observer.
+
+    Args:
+        modes: controlled and residual.
+        laws: to try.
+        places: of the sensors, m.
+        mass_per_length: for the filters; none are tried where it is not known.
+
+    Returns:
+        Controller, explanation on the full plant, and where it cannot be, (None, None, why).
+    """
+    places = np.unique(np.asarray(places, float))
+    tried = []
+    for law in laws:
+        own = modes.select(law.controlled)
+        ways = [
+            lambda law=law, own=own: luenberger(
+                modes, law, [Sensor(f"y{i + 1}", x) for i, x in enumerate(places)], poles=OBSERVER_POLES * own.omega
+            )
+        ]
+        if mass_per_length is not None:
+            ways.insert(0, lambda law=law, own=own: filtered(law, displacement_filter(own, places, mass_per_length)))
+        for way in ways:
+            try:
+                controller = way()
+                tried.append((controller, explain(modes, controller), ""))
+            except ValueError as error:
+                tried.append((None, None, f"{law.name}: {error}"))
+    return tuple(tried)

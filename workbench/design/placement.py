@@ -72,15 +72,19 @@ class Limits:
         """By name of limit, by how much each of many placements (n_placements, n) breaks it, relative; <= 0 is kept."""
         gaps = np.diff(positions, axis=1).min(axis=1, initial=np.inf)
         return {
-            "effort": figures.effort / self.effort - 1.0,
-            "peak force": figures.peak_force / self.peak_force - 1.0,
-            "condition": figures.condition / self.condition - 1.0,
+            "effort": _excess(figures.effort, self.effort),
+            "peak force": _excess(figures.peak_force, self.peak_force),
+            "condition": _excess(figures.condition, self.condition),
             "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(len(positions)),
         }
 
 
 def _apart(x: float, stretch: tuple[float, float]) -> float:
     return max(stretch[0] - x, x - stretch[1], 0.0)
+
+
+def _excess(values: np.ndarray, limit: float) -> np.ndarray:
+    return values / limit - 1.0 if np.isfinite(limit) else np.full(values.shape, -1.0)
 
 
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
