@@ -1,6 +1,7 @@
 """A real browser without a window."""
 
 import shutil
+import time
 
 import pytest
 
@@ -38,3 +39,40 @@ def look(chromium):
         return chromium
 
     return opened
+
+
+def wait_until(what, seconds=10.0):
+    """Wait for something to become true, and return it."""
+    end = time.monotonic() + seconds
+    while not (found := what()):
+        assert time.monotonic() < end, "it did not come about"
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture
+def moves():
+    """Whether the path of a line takes several shapes, none of them broken."""
+
+    def watched(line):
+        paths = set()
+        wait_until(lambda: paths.add(line.get_attribute("d")) or len(paths) >= 4)
+        return not any(path is None or "NaN" in path for path in paths)
+
+    return watched
+
+
+@pytest.fixture
+def drawn():
+    """Wait until as many panels as this are drawn; return them."""
+
+    def waited(browser, count):
+        wait_until(lambda: len(browser.find_elements("css selector", ".panel svg .marks > *:first-child")) == count)
+        return browser.find_elements("css selector", ".panel svg")
+
+    return waited
+
+
+@pytest.fixture
+def until():
+    return wait_until

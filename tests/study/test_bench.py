@@ -3,7 +3,6 @@
 import http.client
 import json
 import threading
-import time
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -130,60 +129,47 @@ def test_the_server_answers_its_own_page_and_nobody_else(bench):
     assert request(bench, "POST", "/try", design, **own)[0] == 200, "it lives on"
 
 
-def answered(browser, before):
-    until = time.monotonic() + 10
-    while int(browser.execute_script("return document.body.dataset.answers || 0")) <= before:
-        assert time.monotonic() < until, "no answer"
-        time.sleep(0.02)
-    time.sleep(0.1)
-    return int(browser.execute_script("return document.body.dataset.answers"))
-
-
 @pytest.mark.parametrize("width", [390, 1200])
-def test_it_can_be_played_on(bench, look, width, tmp_path):
+def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     from selenium.webdriver import ActionChains
 
     browser = look(f"http://127.0.0.1:{bench}/", width)
-    n = answered(browser, 0)
+    drawn(browser, 4)
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width
 
     def card(name):
         return browser.find_element("id", name).text
 
-    assert card("residual") == "1.499e−3" and card("stable") == "stable"
-    assert len(browser.find_elements("css selector", "#work .marks rect")) == 5
-    line = browser.find_element("css selector", ".stand .track")
-    seen = set()
-    for _ in range(4):
-        time.sleep(0.1)
-        seen.add(line.get_attribute("d"))
-    assert len(seen) >= 3, "it moves"
+    def bars():
+        return len(browser.find_elements("css selector", "#work .marks rect"))
+
+    assert card("residual") == "1.499e−3" and card("stable") == "stable" and bars() == 5
+    assert moves(browser.find_element("css selector", ".stand .track"))
 
     second = browser.find_elements("css selector", ".handle.actuators")[1]
     length = browser.find_element("css selector", ".stand").size["width"] - 36
     ActionChains(browser).click_and_hold(second).move_by_offset(round(0.05 * length), 0).release().perform()
-    n = answered(browser, n)
     at = float(second.get_attribute("aria-valuenow"))
     assert at == pytest.approx(4.5, abs=0.1)
-    moved = shown(RIG, replace(start(RIG), actuators=(2.0, at, 6.0, 8.0)))
-    assert float(card("residual").replace("−", "-")) == pytest.approx(moved["residual"], rel=1e-3)
+    moved = shown(RIG, replace(start(RIG), actuators=(2.0, at, 6.0, 8.0)))["residual"]
+    until(lambda: float(card("residual").replace("−", "-")) == pytest.approx(moved, rel=1e-3))
 
-    count = browser.find_element("id", "controlled")
-    browser.execute_script("arguments[0].value = 3; arguments[0].dispatchEvent(new Event('input'))", count)
-    n = answered(browser, n)
-    assert len(browser.find_elements("css selector", "#work .marks rect")) == 6
-    browser.execute_script("arguments[0].value = 5; arguments[0].dispatchEvent(new Event('input'))", count)
-    n = answered(browser, n)
-    assert "5 controlled modes need as many actuators" in browser.find_element("css selector", ".say").text
-    browser.execute_script("arguments[0].value = 4; arguments[0].dispatchEvent(new Event('input'))", count)
-    n = answered(browser, n)
+    def control(count):
+        slider = browser.find_element("id", "controlled")
+        browser.execute_script(f"arguments[0].value = {count}; arguments[0].dispatchEvent(new Event('input'))", slider)
+
+    control(3)
+    until(lambda: bars() == 6)
+    control(5)
+    until(lambda: "5 controlled modes need as many" in browser.find_element("css selector", ".say").text)
+    control(4)
+    until(lambda: bars() == 5 and "Drag" in browser.find_element("css selector", ".say").text)
 
     name = browser.find_element("id", "name")
     name.clear()
     name.send_keys(f"played_{width}")
     name.submit()
-    time.sleep(0.3)
-    assert "saved as" in browser.find_element("id", "saved").text
+    until(lambda: "saved as" in browser.find_element("id", "saved").text)
     assert (tmp_path / f"studies/played_{width}.py").is_file()
     errors = [entry for entry in browser.get_log("browser") if "422" not in entry["message"]]
     assert errors == []
