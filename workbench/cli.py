@@ -228,9 +228,7 @@ def design(
     modes, at = found.modes, _blow(found, impulse_at)
     state = impulse_state(modes, at)
     state[modes.n_modes + n :] = 0.0
-    laws = [coupled_lqr(modes, n, actuators, weight=weight)]
-    if n <= len(actuators):
-        laws.insert(0, imsc(modes, n, actuators, weight=weight))
+    laws = [imsc(modes, n, actuators, weight=weight), coupled_lqr(modes, n, actuators, weight=weight)]
     end = final_time or 20 * TURN / modes.omega[modes.omega > 0][0]
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "feeds", box=None, pad_edge=False)
@@ -240,8 +238,6 @@ def design(
         shown.add_row(row.law.name, *(f"{value:.5g}" for value in figures), feeds)
     console.print(f"{n} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold")
     console.print(shown)
-    if n > len(actuators):
-        console.print(f"  IMSC needs as many actuators as modes; there are {len(actuators)} for {n}")
     mass = None if found.structure is None else found.structure.mass_per_length
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
     console.print("displacement and velocity read at the sensors' places:", style="bold")
