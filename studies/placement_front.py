@@ -1,0 +1,83 @@
+"""What does less spillover cost, is an optimum the best there is, and what does the rule of the nodes give away?"""
+
+import numpy as np
+
+from workbench.design.certificate import certify
+from workbench.design.placement import nodes_of_mode, place, placement_task
+from workbench.draw.design import plot_placement_fronts
+from workbench.structure.member import Beam
+
+SPACING = 0.5
+FACTORS = (1.0001, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0)
+# share of W_R to be proven by number of actuators: cells grow by about fifty with each
+GAPS = {1: 0.01, 2: 0.01, 3: 0.02, 4: 0.1}
+
+
+def study(outcome, data=None):
+    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    modes = beam.modes(9)
+    blows = np.linspace(0.5, 9.5, 19)
+    disturbances = {"a blow at 6.3": 6.3, "a blow anywhere": blows}
+
+    fronts, nodes = {}, {}
+    for name, at in disturbances.items():
+        task = placement_task(modes, 4, impulse_at=at, weight=20.0)
+        nodes[name] = task.placed(nodes_of_mode(modes, 4), "nodes of mode 5")
+        fronts[name] = [
+            place(task, effort_limit=factor * nodes[name].effort, spacing=SPACING, starts=6)
+            for factor in outcome.track(FACTORS, f"front for {name}")
+        ]
+        outcome.table(
+            name.replace(" ", "_"),
+            {
+                "nodes": {"effort": nodes[name].effort, "W_R": nodes[name].residual_work},
+                "front": [
+                    {"effort": p.effort, "W_R": p.residual_work, "peak_force": p.peak_force, "positions": p.positions}
+                    for p in fronts[name]
+                ],
+                "tail_bound_of_the_nodes": placement_task(beam.modes(40), 4, impulse_at=at, weight=20.0).tail_bound(
+                    nodes[name].positions, growth=2.0
+                ),
+            },
+        )
+        outcome.say(
+            f"{name}: at the effort of the nodes of mode 5 the optimum spills"
+            f" {fronts[name][0].residual_work / nodes[name].residual_work:.0%} of what they do; with half as much again"
+            f" {fronts[name][4].residual_work / nodes[name].residual_work:.0%}"
+        )
+        work = np.array([p.residual_work for p in fronts[name]])
+        outcome.check(f"{name}: W_R nowhere rises along the front, largest step", float(np.diff(work).max()), 1e-12)
+        outcome.check(
+            f"{name}: W_R of the optimum over the nodes' at their effort",
+            fronts[name][0].residual_work / nodes[name].residual_work,
+            1.0,
+        )
+
+    proofs = []
+    for n, gap in outcome.track(GAPS.items(), "certificates"):
+        task = placement_task(modes, n, impulse_at=6.3, weight=20.0)
+        rule = task.placed(nodes_of_mode(modes, n), f"nodes of mode {n + 1}")
+        limits = {"effort_limit": 1.5 * rule.effort, "spacing": SPACING}
+        best = place(task, **limits)
+        proof = certify(task, best, gap=gap, **limits)
+        proofs.append(
+            {
+                "actuators": n,
+                "positions": best.positions,
+                "W_R": best.residual_work,
+                "lower_bound": proof.lower_bound,
+                "gap": proof.gap,
+                "cells": proof.cells,
+                "nodes_W_R": rule.residual_work,
+            }
+        )
+        outcome.check(f"{n} actuators: share by which W_R could yet be lower", proof.gap, gap * (1 + 1e-9))
+        outcome.say(
+            f"{n} actuator(s): no placement spills less than {1 - proof.gap:.0%} of the optimum, proven on"
+            f" {proof.cells} cells; the nodes of mode {n + 1} spill"
+            f" {rule.residual_work / best.residual_work:.2f} times the optimum"
+        )
+    outcome.table("certificates", proofs)
+    outcome.figure(
+        "front", plot_placement_fronts(fronts, nodes), "Least spillover at each effort, beside the nodes of mode 5."
+    )
