@@ -85,6 +85,7 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"sensors": [3.0, 3.0]}, "increasing"),
         ({"law": "bang"}, "law is one of"),
         ({"final_time": 0}, "final_time must be positive"),
+        ({"final_time": 10**400}, "finite numbers"),
         ({"extra": 1}, "a design has actuators"),
     ],
 )
