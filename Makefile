@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: study test test-slow bench figures lint clean
+.PHONY: study test test-slow bench docs figures lint clean
 
 $(BIN)/workbench: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -24,6 +24,9 @@ figures: $(BIN)/workbench  ## every study that makes its own data, with its figu
 
 bench: $(BIN)/workbench  ## speeds, as ratios
 	$(BIN)/workbench study design_scaling
+
+docs: $(BIN)/workbench  ## README.md and a page a room, workbench/*/README.md: every example, number and name in them checked
+	$(BIN)/python -m pytest -q tests/test_readme.py
 
 lint: $(BIN)/workbench  ## style and types
 	$(BIN)/ruff check workbench studies tests
