@@ -153,6 +153,16 @@ def test_tables_sort_and_the_page_follows_light_dark_and_paper(page, look):
     assert len(shown) == 4 and not any(shown)
 
 
+def test_a_damaged_figure_leaves_the_others_drawn(page, look, drawn, tmp_path):
+    content = json.loads(page.with_suffix(".page.json").read_text())
+    content["blocks"] = [{"caption": "damaged", "figure": {}}, {"caption": "moved", "motion": 3}, content["blocks"][0]]
+    browser = look(write_page(tmp_path / "p.html", story_of(content)).as_uri(), 1200)
+    drawn(browser, 4)
+    damaged = [stage.text for stage in browser.find_elements("css selector", ".stage")]
+    assert damaged[:2] == ["This figure is damaged."] * 2
+    assert len(browser.get_log("browser")) == 2
+
+
 def test_the_story_beside_the_page_makes_the_same_page_again(page, tmp_path):
     again = write_page(tmp_path / "p.html", story_in(page.with_suffix(".page.json")))
     assert again.read_bytes() == page.read_bytes()
