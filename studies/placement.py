@@ -1,8 +1,9 @@
-"""Where should four actuators stand, and what does less spillover cost?"""
+"""Where should four actuators stand, and the sensors of a filter, and what does less spillover cost?"""
 
 import numpy as np
 
 from workbench.design.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.design.sensor_placement import place_sensors
 from workbench.draw.design import plot_effort_front
 from workbench.structure.member import Beam
 
@@ -43,6 +44,22 @@ def study(outcome, data=None):
         f" {best.residual_work:.3e} at x = {', '.join(f'{x:.2f}' for x in best.positions)}"
     )
     outcome.say(f"none of {tried} placements on a grid does better under the same limits")
+    squares = (modes.phi(6.3)[0] / modes.omega) ** 2
+    sensors = {k: place_sensors(modes, 4, k, 1.0, mean_squares=squares, starts=1) for k in (4, 6)}
+    outcome.table(
+        "sensors", {k: {"positions": s.positions, "error": s.error, "even": s.even_error} for k, s in sensors.items()}
+    )
+    outcome.check(
+        "error of a filter's coordinates, sensors placed over even, worst of 4 and 6 sensors",
+        max(s.error / s.even_error for s in sensors.values()),
+        1.0,
+    )
+    outcome.say(
+        "; ".join(
+            f"{k} sensors of a filter: {s.even_error:.1%} of error evenly spaced, {s.error:.1%} placed"
+            for k, s in sensors.items()
+        )
+    )
     outcome.figure(
         "front",
         plot_effort_front(front, {"nodes of mode 5": nodes, "effort limit 1.5 times theirs": best}),

@@ -52,6 +52,7 @@ _HOMES = {
     "design.remedies": ("remedies", "sensors_that_suffice"),
     "design.how_many": ("how_many_modes",),
     "design.robustness": ("draw_modes", "survive"),
+    "design.sensor_placement": ("place_sensors",),
     "design.certificate": ("Certificate", "certify"),
     "design.modal_filter": ("ModalFilter", "displacement_filter", "hermite_filter"),
     "design.closed_loop": ("ClosedLoop", "Response", "close_loop", "impulse_state", "respond"),
