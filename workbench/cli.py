@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -243,8 +243,8 @@ def design(
     console.print("displacement and velocity read at the sensors' places:", style="bold")
     sensed = Table("design", "margin [1/s]", "worst residual mode", "by the path", box=None, pad_edge=False)
     for controller, explained, why in tried:
-        if explained is None:
-            console.print(f"  {why}")
+        if controller is None or explained is None:
+            console.print(f"  {why}", markup=False)
             continue
         worst = explained.moved[0] if explained.moved else None
         mode = f"mode {worst.mode + 1}: {worst.closed_pole.real:+.3g} 1/s" if worst else ""
@@ -275,7 +275,7 @@ def design(
             "through_sensors": [
                 {"design": c.name, "margin": e.margin, "poles_real": e.poles.real, "poles_imag": e.poles.imag}
                 for c, e, _ in tried
-                if e is not None
+                if c is not None and e is not None
             ],
         },
     )
@@ -315,7 +315,7 @@ def place(
     task = placement_task(modes, control, impulse_at=at, weight=weight)
     even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
     apart = modes.length / 20 if spacing is None else spacing
-    limits = {"effort_limit": effort * even.effort, "spacing": apart}
+    limits: dict[str, Any] = {"effort_limit": effort * even.effort, "spacing": apart}
     best = least_work(
         task, **limits, peak_limit=peak_force, condition_limit=condition, forbidden=[_stretch(s) for s in forbid or ()]
     )

@@ -94,17 +94,17 @@ def through_sensors(
     Returns:
         Controller, explanation on the full plant, and where it cannot be, (None, None, why).
     """
-    places = np.unique(np.asarray(places, float))
-    tried = []
+    stands = np.unique(np.asarray(places, float))
+    tried: list[tuple[Controller | None, Explanation | None, str]] = []
     for law in laws:
         own = modes.select(law.controlled)
         ways = [
             lambda law=law, own=own: luenberger(
-                modes, law, [Sensor(f"y{i + 1}", x) for i, x in enumerate(places)], poles=OBSERVER_POLES * own.omega
+                modes, law, [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)], poles=OBSERVER_POLES * own.omega
             )
         ]
         if mass_per_length is not None:
-            ways.insert(0, lambda law=law, own=own: filtered(law, displacement_filter(own, places, mass_per_length)))
+            ways.insert(0, lambda law=law, own=own: filtered(law, displacement_filter(own, stands, mass_per_length)))
         for way in ways:
             try:
                 controller = way()

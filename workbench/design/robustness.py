@@ -50,7 +50,8 @@ class Survival:
         there = self.work[np.isfinite(self.work)]
         if not there.size:
             return np.nan, np.nan, np.nan
-        return tuple(float(q) for q in np.quantile(there, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level)))
+        low, middle, high = np.quantile(there, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level))
+        return float(low), float(middle), float(high)
 
 
 def draw_modes(
@@ -84,7 +85,7 @@ def draw_modes(
     centre = np.r_[modes.omega, modes.zeta]
     drawn = centre + scale * rng.standard_normal((count, 2 * n)) @ _root(modes.covariance).T
     mixing = np.zeros((count, n, n))
-    if shape_covariance is not None:
+    if shape_covariance is not None and positions is not None:
         at = modes.phi(positions)
         known = np.linalg.pinv(at)
         for r, covariance in enumerate(np.asarray(shape_covariance, float)):

@@ -132,7 +132,7 @@ class Results(Sequence):
 
 
 def _flat(values: Mapping, before: str = "") -> dict:
-    flat = {}
+    flat: dict[str, object] = {}
     for name, value in values.items():
         part = _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name: value}
         twice = part.keys() & flat.keys()
