@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from workbench.design.closed_loop import Response
 from workbench.design.explain import Explanation
 from workbench.design.how_many import HowMany
+from workbench.design.on_off import OnOffLaw, Switched
 from workbench.design.placement import Placement
 from workbench.design.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
@@ -250,4 +251,34 @@ def plot_drift(rows: Sequence[dict]) -> Figure:
         axes[1].plot(drift, [1e6 * row[key] for row in rows], mark, label=label)
     axes[1].set(xlabel="drift of the stiffness [%]", ylabel="cost above the best, parts per million")
     axes[1].legend()
+    return figure
+
+
+def plot_switching(law: OnOffLaw, switched: Switched, which: int = 0) -> Figure:
+    """A mode under on-off control: its path in the phase plane with the dead band, and the force over time."""
+    relay, stretches = law.relays[which], switched.stretches[which]
+    response, r = switched.response, law.controlled[which]
+    q, v = response.modal[r], response.modal[response.modes.n_modes + r]
+    figure, axes = new_figure(1, 2, width=11, height=4.5)
+    axes[0].plot(q, v, color=COLOURS[0], linewidth=1.0, label="motion")
+    for stretch in stretches:
+        if stretch.sliding:
+            inside = (response.time >= stretch.start) & (response.time <= stretch.end)
+            axes[0].plot(q[inside], v[inside], color=COLOURS[1], linewidth=3.5, label="slides along the edge")
+    reach = np.array([q.min(), q.max()])
+    edges = [edge - relay.slope * reach for edge in (-relay.dead_band, relay.dead_band)]
+    axes[0].fill_between(reach, *edges, color=GREY, alpha=0.25, label="dead band: no force")
+    switches = np.array([(s.displacement, s.rate) for s in stretches[1:]]).reshape(-1, 2)
+    axes[0].plot(*switches.T, ".", color=COLOURS[6], markersize=5, label="switches")
+    handles, labels = axes[0].get_legend_handles_labels()
+    once = dict(zip(labels, handles, strict=True))
+    axes[0].legend(once.values(), once.keys(), loc="lower left")
+    axes[0].set(xlabel=f"q{r + 1}", ylabel=f"rate of q{r + 1}", title=f"mode {r + 1} in the phase plane")
+    pushes = np.zeros(response.time.size)
+    for s in stretches:
+        tau = response.time - s.start
+        inside = (tau >= 0) & (response.time <= s.end)
+        pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])
+    axes[1].plot(response.time, pushes, color=COLOURS[0])
+    axes[1].set(xlabel="time [s]", ylabel="modal force", title="on, off, and in the mean between where it slides")
     return figure
