@@ -138,6 +138,16 @@ def test_a_study_that_does_not_hold_ends_in_code_1(tmp_path, monkeypatch):
     assert (tmp_path / "out/wrong.html").is_file()
 
 
+def test_words_of_several_lines_are_told_in_one(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies/torn.py").write_text(
+        '"""Why?"""\ndef study(outcome, data=None):\n    raise ValueError("a\\n  matrix\\n[[1]]")\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    result = run("study", "torn")
+    assert result.exit_code == 2 and result.output.splitlines()[-1] == "workbench: a matrix [[1]]"
+
+
 MANY = """'Is a third of two an error?'
 
 def third(at):

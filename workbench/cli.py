@@ -56,13 +56,14 @@ def _guarded(command: Callable) -> Callable:
         except typer.Exit:
             raise
         except (ValueError, OSError, MemoryError) as error:
-            errors.print(f"workbench: {error}", style="red", markup=False)
+            errors.print(f"workbench: {' '.join(str(error).split())}", style="red", markup=False)
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
             errors.print("workbench: interrupted", style="red", markup=False)
             raise typer.Exit(FAILURE) from None
         except Exception as error:
-            errors.print(f"workbench: {type(error).__name__}: {error}", style="red", markup=False)
+            told = f"{type(error).__name__}: {' '.join(str(error).split())}"
+            errors.print(f"workbench: {told}", style="red", markup=False)
             raise typer.Exit(FAILURE) from None
 
     return guarded

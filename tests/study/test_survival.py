@@ -142,6 +142,17 @@ def test_a_cluster_loses_a_worker_and_no_case(tmp_path, dask_cluster):
     assert strip(here.rows()) == strip(found.rows())
 
 
+def test_a_worker_with_another_workbench_is_refused():
+    from workbench.study.engines import _gathered
+
+    class Finished:
+        def result(self):
+            return {"result": {"W_R": 1.0}, "error": None, "trace": None, "seconds": 0.1, "workbench": "another"}
+
+    with pytest.raises(StudyError, match=r"a worker of the cluster runs another modal-workbench \(another, here"):
+        _gathered(Finished())
+
+
 def test_a_scheduler_that_is_not_there_is_said_to_be_so(monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr("workbench.study.engines.CONNECT_SECONDS", 0.5)
