@@ -55,7 +55,7 @@ def test_survival_is_the_share_of_positive_damping():
     modes = replace(beam(1), covariance=covariance)
     law = Law(np.zeros((1, 2)), (0,), (PLACES[0],))
     idle = filtered(law, hermite_filter(modes, np.linspace(0.0, 10.0, 5), 1.0))
-    found = survive(draw_modes(modes, 3000), {"idle": idle}, state=impulse_state(modes, 6.3), final_time=1.0)["idle"]
+    found = survive(draw_modes(modes, 1200), {"idle": idle}, state=impulse_state(modes, 6.3), final_time=1.0)["idle"]
     assert found.share == pytest.approx(norm.cdf(1.0), abs=4 * found.standard_error)
     assert np.isnan(found.work).mean() == pytest.approx(1 - found.share)
 

@@ -167,7 +167,7 @@ def plot_cure(margins: dict[str, np.ndarray], counts: dict[str, int | None]) -> 
     return figure
 
 
-def plot_how_many(found: dict[str, HowMany], share: float) -> Figure:
+def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figure:
     """What is left of each disturbance when the lowest n modes are controlled: untouched and spilled, as shares."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
@@ -176,7 +176,8 @@ def plot_how_many(found: dict[str, HowMany], share: float) -> Figure:
         ax.bar(
             result.counts, result.spilled / total, bottom=result.untouched / total, color=COLOURS[1], label="spilled"
         )
-        ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
+        if share is not None:
+            ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
         if result.recommended:
             ax.axvline(
                 result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=f"control {result.recommended}"

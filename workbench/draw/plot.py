@@ -6,11 +6,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.design.closed_loop import Response
+from workbench.design.explain import Explanation
+from workbench.design.how_many import HowMany
 from workbench.design.modal_filter import ModalFilter
 from workbench.design.placement import Placement
 from workbench.design.spillover import Spillover
 from workbench.draw.beam import plot_motion
-from workbench.draw.design import plot_work
+from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.verdict import Verdict
@@ -23,8 +25,8 @@ MOST_PANELS = 12
 
 @singledispatch
 def plot(result) -> Figure:
-    """A figure of a result: `Record`, `Modes`, `SampledModes`, `Refined`, `Response`, `Spillover`, `Placement`,
-    `ModalFilter` or `Verdict`.
+    """A figure of a result: `Record`, `Modes`, `SampledModes`, `Refined`, `Response`, `Spillover`, `Explanation`,
+    `HowMany`, `Placement`, `ModalFilter` or `Verdict`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -106,6 +108,16 @@ def _(result: Placement) -> Figure:
     ax.set(xlabel="residual mode", ylabel="work spilled, W_r", xticks=numbers)
     ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
     return figure
+
+
+@plot.register
+def _(result: Explanation) -> Figure:
+    return plot_spillover_paths(result)
+
+
+@plot.register
+def _(result: HowMany) -> Figure:
+    return plot_how_many({"energy left of this disturbance": result})
 
 
 @plot.register
