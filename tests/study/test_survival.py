@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from workbench import study
 from workbench.study.cases import StudyError
+from workbench.study.versions import PACKAGE, own_source
 
 SCRIPT = """
 import os, sys, time
@@ -42,7 +44,7 @@ def start(tmp_path, name, n, pause):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
     command = [sys.executable, *map(str, (script, tmp_path / name, tmp_path / f"{name}.txt", n, pause))]
-    around = {**os.environ, "LOG": str(tmp_path / f"{name}.log")}
+    around = {**os.environ, "LOG": str(tmp_path / f"{name}.log"), "PYTHONPATH": str(tmp_path / "frozen")}
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True, env=around)
     assert process.stdout.readline() == "ready\n"
     return process
@@ -55,6 +57,8 @@ def kept(folder) -> list[Path]:
 @pytest.mark.parametrize("kills", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_a_run_killed_at_random_moments_ends_in_the_same_table(tmp_path, kills):
     n, pause, moments = 10 + 25 * kills, 0.04, random.Random(kills)
+    # an edit while this runs would rightly make it another workbench
+    shutil.copytree(PACKAGE, tmp_path / "frozen/workbench", ignore=shutil.ignore_patterns("__pycache__"))
     assert start(tmp_path, "calm", n, pause).wait() == 0
     for kill in range(kills):
         process = start(tmp_path, "killed", n, pause)
@@ -101,6 +105,7 @@ class Cluster:
 @pytest.fixture
 def dask_cluster(tmp_path):
     pytest.importorskip("distributed", reason="a cluster needs the extra `cluster`")
+    own_source.cache_clear()  # the workers read the source now
     cluster = Cluster(tmp_path)
     yield cluster
     cluster.stop()
