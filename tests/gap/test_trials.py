@@ -210,10 +210,17 @@ def test_silence_is_right_only_where_nothing_hides():
     assert counted.counts["sensor_bias", "none"] == 1 and counted.counts["none", "none"] == 1
 
 
-@pytest.mark.slow
-def test_a_small_blind_trial_is_passed():
-    alone = [("point_damper",), ("actuator_saturation",), ("sensor_gain",), ("cross_talk",)]
-    kinds = [*alone, (), ("ground_spring", "sensor_lag")]
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        [("point_damper",), (), ("sensor_gain",)],
+        pytest.param(
+            [("actuator_saturation",), ("ground_spring", "sensor_lag"), ("cross_talk",)], marks=pytest.mark.slow
+        ),
+    ],
+    ids=["single and none", "saturation, pair and outside"],
+)
+def test_a_small_blind_trial_is_passed(kinds):
     held = hold_trials(len(kinds), 314, kinds=kinds)
     assert all(s["kinds"] for s in held.scores.values()), held.tally.counts
     assert held.tally.misplaced == 0
