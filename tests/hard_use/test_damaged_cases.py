@@ -261,3 +261,24 @@ def test_the_command_ends_in_one_line_and_writes_nothing(whole, tmp_path, where)
     assert result.exit_code == 2, result.output
     assert folder.name in result.output and len(result.output.strip().splitlines()) == 1
     assert not found.exists() and not page.exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_design_on_a_damaged_structure_is_one_or_a_refusal(whole, tmp_path, count=6, seed=5):
+    rng = np.random.default_rng(seed)
+    path, found = tmp_path / "rig.toml", tmp_path / "found.json"
+    for _ in range(count):
+        table = changed(tomllib.loads((whole / "case.toml").read_text()), rng)
+        path.write_text("\n".join(f"{key} = {as_toml(value)}" for key, value in table.items()))
+        found.unlink(missing_ok=True)
+        result = CliRunner().invoke(app, ["design", str(path), "--control", "1", "--json", str(found)])
+        assert result.exit_code in (0, 2) and "Traceback" not in result.output, result.output[-1000:]
+        assert found.exists() == (result.exit_code == 0)
+        if found.exists():
+            assert "NaN" not in found.read_text() and "Infinity" not in found.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_designs_on_many_damaged_structures(whole, tmp_path):
+    test_a_design_on_a_damaged_structure_is_one_or_a_refusal(whole, tmp_path, count=200, seed=6)
