@@ -3,8 +3,13 @@
 import numpy as np
 
 from workbench.design.certificate import certify
-from workbench.design.placement import nodes_of_mode, place, placement_task
+from workbench.design.closed_loop import impulse_state
+from workbench.design.coupled import coupled_lqr
+from workbench.design.coupled_placement import place_coupled
+from workbench.design.placement import Limits, law_at, nodes_of_mode, place, placement_task
+from workbench.design.spillover import quadratic_cost
 from workbench.draw.design import plot_placement_fronts
+from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 
 SPACING = 0.5
@@ -78,6 +83,40 @@ def study(outcome, data=None):
             f" {rule.residual_work / best.residual_work:.2f} times the optimum"
         )
     outcome.table("certificates", proofs)
+
+    rule, best = nodes["a blow at 6.3"], fronts["a blow at 6.3"][4]
+    limits = Limits(effort=1.5 * rule.effort, spacing=SPACING)
+    together = place_coupled(modes, 4, 4, impulse_at=6.3, weight=10.0, limits=limits)
+    state = impulse_state(modes, 6.3)
+    state[9 + 4 :] = 0.0
+    regulators = {
+        "IMSC": law_at(placement_task(modes, 4, impulse_at=6.3, weight=20.0), best.positions, weight=20.0),
+        "coupled LQR": coupled_lqr(
+            modes, 4, [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(together.positions)], weight=10.0
+        ),
+    }
+    cost = {name: quadratic_cost(modes, law, state, 10.0) for name, law in regulators.items()}
+    outcome.table(
+        "coupled_lqr",
+        {
+            "positions": together.positions,
+            "W_R": together.residual_work,
+            "effort": together.effort,
+            "cost": cost["coupled LQR"],
+            "cost_of_imsc": cost["IMSC"],
+        },
+    )
+    outcome.check(
+        "coupled LQR, placed for itself: W_R over that of IMSC's optimum",
+        together.residual_work / best.residual_work,
+        1.0,
+    )
+    outcome.say(
+        f"coupled LQR placed for itself spills {together.residual_work / best.residual_work:.2g} of what IMSC at its"
+        f" optimum does, for {together.effort / best.effort:.2f} of the effort and"
+        f" {cost['coupled LQR'] / cost['IMSC']:.2f} of the cost: it need not push every mode, nor use every actuator"
+        f" (they stand at {', '.join(f'{x:.2f}' for x in together.positions)})"
+    )
     outcome.figure(
         "front", plot_placement_fronts(fronts, nodes), "Least spillover at each effort, beside the nodes of mode 5."
     )
