@@ -106,11 +106,29 @@ def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: b
     steps = 0
     for _ in range(2):
         # Noise differs from sensor to sensor: it is measured at the first optimum and the sensors reweighted.
-        poles, fit, converged, taken = _search(records, poles, weights, offset)
+        poles, fit, converged, taken = search(records, poles, weights, offset)
         steps += taken
-        noise = _noise(records, fit)
+        noise = noise_level(records, fit)
         weights = 1.0 / noise
     return _report(records, poles, fit, noise, {"converged": bool(converged), "steps": steps})
+
+
+def bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[float]) -> Refined:
+    """The Cramér-Rao bound of a free decay known without noise: what no unbiased estimate can beat.
+
+    Args:
+        modes: true; shapes s_jr carry amplitude and phase at time 0, as `free_decay` takes them.
+        record: for its sample times and quantities; its values do not count.
+        noise_std: of the white noise of all outputs, or of each (n_outputs,), in their units.
+
+    Returns:
+        `Refined` with the true modes and the standard errors of an efficient estimate.
+    """
+    derivative = time_derivatives(record.output_channels)[:, None]
+    amplitude = modes.shapes * modes.poles**derivative
+    clean = replace(record, outputs=(amplitude @ np.exp(modes.poles[:, None] * record.time)).real)
+    noise = np.broadcast_to(np.asarray(noise_std, float), (record.n_outputs,))
+    return _report([clean], modes.poles, [project(clean, modes.poles, False)], noise, {"converged": True, "steps": 0})
 
 
 def amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: bool = False) -> SampledModes:
@@ -125,14 +143,14 @@ def amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: 
     Returns:
         `SampledModes` with y = d^k/dt^k Re Σ s_r e^{λ_r (t - at)}, k the derivative each sensor measures.
     """
-    fit = _project(record, modes.poles, offset)
+    fit = project(record, modes.poles, offset)
     lag = np.exp(modes.poles * (at - record.start_time))
     derivative = time_derivatives(record.output_channels)
     return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
 
 
 @dataclass(frozen=True, eq=False)
-class _Projection:
+class Projection:
     """A record projected on the columns Φ of given poles."""
 
     residual: np.ndarray  # (n_samples, n_outputs)
@@ -149,7 +167,7 @@ class _Projection:
         return (self.coefficients[:n] - 1j * self.coefficients[n : 2 * n]).T
 
 
-def _project(record: Record, poles: np.ndarray, offset: bool) -> _Projection:
+def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     tau = record.sample_time * np.arange(record.n_samples)
     # Complex powers cost one exponential a sample and mode; both real columns come from it.
     decay = np.exp(np.outer(tau, poles))
@@ -163,10 +181,10 @@ def _project(record: Record, poles: np.ndarray, offset: bool) -> _Projection:
     q_t = q.T @ t_phi
     rest = t_phi - q @ q_t
     inverse = solve_triangular(r, np.eye(r.shape[0]))
-    return _Projection(residual, inverse @ qy, rest.T @ rest, t_phi.T @ residual, inverse @ inverse.T, inverse @ q_t)
+    return Projection(residual, inverse @ qy, rest.T @ rest, t_phi.T @ residual, inverse @ inverse.T, inverse @ q_t)
 
 
-def _directions(fit: _Projection) -> np.ndarray:
+def _directions(fit: Projection) -> np.ndarray:
     """How each pole parameter moves the model within tΦ: (2 n_modes parameters, 2 n_modes, n_outputs).
 
     For σ_r: -(α, β); for ω_dr: (β, -α); on the two columns of mode r only.
@@ -180,7 +198,7 @@ def _directions(fit: _Projection) -> np.ndarray:
     return moves
 
 
-def _normal(fits: Sequence[_Projection], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _normal(fits: Sequence[Projection], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix H and right-hand side, over all records, outputs weighted by 1 / noise."""
     size = fits[0].gram.shape[0]
     n = size // 2
@@ -200,47 +218,59 @@ def _normal(fits: Sequence[_Projection], weights: np.ndarray) -> tuple[np.ndarra
     return h, g
 
 
-def _search(records, poles: np.ndarray, weights: np.ndarray, offset: bool):
+def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_steps: int = MOST_STEPS):
     """Levenberg-Marquardt over (σ, ω_d): poles, projections, whether it settled, steps taken."""
     n = poles.size
-    fits = [_project(record, poles, offset) for record in records]
+    fits = [project(record, poles, offset) for record in records]
     cost = _cost(fits, weights)
     free = sum(r.outputs.size for r in records) - 2 * n - sum(f.coefficients.size for f in fits)
     signal = sum(((r.outputs * weights[:, None]) ** 2).sum() for r in records)
     damping = 1e-3
-    for step in range(1, MOST_STEPS + 1):
+    for step in range(1, most_steps + 1):
         h, g = _normal(fits, weights)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
         while True:
             matrix = h * np.outer(scale, scale) + damping * np.eye(2 * n)
-            move = scale * cho_solve(cho_factor(matrix), scale * g)
+            try:
+                move = scale * cho_solve(cho_factor(matrix), scale * g)
+            except np.linalg.LinAlgError:
+                damping = max(8.0 * damping, 1e-9)
+                continue
             trial = poles - move[:n] + 1j * move[n:]
             gain = float(move @ g)
             small = gain <= SETTLED * cost / free or gain <= ROUND_OFF**2 * signal
-            fits_there = [_project(record, trial, offset) for record in records] if _sane(trial, records) else fits
-            cost_there = _cost(fits_there, weights) if fits_there is not fits else np.inf
+            fits_there = _tried(records, trial, offset)
+            cost_there = np.inf if fits_there is None else _cost(fits_there, weights)
             if cost_there <= cost or small or damping > 1e8:
                 break
             damping *= 8.0
-        if cost_there <= cost:
+        if fits_there is not None and cost_there <= cost:
             poles, fits, cost = trial, fits_there, cost_there
         damping = max(0.1 * damping, 1e-12)
         if small or damping > 1e6:
             return poles, fits, small, step
-    return poles, fits, False, MOST_STEPS
+    return poles, fits, False, most_steps
 
 
-def _sane(poles: np.ndarray, records) -> bool:
-    """Whether every mode still swings, and none grows by more than e^20 over a record."""
+def _tried(records, poles: np.ndarray, offset: bool) -> list[Projection] | None:
+    """Projections; None where a mode no longer swings, passes half the sample rate, grows by more than e^20 over a
+    record, decays faster than e^-1 a sample, or cannot be told from another."""
     longest = max(r.n_samples * r.sample_time for r in records)
-    return bool((poles.imag > 0).all() and (poles.real * longest < 20.0).all())
+    gone = -poles.real * records[0].sample_time > 1.0
+    beyond = (poles.imag <= 0) | (poles.imag * records[0].sample_time >= np.pi)
+    if beyond.any() or (poles.real * longest >= 20.0).any() or gone.any():
+        return None
+    try:
+        return [project(record, poles, offset) for record in records]
+    except np.linalg.LinAlgError:
+        return None
 
 
 def _cost(fits, weights: np.ndarray) -> float:
     return float(sum((weights**2 * (fit.residual**2).sum(axis=0)).sum() for fit in fits))
 
 
-def _noise(records, fits) -> np.ndarray:
+def noise_level(records, fits) -> np.ndarray:
     """Standard deviation of the residual of each output, the degrees of freedom the fit took away made good."""
     n_poles, m = fits[0].gram.shape[0], records[0].n_outputs
     free = sum(r.n_samples - f.coefficients.shape[0] for r, f in zip(records, fits, strict=True)) - n_poles / m
@@ -282,7 +312,7 @@ def _report(records, poles, fits, noise, search: dict) -> Refined:
     )
 
 
-def _shape_covariance(fit: _Projection, poles, derivative, pole_covariance, noise) -> np.ndarray:
+def _shape_covariance(fit: Projection, poles, derivative, pole_covariance, noise) -> np.ndarray:
     """Of Re(s_j / s_k), k the largest entry: (n_modes, n_outputs, n_outputs).
 
     d(s_j/s_k) = (ds_j - ds_k s_j/s_k) / s_k. An amplitude moves with its own noise, of covariance (Φ^T Φ)^-1, and with

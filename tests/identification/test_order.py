@@ -1,0 +1,52 @@
+import numpy as np
+import pytest
+
+from workbench.identification.order import identify
+from workbench.identification.refinement import bound, refine
+from workbench.identification.synthesis import free_decay
+from workbench.records.record import Channel, Record
+from workbench.structure.modes import SampledModes
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Five modes, two of them 2 % apart and one of a hundredth of the largest amplitude, at five sensors."""
+    shapes = np.random.default_rng(3).standard_normal((5, 5)) * [1.0, 0.3, 0.3, 0.01, 0.1]
+    omega = 2 * np.pi * np.array([3.0, 9.0, 9.18, 14.0, 20.0])
+    return SampledModes(omega, [0.01, 0.006, 0.01, 0.005, 0.04], shapes, np.linspace(0, 1, 5))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 0.01])
+def test_the_modes_that_are_there_and_no_others(truth, noise):
+    record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=noise, seed=1)
+    found = identify(record)
+    assert found.modes.n_modes == 5
+    std = bound(truth, record, noise_std=noise or 1e-9).omega_std
+    assert (np.abs(found.modes.omega - truth.omega) < 4 * std).all()
+    assert (found.evidence > found.limit).all()
+
+
+def test_a_mode_beneath_the_noise_is_left_out(truth):
+    record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=0.2, seed=1)
+    assert 3 not in np.abs(identify(record).modes.omega[:, None] / truth.omega - 1).argmin(axis=1)
+
+
+def test_noise_alone_is_refused():
+    channels = tuple(Channel(f"y{i}") for i in range(4))
+    noise = Record(0.01, np.random.default_rng(0).standard_normal((4, 600)), channels)
+    with pytest.raises(ValueError, match="holds no mode that rises above its noise"):
+        identify(noise)
+
+
+def test_bound_is_what_refinement_reports(truth):
+    record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=1e-4, seed=2)
+    known = bound(truth, record, noise_std=1e-4)
+    assert np.allclose(refine(record, truth).omega_std, known.omega_std, rtol=0.1)
+
+
+def test_records_of_unequal_length_together_tell_more(truth):
+    first = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=0.01, seed=3)
+    second = free_decay(truth, sample_time=0.01, n_samples=500, noise_std=0.01, seed=4)
+    alone, both = identify(first), identify([first, second])
+    assert both.modes.n_modes == truth.n_modes
+    assert (both.refined.omega_std < alone.refined.omega_std).all()

@@ -1,0 +1,317 @@
+"""Which modes a record holds, decided by likelihood.
+
+Modes are taken in one at a time. What the modes so far leave of the record, r_j for output j, is compared with every
+decaying swing e^{λt} on a grid of λ:
+
+    χ²(λ) = Σ_j |Q^T r_j|² / s_j²,     Q an orthonormal basis of (I - Φ Φ^+) [Re e^{λt}, Im e^{λt}],
+
+which is chi-square with two degrees of freedom an output where only white noise s_j is left. The strongest swing
+enters, all poles are fitted anew, and it stays if the ratio of the likelihoods with and without it is larger than
+noise makes it in one record of a thousand. What is tried and falls below is named as noise. It ends when the strongest
+swing left is no stronger than the strongest of so many in noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from workbench.identification.ibrahim import check_alike
+from workbench.identification.refinement import MOST_STEPS, Refined, project, refine, search
+from workbench.records.record import Record
+from workbench.structure.modes import SampledModes, frozen, mac
+
+# Chance that a record of nothing but noise yields a mode.
+FALSE_ALARM = 1e-3
+MOST_DAMPED = 0.3
+# Tries that fall below the limit in a row before the record counts as told.
+MOST_REFUSALS = 2
+# A record whose noise is not white may take modes in and put them out for ever.
+MOST_ROUNDS = 4
+# A swing whose part outside the modes there already is smaller than this share cannot be told from them.
+LEAST_APART = 1e-7
+SAME_SHAPE = 0.95
+# Bins on either side from which the colour of the noise is taken.
+BESIDE = 50
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """The modes of a record, and what was taken for noise.
+
+    Attributes:
+        refined: the modes, with covariance.
+        evidence: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
+        limit: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
+        noise_modes: tried and refused, each with an evidence below the limit or no underdamped decay.
+        noise_evidence: (n_noise,) theirs.
+    """
+
+    refined: Refined
+    evidence: np.ndarray
+    limit: float
+    noise_modes: SampledModes = field(repr=False)
+    noise_evidence: np.ndarray = field(repr=False)
+
+    @property
+    def modes(self) -> SampledModes:
+        return self.refined.modes
+
+
+def identify(
+    records: Record | Sequence[Record],
+    *,
+    most_modes: int = 40,
+    false_alarm: float = FALSE_ALARM,
+) -> Identified:
+    """The modes that a free decay holds, as many as there are, each with its standard error.
+
+    Args:
+        records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
+        most_modes: where to stop at the latest.
+        false_alarm: chance that noise alone is taken for a mode.
+
+    Raises:
+        ValueError: no mode rises above the noise; records that differ in sensors or rate; too few samples.
+    """
+    records = [records] if isinstance(records, Record) else list(records)
+    check_alike(records)
+    told = _Told(records, false_alarm)
+    most_modes = min(most_modes, (min(r.n_samples for r in records) - 4) // 3)
+    for _ in range(MOST_ROUNDS):
+        if not (told.grow(most_modes) and told.prune()):
+            break
+    if told.poles.size == 0:
+        raise ValueError(
+            f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
+            " decay, measure longer or strike harder"
+        )
+    return told.report()
+
+
+class _Told:
+    """The search: poles so far, their fits, and what was refused."""
+
+    def __init__(self, records: Sequence[Record], false_alarm: float) -> None:
+        self.records = records
+        longest = max(record.n_samples for record in records)
+        self.grids = [_Grid(record, longest) for record in records]
+        cells = self.grids[0].n_cells
+        signals = 2 * sum(r.n_outputs for r in records)
+        self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
+        # A mode is two amplitudes a signal and its pole, chosen among all cells of the grid.
+        self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
+        self.poles = np.zeros(0, complex)
+        self.refused: list[tuple[complex, float]] = []
+        self.weights, self.fits = self._settled(self.poles)[1:]
+
+    def grow(self, most_modes: int) -> bool:
+        """Take in modes until what is left is noise; whether any came in."""
+        grown, refusals = False, 0
+        while self.poles.size < most_modes and refusals < MOST_REFUSALS:
+            swing, strength = self._strongest_swing()
+            if strength < self.enter * self._colour(swing):
+                break
+            try:
+                found = self._settled(np.append(self.poles, swing), most_steps=12)
+                gain = self._ratio(self.fits, found[2])
+            except np.linalg.LinAlgError:
+                gain = 0.0
+            if gain < self.limit * self._colour(swing):
+                refusals += 1
+                self.refuse(swing, gain)
+                continue
+            (self.poles, self.weights, self.fits), grown, refusals = found, True, 0
+        return grown
+
+    def refuse(self, pole: complex, evidence: float) -> None:
+        self.refused.append((complex(pole), evidence))
+
+    def prune(self) -> bool:
+        """Settle, and put out what is no mode; whether any went."""
+        self.poles, self.weights, self.fits = self._settled(self.poles)
+        pruned = False
+        while self.poles.size:
+            trials = [(self._ratio(found[2], self.fits), r, found) for r, found in self._suspects()]
+            weak = [t for t in trials if t[0] < self.limit * self._colour(self.poles[t[1]]) or self._no_mode(t[1])]
+            if not weak:
+                return pruned
+            gain, r, found = min(weak, key=lambda t: t[0])
+            self.refuse(self.poles[r], gain)
+            self.poles, self.weights, self.fits = found
+            pruned = True
+        return pruned
+
+    def _no_mode(self, r: int) -> bool:
+        """Whether a pole is damped beyond what rings, or splits another mode that has its shape and its band."""
+        pole = self.poles[r]
+        if -pole.real > MOST_DAMPED * abs(pole):
+            return True
+        shapes = self.amplitudes
+        agree = mac(shapes[:, [r]], shapes)[0]
+        size = np.linalg.norm(shapes, axis=0)
+        band = np.abs(self.poles.real) + abs(pole.real) + self.grids[0].bin_width
+        split = (np.abs(self.poles.imag - pole.imag) < band) & (agree > SAME_SHAPE) & (size > size[r])
+        return bool(split.any())
+
+    def report(self) -> Identified:
+        start = _bare(self.poles, self.records[0])
+        refined = refine(self.records, start, offset=True)
+        evidence = self._evidence()[np.argsort(np.abs(self.poles))]
+        refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
+        noise = np.array([pole for pole, _ in refused], complex)
+        noise_modes = _bare(noise, self.records[0])
+        return Identified(
+            refined, frozen(evidence), self.limit, noise_modes, frozen([evidence for _, evidence in refused])
+        )
+
+    def _settled(self, poles: np.ndarray, most_steps: int = MOST_STEPS):
+        """Poles, weights and fits after a search, sensors weighted by the noise found."""
+        weights = getattr(self, "weights", np.ones(self.records[0].n_outputs))
+        if poles.size == 0:
+            fits = [_constant(record) for record in self.records]
+            return poles, 1.0 / _spread(fits), fits
+        poles, fits, *_ = search(self.records, poles, weights, True, most_steps)
+        return poles, 1.0 / _spread([fit.residual for fit in fits]), [fit.residual for fit in fits]
+
+    def _without(self, r: int):
+        return self._settled(np.delete(self.poles, r), most_steps=12)
+
+    def _evidence(self) -> np.ndarray:
+        """χ² of each mode's amplitudes, poles held, (n_modes,)."""
+        fits = [project(record, self.poles, True) for record in self.records]
+        self.amplitudes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
+        n, strength = self.poles.size, np.zeros(self.poles.size)
+        for fit in fits:
+            for r in range(n):
+                both = [r, n + r]
+                a = fit.coefficients[both] * self.weights
+                strength[r] += float(np.sum(a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)))
+        return strength
+
+    def _suspects(self):
+        """Modes whose amplitudes stand out little, that stand close to another or that are no modes; each with what
+        the search finds without it."""
+        for r, strength in enumerate(self._evidence()):
+            near = np.abs(np.delete(self.poles, r) - self.poles[r]).min(initial=np.inf)
+            doubtful = strength < 4.0 * self.limit * self._colour(self.poles[r])
+            if doubtful or near < 2.0 * abs(self.poles[r].real) or self._no_mode(r):
+                yield r, self._without(r)
+
+    def _colour(self, pole: complex) -> float:
+        """Noise about a frequency over its mean, where it is larger: median of the spectrum left over, 1 if white."""
+        left = np.abs(np.fft.rfft(self.fits[0] * self.weights, axis=0)[1:]) ** 2
+        left = left.mean(axis=1)
+        at = round(pole.imag / self.grids[0].bin_width) - 1
+        beside = left[max(at - BESIDE, 0) : at + BESIDE + 1]
+        return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
+
+    def _ratio(self, before, after) -> float:
+        """Twice the log likelihood ratio, each sensor's noise unknown: Σ_j N log(SSR_before / SSR_after)."""
+        n = sum(residual.shape[0] for residual in after)
+        squares = [sum((residual**2).sum(axis=0) for residual in fits) for fits in (before, after)]
+        floor = 1e-26 * sum((r.outputs**2).sum(axis=1) for r in self.records) + 1e-300
+        return float(n * np.log((squares[0] + floor) / (squares[1] + floor)).sum())
+
+    def _strongest_swing(self) -> tuple[complex, float]:
+        """The strongest swing left that was not refused before, and its χ²."""
+        both = zip(self.grids, self.fits, strict=True)
+        strengths = np.sum([grid.strengths(residual, self.weights, self.poles) for grid, residual in both], axis=0)
+        grid = self.grids[0]
+        for pole, _ in self.refused:
+            strengths[:, grid.near(pole, 2.0)] = 0.0
+        best = np.unravel_index(int(np.argmax(strengths)), strengths.shape)
+        return complex(grid.poles[best]), float(strengths[best])
+
+
+class _Grid:
+    """Swings e^{λt} to compare a residual with: rates of decay by frequencies, (n_rates, n_frequencies)."""
+
+    def __init__(self, record: Record, n: int) -> None:
+        self.record, dt = record, record.sample_time
+        self.size = 1 << int(np.ceil(np.log2(2 * n)))
+        omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, dt)
+        span = n * dt
+        self.bin_width = 2.0 * np.pi / span
+        fastest = 0.1 * np.pi / dt
+        rates = np.r_[0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))]
+        inside = (omega > np.pi / span) & (omega < np.pi / dt - np.pi / span)
+        self.columns = np.flatnonzero(inside)
+        self.rates = rates
+        self.poles = -rates[:, None] + 1j * omega[inside]
+        self.allowed = rates[:, None] < MOST_DAMPED * omega[inside]
+        self.n_cells = int(self.allowed.sum())
+
+    def near(self, pole: complex, bins: float) -> np.ndarray:
+        """Frequencies within so many bins, or half as many rates of decay, of a pole's."""
+        return np.abs(self.poles[0].imag - pole.imag) < bins * max(self.bin_width, 0.5 * abs(pole.real))
+
+    def strengths(self, residual: np.ndarray, weights: np.ndarray, poles: np.ndarray) -> np.ndarray:
+        """χ² of each swing, (n_rates, n_frequencies); 0 where it cannot be told from the modes there already."""
+        dt, n = self.record.sample_time, residual.shape[0]
+        weighted = residual * weights
+        found = np.zeros(self.poles.shape)
+        near = self._beside(poles)
+        for k, rate in enumerate(self.rates):
+            decay = np.exp(-rate * dt * np.arange(n))
+            spectrum = np.fft.rfft(weighted * decay[:, None], self.size, axis=0)[self.columns]
+            own = (np.abs(spectrum) ** 2).sum(axis=1)
+            double = (spectrum.conj() ** 2).sum(axis=1)
+            w = np.exp(self.poles[k] * dt)
+            p = np.full(w.shape, np.sum(decay**2))
+            q = _geometric(np.ones(1), w.conj() ** 2, n)[0]
+            whole = p.copy()
+            at = near[k]
+            if at.any():
+                dp, dq = self._shared(np.exp(poles * dt), w[at], n)
+                p[at] -= dp
+                q[at] -= dq
+            det = p**2 - np.abs(q) ** 2
+            good = self.allowed[k] & (det > LEAST_APART * whole**2) & (p > 0)
+            top = 2.0 * p * own - 2.0 * (q * double.conj()).real
+            found[k] = np.where(good, top / np.where(good, det, 1.0), 0.0)
+        return found
+
+    def _beside(self, poles: np.ndarray) -> np.ndarray:
+        """Which swings overlap with a mode there already."""
+        near = np.zeros(self.poles.shape, bool)
+        for pole in poles:
+            near |= np.abs(self.poles.imag - pole.imag) < 3.0 * (
+                2.0 * self.bin_width + abs(pole.real) + self.rates[:, None]
+            )
+        return near
+
+    @staticmethod
+    def _shared(z: np.ndarray, w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """What of the Gram matrix [[p, q], [q*, p]] of (w^t, w*^t) lies in the span of the modes z."""
+        basis = np.r_[z, z.conj()].conj()
+        gram = _geometric(basis, basis.conj(), n)
+        first, second = _geometric(basis, w, n), _geometric(basis, w.conj(), n)
+        solved = np.linalg.solve(gram, np.hstack([first, second]))
+        a, b = np.split(solved, 2, axis=1)
+        return (first.conj() * a).sum(axis=0).real, (first.conj() * b).sum(axis=0)
+
+
+def _geometric(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
+    """Σ_{t<n} (a_i b_k)^t, (a.size, b.size)."""
+    gap = 1.0 - np.outer(a, b)
+    small = np.abs(gap) < 1e-12
+    return np.where(small, n, (1.0 - np.outer(a**n, b**n)) / np.where(small, 1.0, gap))
+
+
+def _constant(record: Record) -> np.ndarray:
+    return (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
+
+
+def _spread(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    n = sum(r.shape[0] for r in residuals)
+    squares = sum((r**2).sum(axis=0) for r in residuals)
+    return np.sqrt(np.maximum(squares / n, 1e-28 * squares.max() + 1e-300))
+
+
+def _bare(poles: np.ndarray, record: Record) -> SampledModes:
+    omega = np.abs(poles)
+    order = np.argsort(omega)
+    shapes = np.ones((record.n_outputs, poles.size))
+    return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)
