@@ -15,6 +15,7 @@ DATA = {"ruler": SHARED / "measured/ruler/ruler.mat", "blind_trials": SHARED / "
 DATA["arm_change"] = SHARED / "measured/arm-change"
 DATA["silverbox"] = SHARED / "measured/silverbox/SNLS80mV.mat"
 LONG = {"blind_trials", "own_trials", "false_alarms", "many_cases", "design_scaling", "placement_front"}
+LONG |= {"identification_order"}
 STUDIES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
     for path in sorted((ROOT / "studies").glob("*.py"))

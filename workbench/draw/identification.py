@@ -154,3 +154,23 @@ def placement_on_shapes(modes: Modes, placements: Mapping, *, n_controlled: int)
     right.set_ylabel("work left in it")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
+
+
+def order_found(rows: Sequence[Mapping]) -> Figure:
+    """Modes counted, missed and falsely reported over the level of each record; rows as `identification_order`."""
+    figure, ax = new_figure(width=8, height=4.2)
+    level = np.array([row["level_db"] for row in rows])
+    kinds = (
+        ([row["found"] for row in rows], "found", "o", COLOURS[0]),
+        ([-(row["count"] - row["found"]) for row in rows], "missed", "x", COLOURS[1]),
+        ([-row["false"] for row in rows], "not there", "+", COLOURS[3]),
+    )
+    for values, label, marker, colour in kinds:
+        shown = np.array(values) != 0
+        ax.plot(level[shown], np.array(values)[shown], marker, color=colour, label=f"{label} ({abs(sum(values))})")
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    ax.set_xlabel("record above its noise [dB]")
+    ax.set_ylabel("modes of a structure\nmistakes below the line")
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
+    return figure
