@@ -81,7 +81,7 @@ def test_every_result_is_what_its_study_wrote():
         value = ROWS[key](json.loads((ROOT / "studies/results" / f"{study}.json").read_text(encoding="utf-8")))
         words, number = re.match(r"(below|at most|at least)? ?([\d.e-]+)", found).groups()
         if words is None:
-            digits = len(number.split(".")[1])
+            digits = len(number.partition(".")[2])
             assert f"{value:.{digits}f}" == number, what
         else:
             limit = float(number)
