@@ -112,7 +112,10 @@ def fit_random_force(
         cost=float((found.fun - noise_part) / n_values),
         chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
         rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
-        follows=max(_followed(f, r.inputs) for f, r in zip(forces, data.counted, strict=True)),
+        follows=max(
+            _followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
+            for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
+        ),
     )
 
 
@@ -130,15 +133,22 @@ def _power(memory: float, stages: int) -> float:
     return float(solve_discrete_lyapunov(a, drive)[0, 0])
 
 
-def _followed(force: np.ndarray, inputs: np.ndarray) -> float:
-    """Share of the force that inputs of the last few samples account for, chance taken off."""
+def _followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:
+    """Share of the force that the inputs and the motion they cause account for, chance taken off.
+
+    The motion (2, n_samples), displacement and velocity at the force, is the model's without the force: that of the
+    real structure has part of the force in it, whatever the force follows.
+    """
     active = [row for row in inputs if np.any(row)]
     if not active:
         return 0.0
-    lags = np.array([np.roll(row, lag) for row in active for lag in (0, 1, 2, 4, 8, 16)]).T[16:]
+    w, v = motion
+    lags = [np.roll(row, lag) for row in active for lag in (0, 1, 2, 4, 8, 16)]
+    followed = np.array([*lags, w, v, w**2, w**3, v * np.abs(v)])[:, 16:]
+    followed = (followed / np.linalg.norm(followed, axis=1, keepdims=True).clip(1e-300)).T
     target = force[16:] - force[16:].mean()
-    fitted = lags @ np.linalg.lstsq(lags, target, rcond=None)[0]
-    return float(max(fitted @ fitted / (target @ target) - 3.0 * lags.shape[1] / target.size, 0.0))
+    fitted = followed @ np.linalg.lstsq(followed, target, rcond=None)[0]
+    return float(max(fitted @ fitted / (target @ target) - 3.0 * followed.shape[1] / target.size, 0.0))
 
 
 def _deviation(loss, point: np.ndarray, j: int, step: float) -> float:
