@@ -82,6 +82,10 @@ def test_response_at_uneven_times_is_the_same_response():
     loop, state = close_loop(modes(), law), impulse_state(modes(), 6.3)
     even, uneven = respond(loop, state, [0.0, 1.0, 2.0, 3.0]), respond(loop, state, [0.0, 0.7, 2.0, 3.0])
     np.testing.assert_allclose(even.modal[:, 2:], uneven.modal[:, 2:], atol=1e-12)
+    many = np.linspace(2.0, 40.0, 317)
+    many, some = respond(loop, state, many), respond(loop, state, many[[0, 3, 90, 316]])
+    np.testing.assert_allclose(many.modal[:, [0, 3, 90, 316]], some.modal, atol=1e-12)
+    assert not many.modal.flags.writeable and state.flags.writeable
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from workbench.structure.modes import Modes, frozen
 UNSEEN = 1e-9
 WELL_CONDITIONED = 1e6
 RESONANT = 1e-6
+EVEN = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +127,10 @@ def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndar
     modal = _cascade(loop, state, time)
     if modal is None:
         modal = _stepped(loop.matrix, state, time)
+    modal.flags.writeable = False  # a response of many modes fills the memory once, not twice
+    motion = modal if modal.shape[0] == 2 * loop.modes.n_modes else modal[: 2 * loop.modes.n_modes]
     fed = np.flatnonzero(loop.feedback.any(axis=0))
-    return Response(time, modal[: 2 * loop.modes.n_modes], loop.feedback[:, fed] @ modal[fed], loop.modes)
+    return Response(time, motion, loop.feedback[:, fed] @ modal[fed], loop.modes)
 
 
 def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -166,22 +169,41 @@ def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarra
     values, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
     if not np.linalg.cond(vectors) < WELL_CONDITIONED:
         return None
-    held = np.linalg.solve(vectors, state[own].astype(complex))
-    swing = np.exp(np.outer(values, time))
+    held = vectors * np.linalg.solve(vectors, state[own].astype(complex))
+    outer, inner = _halves(time)
+    left, right = np.exp(np.outer(outer, values)), np.exp(np.outer(values, inner))
     modal = np.empty((2 * n, time.size))
-    modal[own] = ((vectors * held) @ swing).real
+    for row, amplitudes in zip(own, held):
+        modal[row] = _added_up(amplitudes, left, right)[: time.size]
     if not rest.size:
         return modal
     sigma, damped = 0.5 * c[rest], np.sqrt(modes.omega[rest] ** 2 - 0.25 * c[rest] ** 2)
     pole = -sigma + 1j * damped
-    push = loop.matrix[np.ix_(n + rest, np.asarray(own))] @ (vectors * held)
     apart = values - pole[:, None]
     if np.abs(apart).min() < RESONANT * np.abs(pole).max():
         return None
-    driven = push / apart
+    driven = loop.matrix[np.ix_(n + rest, np.asarray(own))] @ held / apart
     free = state[n + rest] + (sigma + 1j * damped) * state[rest] - driven.sum(axis=1)
-    for few in np.array_split(np.arange(rest.size), max(1, rest.size * time.size // 400_000)):
-        z = driven[few] @ swing + free[few, None] * np.exp(np.outer(pole[few], time))
-        q = z.imag / damped[few, None]
-        modal[rest[few]], modal[n + rest[few]] = q, z.real - sigma[few, None] * q
+    # q = Im z / ω_d and q' = Im(p z) / ω_d
+    z = -1j * np.column_stack([driven, free]) / damped[:, None]
+    for r, p, amplitudes in zip(rest, pole, z):
+        factors = np.column_stack([left, np.exp(p * outer)]), np.vstack([right, np.exp(p * inner)])
+        modal[r] = _added_up(amplitudes, *factors)[: time.size]
+        modal[n + r] = _added_up(p * amplitudes, *factors)[: time.size]
     return modal
+
+
+def _halves(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Instants (n_outer,), (n_inner,) whose sums, row by row, begin with `time`: √n_times of each where it is even."""
+    n = time.size
+    step = (time[-1] - time[0]) / max(n - 1, 1)
+    if np.abs(time - time[0] - step * np.arange(n)).max() > EVEN * time[-1]:
+        return time, np.zeros(1)
+    width = int(np.ceil(np.sqrt(n)))
+    return time[0] + step * width * np.arange(-(-n // width)), step * np.arange(width)
+
+
+def _added_up(amplitudes: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Re Σ_k a_k e^{λ_k (t_a + t_b)} at all instants, from factors (n_outer, n_poles) and (n_poles, n_inner)."""
+    scaled = left * amplitudes
+    return (np.hstack([scaled.real, -scaled.imag]) @ np.vstack([right.real, right.imag])).ravel()

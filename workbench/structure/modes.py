@@ -10,7 +10,9 @@ Shapes = Callable[[np.ndarray, int], np.ndarray]
 
 
 def frozen(array: ArrayLike, dtype=float) -> np.ndarray:
-    """A read-only copy, as the fields of every frozen type hold it."""
+    """A read-only copy, as the fields of every frozen type hold it; the array itself where it is read-only already."""
+    if type(array) is np.ndarray and array.dtype == dtype and array.base is None and not array.flags.writeable:
+        return array
     copy = np.array(array, dtype=dtype)
     copy.flags.writeable = False
     return copy
