@@ -1,0 +1,139 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from workbench.identification.distributions import Basis
+from workbench.identification.refinement import bound
+from workbench.identification.structure_fit import GaussianPrior, choose_structure, fit_structure
+from workbench.identification.synthesis import free_decay, struck
+from workbench.structure.member import Bar, Beam
+
+X = np.linspace(0.02, 1.98, 9)
+SENSORS = np.linspace(0.1, 1.93, 10)
+
+
+def mass(x):
+    return 1.5 + 0.3 * x
+
+
+def stiffness(x):
+    return 3.0 - 0.8 * x + 0.2 * x**2
+
+
+def structure(kind, mass=mass, stiffness=stiffness):
+    where = {"length": 2.0, "mass_per_length": mass, "right": "free"}
+    if kind == "bar":
+        return Bar(axial_stiffness=stiffness, left="fixed", **where)
+    return Beam(bending_stiffness=stiffness, left="free" if kind == "free beam" else "clamped", **where)
+
+
+def measured(kind, noise=1e-3):
+    """Five elastic modes of the true structure, with the covariance that white noise in a record would leave."""
+    rigid = 2 if kind == "free beam" else 0
+    modes = structure(kind).modes(rigid + 5).select(slice(rigid, None))
+    decay = struck(replace(modes, damping=np.full(5, 0.005)), at=1.73, positions=SENSORS)
+    record = free_decay(decay, sample_time=1.0 / modes.omega[-1], n_samples=1500)
+    return bound(decay, record, noise_std=noise * float(np.sqrt((record.outputs**2).mean())))
+
+
+def redrawn(exact, seed):
+    """The same with errors of that covariance in frequencies and shapes."""
+    rng, n = np.random.default_rng(seed), exact.modes.n_modes
+    omega = rng.multivariate_normal(exact.modes.omega, exact.covariance[:n, :n])
+    errors = np.array(
+        [rng.multivariate_normal(np.zeros(SENSORS.size), c, method="eigh") for c in exact.shape_covariance]
+    )
+    return replace(exact, modes=replace(exact.modes, omega=omega, shapes=exact.modes.shapes + errors.T))
+
+
+@pytest.mark.parametrize("kind", ["beam", "free beam", "bar"])
+def test_exact_modes_give_exact_distributions(kind):
+    """From a uniform start, whatever it is."""
+    found = fit_structure(
+        measured(kind),
+        structure(kind, 1.0, 1.0),
+        mass=Basis.polynomial(2),
+        stiffness=Basis.splines(4, length=2.0),
+        known_mass=[(0.5, 1.65), (1.5, 1.95)],
+    )
+    assert np.allclose(found.mass(X), mass(X), rtol=1e-6)
+    assert np.allclose(found.stiffness(X), stiffness(X), rtol=1e-6)
+    assert found.chi2 < 1e-6 and found.explains
+    assert list(found.numbers) == [1, 2, 3, 4, 5]
+    assert found.check.worst < 1e-9 and found.check.mac.min() > 1 - 1e-9
+    assert np.ptp(found.mass.band(X), axis=0).max() < 1e-6  # two points hold a line
+
+
+def test_as_many_terms_as_there_are():
+    noisy = redrawn(measured("beam", 1e-2), seed=4)
+    found = choose_structure(noisy, structure("beam", 1.0, 1.0), known_mass=[(1.0, 1.8)])
+    assert found.n_terms == (2, 3)
+    assert found.explains
+    few = fit_structure(
+        noisy,
+        structure("beam", 1.0, 1.0),
+        mass=Basis.polynomial(1),
+        stiffness=Basis.polynomial(2),
+        known_mass=[(1.0, 1.8)],
+    )
+    assert not few.explains and few.criterion > found.criterion
+
+
+@pytest.mark.parametrize("kind", ["beam", pytest.param("bar", marks=pytest.mark.slow)])
+def test_intervals_hold_the_truth_as_often_as_they_say(kind):
+    """Share of draws whose nominal 95 % band holds the truth at each place, within what chance allows."""
+    exact, draws = measured(kind, 1e-2), 120
+    inside = np.zeros((2, X.size))
+    for seed in range(draws):
+        found = fit_structure(
+            redrawn(exact, seed),
+            structure(kind, 1.0, 1.0),
+            mass=Basis.polynomial(2),
+            stiffness=Basis.polynomial(3),
+            known_mass=[(1.0, 1.8)],
+        )
+        for row, (profile, truth) in enumerate(((found.mass, mass(X)), (found.stiffness, stiffness(X)))):
+            low, high = profile.band(X)
+            inside[row] += (low <= truth) & (truth <= high)
+    least, most = binom.ppf([0.0005, 0.9995], draws, 0.95)
+    assert ((inside >= least) & (inside <= most)).all(), inside / draws
+
+
+def test_a_prior_weighs_what_is_believed_against_what_is_measured():
+    """Far from sure, the prior changes nothing; sure, it is the answer; between, the band narrows."""
+    noisy = redrawn(measured("beam", 1e-2), seed=1)
+    terms = {"mass": Basis.polynomial(0), "stiffness": Basis.splines(8, length=2.0)}
+    nominal = structure("beam", stiffness=2.6)
+    free = fit_structure(noisy, nominal, **terms)
+    loose, fair, sure = (
+        fit_structure(noisy, nominal, stiffness_prior=GaussianPrior(std, 0.5), **terms) for std in (1e3, 0.2, 1e-7)
+    )
+    assert np.allclose(loose.stiffness(X), free.stiffness(X), atol=0.05 * free.stiffness.std(X).max())
+    assert np.allclose(sure.stiffness(X), 2.6, rtol=1e-4)
+    assert (fair.stiffness.std(X) < free.stiffness.std(X)).all()
+    assert np.abs(fair.stiffness(X) - stiffness(X)).max() < np.abs(free.stiffness(X) - stiffness(X)).max()
+
+
+def test_refusals():
+    exact = measured("beam")
+    nominal, one = structure("beam", 1.0, 1.0), Basis.polynomial(1)
+    with pytest.raises(ValueError, match="give known_mass at a point"):
+        fit_structure(exact, nominal, mass=one, stiffness=one)
+    with pytest.raises(ValueError, match="cannot take the 2 known masses"):
+        fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(0.0, 1.5), (2.0, 2.1)])
+    with pytest.raises(ValueError, match="51 terms cannot be found from 50 data"):
+        fit_structure(exact, nominal, mass=one, stiffness=Basis.splines(51, length=2.0), known_mass=[(1.0, 1.8)])
+    with pytest.raises(ValueError, match="known mass -1 at x = 1: it must be positive"):
+        fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(1.0, -1.0)])
+    with pytest.raises(ValueError, match="looks like no mode of the nominal"):
+        scrambled = replace(exact.modes, shapes=exact.modes.shapes[::-1] * np.arange(1, 11)[:, None] ** 2)
+        fit_structure(replace(exact, modes=scrambled), nominal, mass=one, stiffness=one, known_mass=[(1.0, 1.8)])
+    with pytest.raises(ValueError, match="5 different modes"):
+        fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(1.0, 1.8)], numbers=[1, 2, 3])
+    unplaced = replace(exact, modes=replace(exact.modes, positions=np.r_[np.nan, SENSORS[1:]]))
+    with pytest.raises(ValueError, match="sensor 0 has no place"):
+        fit_structure(unplaced, nominal, mass=one, stiffness=one, known_mass=[(1.0, 1.8)])
+    with pytest.raises(ValueError, match="a prior needs a positive standard deviation"):
+        GaussianPrior(0.0, 1.0)

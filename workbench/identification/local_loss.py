@@ -1,0 +1,145 @@
+"""Is stiffness lost over a part of the structure, and where?
+
+Two explanations of the same modes compete: mass and stiffness that vary smoothly, in as many terms as it takes, and
+the same with a share δ of the stiffness lost between two places. Each is fitted to the measured frequencies and shapes
+in units of their standard errors. A loss is reported where it lowers
+
+    χ² + n_terms ln n_data
+
+below that of the smooth explanation by more than noise would lower χ² anywhere along the structure, but for the chance
+of a false alarm. No measurement of the undamaged structure is needed.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2 as chi2_distribution
+from scipy.stats import norm
+
+from workbench.identification.distributions import Basis
+from workbench.identification.refinement import Refined
+from workbench.identification.sensitivity import LocalLoss, SeriesStructure
+from workbench.identification.structure_fit import MOST_TERMS, FittedStructure, Problem, Task, choose
+from workbench.structure.member import Bar, Beam
+
+FALSE_ALARM = 0.01
+N_PLACES = 60
+TYPICAL_WIDTH = 0.1  # of the length, in the first look along the structure
+MOST_STARTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LossFound:
+    """What the modes say of a local loss of stiffness.
+
+    Attributes:
+        smooth: the best explanation without one.
+        lossy: the best with one, believed or not.
+        evidence: what the loss lowers χ² + n_terms ln n_data by.
+        limit: what noise lowers it by with the chance of a false alarm.
+    """
+
+    smooth: FittedStructure
+    lossy: FittedStructure
+    evidence: float
+    limit: float
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a loss."""
+        return bool(self.evidence > self.limit)
+
+    @property
+    def loss(self) -> LocalLoss | None:
+        """Share, centre and width; None where there is none."""
+        return self.lossy.loss if self.found else None
+
+    @property
+    def best(self) -> FittedStructure:
+        """The explanation to take."""
+        return self.lossy if self.found else self.smooth
+
+    def interval(self, level: float = 0.95) -> np.ndarray:
+        """Confidence intervals of share, centre and width, (3, 2)."""
+        std = np.sqrt(np.diag(self.lossy.covariance)[-3:])
+        half = float(norm.ppf(0.5 * (1.0 + level))) * std
+        return self.lossy.parameters[-3:, None] + half[:, None] * np.array([-1.0, 1.0])
+
+
+def find_loss(
+    measured: Refined,
+    nominal: Bar | Beam,
+    *,
+    basis: Callable[[int], Basis] = Basis.polynomial,
+    mass_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    false_alarm: float = FALSE_ALARM,
+    **known: Any,
+) -> LossFound:
+    """Whether and where stiffness is lost over a part of the structure, from its modes alone.
+
+    Args:
+        measured, nominal, basis, mass_terms, stiffness_terms: as `choose_structure`.
+        false_alarm: chance that an undamaged structure is reported.
+        known: `known_mass`, `known_stiffness`, priors and `numbers` of `fit_structure`.
+
+    Raises:
+        ValueError: as `fit_structure`.
+    """
+    task = Task.of(measured, nominal, **known)
+    terms = sorted(mass_terms), sorted(stiffness_terms)
+    lossy = choose(task, basis, *terms, _with_loss, exhaust=False)
+    smooth = choose(task, basis, *terms, lambda problem, near: problem.fit(near), exhaust=not lossy.explains)
+    if not (lossy.explains or smooth.explains):
+        lossy = choose(task, basis, *terms, _with_loss)
+    # three parameters, sought over as many places as stand apart
+    limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
+    evidence = smooth.criterion - lossy.criterion + 3.0 * float(np.log(task.n_data))
+    return LossFound(smooth, lossy, evidence, limit)
+
+
+def _with_loss(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The most likely structure with a loss: near the one found before, or from the likeliest places."""
+    if near is not None:
+        return problem.fit(near, near.loss)
+    smooth = problem.fit()
+    width = TYPICAL_WIDTH * problem.task.nominal.length
+    fits = (problem.fit(smooth, LocalLoss(0.1, place, width)) for place in _likely_places(problem, smooth))
+    return min(fits, key=lambda fit: fit.chi2)
+
+
+def _likely_places(problem: Problem, smooth: FittedStructure) -> list[float]:
+    """Where a loss would lower χ² most, the local peaks of `scan`."""
+    places, gain = scan(problem, smooth)
+    peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True])
+    return [float(places[i]) for i in sorted(peaks, key=lambda i: -gain[i])[:MOST_STARTS]]
+
+
+def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
+    """Places along the structure and what a small loss there would lower χ² by, to first order, (n_places,) each."""
+    task, series = problem.task, problem.series
+    length = task.nominal.length
+    places = (np.arange(N_PLACES) + 0.5) / N_PLACES * length
+    d, e = np.split(smooth.parameters, [smooth.n_terms[0]])
+
+    def with_losses(x: np.ndarray) -> np.ndarray:
+        own = series.stiffness.functions(x)
+        near = np.maximum(1.0 - np.abs(x[:, None] - places) / (0.5 * TYPICAL_WIDTH * length), 0.0)
+        return np.hstack([own, -(1.0 + own @ e)[:, None] * near])
+
+    breaks = tuple(np.linspace(0.0, length, 11))
+    wider = Basis(with_losses, e.size + N_PLACES, (*series.stiffness.breaks, *breaks))
+    particular, free = problem.stiffness_held
+    held = np.r_[particular, np.zeros(N_PLACES)], block_diag(free, np.eye(N_PLACES))
+    trial = replace(
+        problem, series=SeriesStructure(task.nominal, series.mass, wider, series.positions), stiffness_held=held
+    )
+    missed, slopes = trial.misses(np.r_[problem.free_of(d, e), np.zeros(N_PLACES)])
+    # what the smooth series cannot make good
+    own = np.linalg.qr(slopes[:, :-N_PLACES])[0]
+    losses = slopes[:, -N_PLACES:] - own @ (own.T @ slopes[:, -N_PLACES:])
+    along = -losses.T @ missed
+    return places, np.maximum(along, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300)

@@ -1,0 +1,556 @@
+"""The most likely mass and stiffness of a structure, given modes that are known to within their covariance.
+
+Orthogonality (4.6) needs curvatures, and second derivatives of noisy shapes are worth little. So the eigenfunctions
+are taken from the candidate structure itself: the coefficients d, e of
+
+    m = m_0 (1 + Σ d_j M_j),   k = k_0 (1 + Σ e_j K_j)
+
+minimise χ², the squares of what the candidate's own frequencies and shapes miss of the measured ones, each in units of
+its standard error, by Gauss-Newton steps with exact sensitivities. This is the self-check of section 4.3 made the
+criterion. It also tells how many terms there are: the fewest whose modes cannot be told from the measured, by Schwarz's
+criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978), which an unneeded term does not lower.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag, null_space
+from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.stats import chi2 as chi2_distribution
+
+from workbench.identification.distributions import KNOWN_TOLERANCE, Basis
+from workbench.identification.ibrahim import normalised_shapes
+from workbench.identification.refinement import Refined
+from workbench.identification.selfcheck import SelfCheck
+from workbench.identification.sensitivity import LocalLoss, SeriesStructure
+from workbench.structure.member import Bar, Beam
+from workbench.structure.modes import frozen, mac
+from workbench.structure.profile import Profile
+
+# No theory of bars and beams is better than this, however clean the record.
+TRUSTED = 1e-8
+SAME_MODE = 0.6  # least MAC with the mode of the nominal structure that a measured one is taken for
+UNLIKELY = 0.01
+MOST_TERMS = 6
+NARROWEST, WIDEST = 0.02, 0.5  # of the length: a loss narrower is a crack, one wider is no local one
+MOST_LOST = 0.95
+N_DRAWS = 1000
+MOST_STEPS = 25
+
+
+@dataclass(frozen=True)
+class GaussianPrior:
+    """How far a distribution is believed to stray from its nominal one: relative, and over what length it varies.
+
+    Attributes:
+        std: standard deviation of k / k_0 - 1 (or m / m_0 - 1) at any place.
+        correlation: length over which two places stray alike, m: exp(-Δx² / (2 correlation²)).
+    """
+
+    std: float
+    correlation: float
+
+    def __post_init__(self) -> None:
+        if not (self.std > 0 and self.correlation > 0):
+            raise ValueError(
+                f"a prior needs a positive standard deviation and correlation length; got {self.std} and"
+                f" {self.correlation}. What is known exactly is nominal and takes no term"
+            )
+
+    def root(self, basis: Basis, length: float) -> np.ndarray:
+        """R with |R c|² the prior's χ² of coefficients c."""
+        x = (np.arange(200) + 0.5) / 200 * length
+        onto = np.linalg.pinv(basis.functions(x))
+        kernel = self.std**2 * np.exp(-0.5 * ((x[:, None] - x) / self.correlation) ** 2)
+        values, vectors = np.linalg.eigh(onto @ kernel @ onto.T)
+        return (vectors / np.sqrt(np.maximum(values, 1e-8 * values.max()))).T
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainProfile:
+    """A distribution along the structure and how far it is to be trusted.
+
+    Attributes:
+        profile: the most likely one.
+        others: x (n_points,) -> (n_draws, n_points), as likely as the measurement leaves them.
+    """
+
+    profile: Profile
+    others: Callable[[np.ndarray], np.ndarray] = field(repr=False)
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Values at x, in the shape of x."""
+        return self.profile(x)
+
+    def std(self, x: np.ndarray) -> np.ndarray:
+        """Standard error at each x (n_points,)."""
+        return self.others(np.atleast_1d(np.asarray(x, float))).std(axis=0)
+
+    def band(self, x: np.ndarray, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+        """Limits at each x (n_points,), lower and upper, that hold the truth there with this probability."""
+        tail = 0.5 * (1.0 - level)
+        lower, upper = np.quantile(self.others(np.atleast_1d(np.asarray(x, float))), [tail, 1.0 - tail], axis=0)
+        return lower, upper
+
+
+@dataclass(frozen=True, eq=False)
+class FittedStructure:
+    """The structure whose own modes come nearest to the measured, in units of their standard errors.
+
+    Attributes:
+        structure: a `Bar` or `Beam`, with ends and attachments of the nominal one.
+        mass: kg/m, with its band.
+        stiffness: EA in N or EI in N m², with its band.
+        n_terms: of mass, of stiffness.
+        loss: of stiffness over a part of the structure, where one was fitted.
+        chi2: squares of what its modes miss of the measured, in standard errors; those of the prior with them.
+        freedom: data less parameters; `chi2` is about as large where the structure explains its modes.
+        criterion: χ² + n_parameters ln n_data; the least among numbers of terms is the one to take.
+        parameters: d, e and, with a loss, its share, centre and width.
+        covariance: of the parameters, the Cramér-Rao bound at the estimate; larger by χ² / freedom where the structure
+            does not explain its modes.
+        numbers: (n_modes,) of the structure's elastic modes, from 1, that the measured ones are.
+        check: frequencies and shapes of the structure beside the measured.
+    """
+
+    structure: Bar | Beam
+    mass: UncertainProfile
+    stiffness: UncertainProfile
+    n_terms: tuple[int, int]
+    loss: LocalLoss | None
+    chi2: float
+    freedom: int
+    criterion: float
+    parameters: np.ndarray
+    covariance: np.ndarray = field(repr=False)
+    numbers: np.ndarray
+    check: SelfCheck
+
+    @property
+    def explains(self) -> bool:
+        """Whether noise alone would miss the measured modes by as much, in one measurement of a hundred or more."""
+        return bool(self.chi2 <= chi2_distribution.isf(UNLIKELY, self.freedom))
+
+
+def fit_structure(
+    measured: Refined,
+    nominal: Bar | Beam,
+    *,
+    mass: Basis,
+    stiffness: Basis,
+    known_mass: Sequence[tuple[float, float]] = (),
+    known_stiffness: Sequence[tuple[float, float]] = (),
+    mass_prior: GaussianPrior | None = None,
+    stiffness_prior: GaussianPrior | None = None,
+    numbers: Sequence[int] | None = None,
+) -> FittedStructure:
+    """Mass and stiffness as series of given terms, with the covariance that the modes leave them.
+
+    Frequencies and shapes of any scale say nothing of the overall size: either mass or stiffness must be known
+    somewhere, or be nominal (no terms), or have a prior.
+
+    Args:
+        measured: of `refine` or `identify`; sensors must be placed.
+        nominal: ends, attachments, and the first estimates m_0 and k_0; uniform where nothing is known of them.
+        mass, stiffness: functions of the relative changes; `Basis.polynomial(0)` keeps the nominal ones.
+        known_mass, known_stiffness: ((x, value), ...), held exactly.
+        mass_prior, stiffness_prior: how far the nominal ones are to be trusted; not at all without.
+        numbers: of the structure's elastic modes, from 1, that the measured are; told by their shapes unless given.
+
+    Raises:
+        ValueError: overall size unknown, more terms than data, known values the series cannot take, unplaced sensors,
+            a measured mode that looks like none of the nominal structure.
+    """
+    task = Task.of(measured, nominal, known_mass, known_stiffness, mass_prior, stiffness_prior, numbers)
+    return task.problem(mass, stiffness).fit()
+
+
+def choose_structure(
+    measured: Refined,
+    nominal: Bar | Beam,
+    *,
+    basis: Callable[[int], Basis] = Basis.polynomial,
+    mass_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    **known: Any,
+) -> FittedStructure:
+    """Mass and stiffness as series of as many terms as the modes call for, by `FittedStructure.criterion`.
+
+    Args:
+        measured, nominal: as `fit_structure`.
+        basis: number of terms -> `Basis`.
+        mass_terms, stiffness_terms: numbers to choose from.
+        known: `known_mass`, `known_stiffness`, `mass_prior`, `stiffness_prior`, `numbers` of `fit_structure`.
+
+    Raises:
+        ValueError: as `fit_structure`.
+    """
+    task = Task.of(measured, nominal, **known)
+    return choose(task, basis, sorted(mass_terms), sorted(stiffness_terms), lambda problem, near: problem.fit(near))
+
+
+def choose(
+    task: "Task", basis, mass_terms: list[int], stiffness_terms: list[int], fit, *, exhaust: bool = True
+) -> FittedStructure:
+    """The fit of least criterion, from the fewest terms up as long as one or two more of either lower it; of all
+    numbers, with `exhaust`, where that leaves modes unexplained."""
+    tried: dict[tuple[int, int], FittedStructure | None] = {}
+    best: FittedStructure | None = None
+    at, ahead, reason = (0, 0), 3, "no number of terms was given"
+    while True:
+        for i in range(at[0], min(at[0] + ahead, len(mass_terms))):
+            for j in range(at[1], min(at[1] + ahead, len(stiffness_terms))):
+                if (i, j) in tried:
+                    continue
+                try:
+                    tried[i, j] = fit(task.problem(basis(mass_terms[i]), basis(stiffness_terms[j])), best)
+                except ValueError as error:
+                    tried[i, j], reason = None, str(error)
+        good = {pair: found for pair, found in tried.items() if found is not None}
+        if not good:
+            raise ValueError(reason)
+        least = min(good, key=lambda pair: good[pair].criterion)
+        better, best, at = good[least] is not best, good[least], least
+        if better:
+            continue
+        if best.explains or ahead > 3 or not exhaust:
+            return best
+        ahead = len(mass_terms) + len(stiffness_terms)
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What was measured, in units of its standard errors, and what is known beforehand."""
+
+    measured: Refined
+    nominal: Bar | Beam
+    known_mass: np.ndarray  # (n_known, 2)
+    known_stiffness: np.ndarray
+    mass_prior: GaussianPrior | None
+    stiffness_prior: GaussianPrior | None
+    which: np.ndarray  # elastic modes, from 0
+    reference: np.ndarray  # (n_modes,) the sensor where each shape is 1
+    shapes: np.ndarray  # (n_sensors, n_modes) real
+    unit_omega: np.ndarray  # differences of ω to standard errors, (n_modes, n_modes)
+    unit_shapes: tuple[np.ndarray, ...]  # the same for the shape of each mode at all sensors but its reference
+
+    @classmethod
+    def of(
+        cls,
+        measured: Refined,
+        nominal: Bar | Beam,
+        known_mass=(),
+        known_stiffness=(),
+        mass_prior: GaussianPrior | None = None,
+        stiffness_prior: GaussianPrior | None = None,
+        numbers: Sequence[int] | None = None,
+    ) -> "Task":
+        modes = measured.modes
+        if not np.isfinite(modes.positions).all():
+            lost = int(np.argmax(~np.isfinite(modes.positions)))
+            raise ValueError(f"sensor {lost} has no place; give its channel `at`")
+        n, m = modes.n_modes, modes.positions.size
+        if m < 2:
+            raise ValueError("one sensor tells no shape; use two or more")
+        # The entry that a shape is measured by has no error of its own.
+        reference = np.argmin(measured.shape_std, axis=0)
+        shapes = (modes.shapes / modes.shapes[reference, np.arange(n)]).real
+        spread = measured.covariance[:n, :n] + np.diag((TRUSTED * modes.omega) ** 2)
+        units = []
+        for r in range(n):
+            others = np.arange(m) != reference[r]
+            units.append(_unit(measured.shape_covariance[r][np.ix_(others, others)] + TRUSTED**2 * np.eye(m - 1)))
+        known = [np.array(pairs, float).reshape(-1, 2) for pairs in (known_mass, known_stiffness)]
+        for name, pairs in zip(("mass", "stiffness"), known, strict=True):
+            outside = (pairs[:, 0] < 0) | (pairs[:, 0] > nominal.length) | ~(pairs[:, 1] > 0)
+            if outside.any():
+                x, value = pairs[outside][0]
+                raise ValueError(
+                    f"known {name} {value:g} at x = {x:g}: it must be positive and lie within 0 to {nominal.length:g}"
+                )
+        which = _paired(measured, nominal) if numbers is None else np.asarray(numbers, int) - 1
+        if which.shape != (n,) or (which < 0).any() or np.unique(which).size < n:
+            raise ValueError(f"numbers must name {n} different modes from 1 on; got {numbers}")
+        return cls(
+            measured=measured,
+            nominal=nominal,
+            known_mass=known[0],
+            known_stiffness=known[1],
+            mass_prior=mass_prior,
+            stiffness_prior=stiffness_prior,
+            which=which,
+            reference=reference,
+            shapes=shapes,
+            unit_omega=_unit(spread),
+            unit_shapes=tuple(units),
+        )
+
+    def problem(self, mass: Basis, stiffness: Basis) -> "Problem":
+        """The task with so many terms."""
+        if mass.n_terms and stiffness.n_terms and not (len(self.known_mass) or len(self.known_stiffness)):
+            if self.mass_prior is None and self.stiffness_prior is None:
+                raise ValueError(
+                    "modes leave the overall size of mass and stiffness open; give known_mass at a point,"
+                    " known_stiffness, or a prior"
+                )
+        series = SeriesStructure(self.nominal, mass, stiffness, self.measured.modes.positions)
+        known = (
+            (mass, self.known_mass, self.nominal.mass_per_length, "masses"),
+            (stiffness, self.known_stiffness, series.nominal_stiffness, "stiffnesses"),
+        )
+        problem = Problem(self, series, *(_held(*one) for one in known))
+        if problem.n_free > self.n_data:
+            raise ValueError(
+                f"{problem.n_free} terms cannot be found from {self.n_data} data of {self.which.size} modes at"
+                f" {self.shapes.shape[0]} sensors; use fewer terms"
+            )
+        return problem
+
+    @property
+    def n_data(self) -> int:
+        """Frequencies, and shapes but for their scale."""
+        return self.shapes.size
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """χ² of a structure of so many terms, as a function of its free parameters: those the known values leave, and a
+    loss."""
+
+    task: Task
+    series: SeriesStructure
+    mass_held: tuple[np.ndarray, np.ndarray]  # d = particular + free z
+    stiffness_held: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def n_free(self) -> int:
+        """Free parameters without a loss."""
+        return self.mass_held[1].shape[1] + self.stiffness_held[1].shape[1]
+
+    def fit(self, near: FittedStructure | None = None, loss: LocalLoss | None = None) -> FittedStructure:
+        """The most likely structure, searched from one found before, with a loss near `loss` if there is one."""
+        length = self.task.nominal.length
+        z = self._start(near)
+        low, high = np.full(z.size, -np.inf), np.full(z.size, np.inf)
+        if loss is not None:
+            z = np.r_[z, loss.share, loss.centre, loss.width]
+            low = np.r_[low, 0.0, 0.0, NARROWEST * length]
+            high = np.r_[high, MOST_LOST, length, WIDEST * length]
+            z[-3:] = np.clip(z[-3:], *(0.999 * low[-3:] + 0.001 * high[-3:], 0.001 * low[-3:] + 0.999 * high[-3:]))
+        if z.size == 0:
+            return self.report(z)
+        memory: dict[bytes, tuple] = {}
+
+        def at(z: np.ndarray):
+            key = z.tobytes()
+            if key not in memory:
+                memory.clear()
+                memory[key] = self.misses(z)
+            return memory[key]
+
+        tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9, "max_nfev": MOST_STEPS}
+        found = least_squares(
+            lambda z: at(z)[0], z, lambda z: at(z)[1], bounds=(low, high), x_scale="jac", **tolerances
+        )
+        return self.report(found.x)
+
+    def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, LocalLoss | None]:
+        """d, e and the loss of free parameters."""
+        (d0, d_free), (e0, e_free) = self.mass_held, self.stiffness_held
+        n, m = d_free.shape[1], self.n_free
+        loss = LocalLoss(*(float(value) for value in z[m:])) if z.size > m else None
+        return d0 + d_free @ z[:n], e0 + e_free @ z[n:m], loss
+
+    def free_of(self, d: np.ndarray, e: np.ndarray) -> np.ndarray:
+        """The free parameters of coefficients that take the known values."""
+        both = zip((d, e), (self.mass_held, self.stiffness_held), strict=True)
+        return np.concatenate([free.T @ (value - particular) for value, (particular, free) in both])
+
+    def carry(self, z: np.ndarray) -> np.ndarray:
+        """∂(d, e, loss)/∂z."""
+        return block_diag(self.mass_held[1], self.stiffness_held[1], np.eye(z.size - self.n_free))
+
+    def misses(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What frequencies, shapes and prior are missed by, in standard errors, (n_rows,), and how it moves with z."""
+        task = self.task
+        d, e, loss = self.parts(z)
+        solved = self.series.solve(d, e, n_modes=int(task.which.max()) + 1, loss=loss)
+        carry = self.carry(z)
+        priors = [
+            (task.mass_prior, self.series.mass, d, slice(0, d.size)),
+            (task.stiffness_prior, self.series.stiffness, e, slice(d.size, d.size + e.size)),
+        ]
+        n_prior = sum(value.size for prior, _, value, _ in priors if prior is not None)
+        if solved is None:
+            # No structure: so poor that the step is taken back.
+            return np.full(task.n_data + n_prior, 1e8), np.zeros((task.n_data + n_prior, z.size))
+        found = solved.sensitivity(task.which)
+        rows = [task.unit_omega @ (found.omega - task.measured.modes.omega)]
+        slopes = [task.unit_omega @ found.omega_by]
+        for r, (k, unit) in enumerate(zip(task.reference, task.unit_shapes, strict=True)):
+            others = np.arange(task.shapes.shape[0]) != k
+            shape, by = found.shapes[:, r], found.shapes_by[:, r]
+            ratio = shape / shape[k]
+            rows.append(unit @ (ratio - task.shapes[:, r])[others])
+            slopes.append(unit @ ((by - ratio[:, None] * by[k]) / shape[k])[others])
+        for prior, basis, value, own in priors:
+            if prior is not None and value.size:
+                root = prior.root(basis, task.nominal.length)
+                rows.append(root @ value)
+                slope = np.zeros((value.size, carry.shape[0]))
+                slope[:, own] = root
+                slopes.append(slope)
+        return np.concatenate(rows), np.vstack(slopes) @ carry
+
+    def report(self, z: np.ndarray) -> FittedStructure:
+        """The structure of free parameters z, with what the data leave open about it."""
+        task, series = self.task, self.series
+        rows, slopes = self.misses(z)
+        chi2 = float(rows @ rows)
+        freedom = rows.size - z.size
+        d, e, loss = self.parts(z)
+        parameters = np.r_[d, e, z[self.n_free :]]
+        carry = self.carry(z)
+        covariance = carry @ _inverse(slopes.T @ slopes) @ carry.T
+        if freedom > 0 and chi2 > chi2_distribution.isf(UNLIKELY, freedom):
+            covariance = covariance * chi2 / freedom
+        draws = np.random.default_rng(0).multivariate_normal(parameters, covariance, N_DRAWS, method="eigh")
+        n, m = d.size, d.size + e.size
+        mass = _uncertain(task.nominal.mass_per_length, series.mass, d, draws[:, :n])
+        stiffness = _uncertain(
+            series.nominal_stiffness, series.stiffness, e, draws[:, n:m], loss, draws[:, m:], task.nominal.length
+        )
+        name = "bending_stiffness" if isinstance(task.nominal, Beam) else "axial_stiffness"
+        changes: dict[str, Any] = {"mass_per_length": mass.profile, name: stiffness.profile}
+        solved = series.solve(d, e, n_modes=int(task.which.max()) + 1, loss=loss)
+        if solved is None:
+            raise ValueError(
+                "no positive mass and stiffness of this many terms were found; use fewer terms, a prior, or a nominal"
+                " structure nearer to the real one"
+            )
+        found = solved.sensitivity(task.which)
+        agreement = np.diag(mac(found.shapes, task.shapes))
+        try:
+            structure = replace(task.nominal, **changes)
+        except ValueError as error:
+            raise ValueError(
+                f"{error}; use fewer terms, a prior, or a nominal structure nearer to the real one"
+            ) from None
+        return FittedStructure(
+            structure=structure,
+            mass=mass,
+            stiffness=stiffness,
+            n_terms=(n, e.size),
+            loss=loss,
+            chi2=chi2,
+            freedom=freedom,
+            criterion=chi2 + z.size * float(np.log(task.n_data)),
+            parameters=frozen(parameters),
+            covariance=frozen(covariance),
+            numbers=task.which + 1,
+            check=SelfCheck(found.omega / task.measured.modes.omega - 1.0, agreement),
+        )
+
+    def _start(self, near: FittedStructure | None) -> np.ndarray:
+        """Free parameters of the structure found before, or of the nominal one at the measured frequencies."""
+        task, series = self.task, self.series
+        x = (np.arange(100) + 0.5) / 100 * task.nominal.length
+        if near is not None:
+            stiffness = near.stiffness(x) / (
+                1.0 if near.loss is None else near.loss.of(Profile.constant(1.0), task.nominal.length)(x)
+            )
+            return self._nearest(
+                x, near.mass(x) / task.nominal.mass_per_length(x), stiffness / series.nominal_stiffness(x)
+            )
+        size = np.ones(2)
+        for i, (pairs, nominal) in enumerate(
+            ((task.known_mass, task.nominal.mass_per_length), (task.known_stiffness, series.nominal_stiffness))
+        ):
+            if len(pairs):
+                size[i] = np.mean(pairs[:, 1] / nominal(pairs[:, 0]))
+        z = self._nearest(x, np.full(x.size, size[0]), np.full(x.size, size[1]))
+        d, e, _ = self.parts(z)
+        solved = series.solve(d, e, n_modes=int(task.which.max()) + 1)
+        if solved is None:
+            return z
+        ratio = np.median(task.measured.modes.omega**2 / solved.eigenvalues[solved.n_rigid + task.which])
+        if self.stiffness_held[1].shape[1] and not len(task.known_stiffness):
+            return self._nearest(x, np.full(x.size, size[0]), np.full(x.size, size[1] * ratio))
+        return self._nearest(x, np.full(x.size, size[0] / ratio), np.full(x.size, size[1]))
+
+    def _nearest(self, x: np.ndarray, mass: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """Free parameters of the series nearest to these multiples of the nominal mass and stiffness at x."""
+        z = []
+        for basis, ratio, (particular, free) in (
+            (self.series.mass, mass, self.mass_held),
+            (self.series.stiffness, stiffness, self.stiffness_held),
+        ):
+            terms = basis.functions(x)
+            z.append(np.linalg.lstsq(terms @ free, ratio - 1.0 - terms @ particular, rcond=None)[0])
+        return np.concatenate(z)
+
+
+def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
+    """Which elastic mode of the nominal structure each measured one is, from 0, by their shapes."""
+    modes = measured.modes
+    nothing = Basis.polynomial(0)
+    n = modes.n_modes + 4
+    solved = SeriesStructure(nominal, nothing, nothing, modes.positions).solve(np.zeros(0), np.zeros(0), n_modes=n)
+    assert solved is not None, "a nominal structure has positive mass and stiffness"
+    shapes = solved.at_sensors[:, solved.n_rigid : solved.n_rigid + n]
+    agreement = mac(normalised_shapes(modes.shapes).real, shapes)
+    which = linear_sum_assignment(-agreement)[1]
+    least = int(np.argmin(agreement[np.arange(modes.n_modes), which]))
+    if agreement[least, which[least]] < SAME_MODE:
+        raise ValueError(
+            f"measured mode {least + 1} at {modes.frequencies_hz[least]:.4g} Hz looks like no mode of the nominal"
+            f" structure (best MAC {agreement[least].max():.2f}); leave it out, mend the nominal ends, or give numbers"
+        )
+    return which
+
+
+def _held(basis: Basis, known: np.ndarray, nominal: Profile, what: str) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients that take the known values, and the directions that keep them."""
+    if basis.n_terms == 0 or len(known) == 0:
+        return np.zeros(basis.n_terms), np.eye(basis.n_terms)
+    rows, wanted = basis.functions(known[:, 0]), known[:, 1] / nominal(known[:, 0]) - 1.0
+    particular = np.linalg.lstsq(rows, wanted, rcond=None)[0]
+    left = np.abs(rows @ particular - wanted).max()
+    if left > KNOWN_TOLERANCE * max(np.abs(wanted).max(), 1.0):
+        raise ValueError(
+            f"the series with {basis.n_terms} terms cannot take the {len(known)} known {what} (off by {left:.3g} of the"
+            " nominal); use more terms or fewer known places"
+        )
+    return particular, null_space(rows)
+
+
+def _uncertain(nominal, basis, coefficients, draws, loss=None, loss_draws=None, length=0.0) -> UncertainProfile:
+    """nominal (1 + series) (1 - loss), and as many others as there are draws."""
+
+    def values(x, coefficients, losses):
+        series = nominal(x) * (1.0 + coefficients @ basis.functions(x).T)
+        if losses is None:
+            return series
+        share, centre, width = losses[:, :, None].transpose(1, 0, 2)
+        within = np.abs(x - centre) < 0.5 * np.maximum(width, 0.0)
+        return np.where(within, 1.0 - share, 1.0) * series
+
+    smooth = Profile(
+        lambda x: values(np.ravel(x), coefficients, None).reshape(np.shape(x)),
+        tuple(sorted({*nominal.breaks, *basis.breaks})),
+    )
+    profile = smooth if loss is None else loss.of(smooth, length)
+    return UncertainProfile(profile, lambda x: values(x, draws, None if loss is None else loss_draws))
+
+
+def _unit(covariance: np.ndarray) -> np.ndarray:
+    """W with W^T W the inverse of a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T
+
+
+def _inverse(normal: np.ndarray) -> np.ndarray:
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * np.outer(scale, scale)
