@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from workbench.gap.decide import decide, decide_on_pairs, figures, pairs_of, unexplained, with_nominal
+from workbench.gap.decide import decide, decide_on_pairs, decide_on_random, figures, pairs_of, unexplained, with_nominal
 from workbench.gap.disturbance import RandomForceFit
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -111,7 +111,7 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
         start = fit(search.rig, (figures(search),), search.data, iterations=15)
         evidence = Evidence.of(apply_all(search.rig, start.effects), data)
     singles = one_more(search, start.effects if free_nominal else (), evidence, 0.05, 0.45, finalists=8)
-    found = decide(search, start, singles)
+    found = decide(search, start, singles) or decide_on_random(search, start, singles[0])
     if found is None and free_nominal:
         best, rivals = ranked(search, search.side_by_side(finished, singles[:3]))
         found = unexplained(start, best, rivals)

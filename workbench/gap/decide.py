@@ -1,10 +1,12 @@
 """What the search may claim: no gap, effects that explain it, or that none does."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from workbench.gap.disturbance import RandomForceFit, fit_random_force
+from workbench.gap.disturbance import RandomForceFit, fit_random_force, model_filter
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
@@ -12,6 +14,7 @@ from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, ranked, relocated, simplest
 from workbench.gap.fit import Fit, fit
 from workbench.gap.search import Search, one_more, spread_over_kinds
+from workbench.rig.rig import Rig
 
 NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
 
@@ -40,15 +43,54 @@ def decide(search: Search, start: Fit, singles: list[Fit]) -> Decision | None:
         return Decision("explained", best, rivals=rivals)
     if search.explains(start):
         return Decision("none", start)
-    random = with_random(search, start)
-    if random is not None and random[1].holds:
-        return Decision("explained", *random)
     return None
 
 
-def with_random(search: Search, given: Fit) -> tuple[Fit, RandomForceFit] | None:
-    """The given effects and a random disturbance."""
-    rig = apply_all(search.rig, [e for e in given.effects if e.kind.name != "sensor_quantisation"])
+def decide_on_random(search: Search, start: Fit, nearest: Fit) -> Decision | None:
+    """A random disturbance, alone or beside one effect; None where no such force holds in every record.
+
+    It is looked for beside one effect only where it says far more than the nearest effect alone.
+    """
+    alone = with_random(search, start)
+    if alone[1].holds:
+        return Decision("explained", *alone)
+    if not search.near(alone[0], NEAR) or search.near(nearest, NEAR):
+        return None
+    rig = _rig_with(search, start)
+    evidence = Evidence.of(rig, search.data, 20)
+    beside = search.through(model_filter(evidence.model, rig, alone[1]))
+    singles = spread_over_kinds(one_more(beside, start.effects, evidence, 0.45, 0.5, finalists=4), 1)
+    return best_with_random(search, singles[:3])
+
+
+def best_with_random(search: Search, candidates: Sequence[Fit]) -> Decision | None:
+    """The likeliest of the candidates beside a random disturbance that holds."""
+    tried = [with_random(search, candidate) for candidate in candidates]
+    holding = sorted((found for found in tried if found[1].holds), key=lambda found: found[0].cost)
+    if not holding:
+        return None
+    best, rivals = ranked(search, [found[0] for found in holding])
+    return Decision("explained", best, next(random for found, random in holding if found is best), rivals)
+
+
+def with_random(search: Search, given: Fit) -> tuple[Fit, RandomForceFit]:
+    """The given effects and a random disturbance, each fitted beside the other."""
+    found = _random_beside(search, given)
+    if given.effects and not found[1].holds and search.near(found[0], NEAR):
+        rig = _rig_with(search, given)
+        data = search.data.through(model_filter(Evidence.of(rig, search.data).model, rig, found[1]))
+        refitted = fit(search.rig, given.effects, data, iterations=8)
+        left = search.data.by_channel(search.data.residual(apply_all(search.rig, refitted.effects)))
+        found = _random_beside(search, replace(refitted, cost_by_channel=left))
+    return found
+
+
+def _rig_with(search: Search, given: Fit) -> Rig:
+    return apply_all(search.rig, [e for e in given.effects if e.kind.name != "sensor_quantisation"])
+
+
+def _random_beside(search: Search, given: Fit) -> tuple[Fit, RandomForceFit]:
+    rig = _rig_with(search, given)
     evidence = Evidence.of(rig, search.data, 20)
     found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.force_rms)
     effect = Effect(
@@ -139,9 +181,8 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit], pairs: list[
     if explaining:
         best, rivals = ranked(search, [simplest(search, f) for f in explaining])
         return Decision("explained", best, rivals=rivals)
-    for first in singles[:3]:
-        random = with_random(search, first)
-        if random is not None and random[1].holds:
-            return Decision("explained", *random)
+    beside = best_with_random(search, singles[:3])
+    if beside is not None:
+        return beside
     best, rivals = ranked(search, ended or singles[:1])
     return unexplained(start, best, rivals)

@@ -97,6 +97,9 @@ class _Problem:
             if parameter.to_free(parameter.high) < moved[j]:
                 moved[j] = free[j] - step
             beside = self.residual(moved)
+            if beside is None:
+                moved[j] = 2.0 * free[j] - moved[j]
+                beside = self.residual(moved)
             columns.append(np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j]))
         return np.array(columns).T
 

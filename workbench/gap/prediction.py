@@ -1,12 +1,13 @@
 """The fit records as a yardstick: how far a rig's prediction stands from them, in units of the noise."""
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
 
 import numpy as np
 
+from workbench.gap.missing_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, move, read
@@ -24,12 +25,15 @@ class FitData:
         substeps: of a sample, for rigs that are not linear.
         lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
             rest that the simulation assumes to the motion it really had.
+        whitener: filter of a random force on the structure, through which every residual is seen; None where there is
+            none.
     """
 
     records: tuple[Record, ...]
     noise: np.ndarray
     substeps: int = 4
     lead: int = 0
+    whitener: ForceFilter | None = None
     _memory: OrderedDict = field(default_factory=OrderedDict, repr=False, init=False)
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 
@@ -40,11 +44,15 @@ class FitData:
 
     def only(self, names: tuple[str, ...]) -> "FitData":
         """The same yardstick on some of the records."""
-        return FitData(tuple(r for r in self.records if r.name in names), self.noise, self.substeps, self.lead)
+        return replace(self, records=tuple(r for r in self.records if r.name in names))
 
     def stepped(self, substeps: int) -> "FitData":
         """The same yardstick with other substeps."""
-        return FitData(self.records, self.noise, substeps, self.lead)
+        return replace(self, substeps=substeps)
+
+    def through(self, whitener: ForceFilter) -> "FitData":
+        """The same yardstick beside a random force."""
+        return replace(self, whitener=whitener)
 
     @cached_property
     def counted(self) -> tuple[Record, ...]:
@@ -78,12 +86,12 @@ class FitData:
         )
 
     def residual(self, rig: Rig) -> np.ndarray:
-        """(measured - predicted) / noise, all records joined: (n_values,)."""
-        scaled = [
-            ((record.outputs - prediction) / self.noise[:, None]).ravel()
-            for record, prediction in zip(self.counted, self.predictions(rig), strict=True)
-        ]
-        return np.concatenate(scaled)
+        """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
+        both = zip(self.counted, self.predictions(rig), strict=True)
+        left = [record.outputs - prediction for record, prediction in both]
+        if self.whitener is not None:
+            return np.concatenate([whiten(self.whitener, r).ravel() for r in left])
+        return np.concatenate([(r / self.noise[:, None]).ravel() for r in left])
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""

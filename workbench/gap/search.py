@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import HOPELESS, Fit, cost_of, fit
+from workbench.gap.missing_force import ForceFilter
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
 
@@ -18,6 +19,8 @@ INTEGRATION_SHARE = 2e-6
 SURE = 30.0
 WORTHWHILE = 0.01  # of the noise power: less is within what two good finite-element models differ by
 TARGETS_A_KIND, JOINED = 2, 10
+ELSEWHERE = 0.1  # of the length
+CLOSE = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +67,11 @@ class Search:
     def near(self, candidate: Fit, share: float) -> bool:
         """Whether at most this share of the gap's power is left."""
         return candidate.cost - 1.0 < share * (self.nominal.mean() - 1.0)
+
+    def through(self, whitener: ForceFilter) -> "Search":
+        """The same search beside a random force."""
+        quick, first = self.quick.through(whitener), self.first.through(whitener)
+        return replace(self, data=self.data.through(whitener), quick=quick, first=first)
 
     def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
         """`function(search, candidate)` of each, in their order."""
@@ -139,12 +147,18 @@ def _repeats(kind: Kind, target, given: Sequence[Effect]) -> bool:
 
 
 def _started(search: Search, rig: Rig, evidence: Evidence, kind: Kind, target) -> list[tuple[float, Effect]]:
-    """The two best starts of a kind on the most telling record, coarsely stepped, with their costs."""
+    """The best start of a kind on the most telling record, coarsely stepped, and the best elsewhere, with costs."""
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
     costs = [cost_of(rig, (effect,), search.first) for effect in starts]
     order = [i for i in np.argsort(costs) if costs[i] < HOPELESS]
     # a lone start is of an effect that is linear in its number: its cost says nothing yet
-    return [(-1.0 if len(starts) == 1 else costs[i], starts[i]) for i in order[:2]]
+    chosen = order[:1] + [i for i in order[1:] if _elsewhere(starts[i], starts[order[0]], rig.modes.length)][:1]
+    return [(-1.0 if len(starts) == 1 else costs[i], starts[i]) for i in chosen]
+
+
+def _elsewhere(one: Effect, other: Effect, length: float) -> bool:
+    """Whether two starts stand far enough apart to end in different valleys; those of no place always do."""
+    return "at" not in one.values or abs(one.values["at"] - other.values["at"]) > ELSEWHERE * length
 
 
 def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[list[tuple[float, Effect]]]:
@@ -160,9 +174,10 @@ def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[lis
 
 
 def _alone(search: Search, rig: Rig, started: list[tuple[float, Effect]]) -> list[tuple[float, Effect]]:
-    """The best start, improved a little with the effects found before held fixed."""
-    candidate = fit(rig, (started[0][1],), search.quick, iterations=3)
-    return [(candidate.cost, candidate.effects[0])]
+    """The starts improved a little with the effects found before held fixed: the best, and a rival near it."""
+    fits = [fit(rig, (effect,), search.quick, iterations=3) for _, effect in started]
+    fits.sort(key=lambda f: f.cost)
+    return [(f.cost, f.effects[0]) for f in fits if f.cost < CLOSE * fits[0].cost]
 
 
 def _quick_fit(search: Search, given: tuple[Effect, ...], started: list[tuple[float, Effect]]) -> Fit:

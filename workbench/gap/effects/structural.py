@@ -15,6 +15,7 @@ from workbench.structure.modification import attach
 from workbench.structure.supports import HELD, End, PointDamper, PointMass, PointSpring
 
 RESOLUTION = 1e-6
+EDGE = 1e-9  # of the length
 
 
 def place_parameter(rig: Rig) -> Parameter:
@@ -184,9 +185,11 @@ POINT_DAMPER = Kind(
 def _softened(rig: Rig, _, values) -> Rig:
     member = _member(rig)
     name, length = stiffness_name(member), member.length
-    start = max(values["at"] - 0.5 * values["width"], 0.0)
-    stop = min(values["at"] + 0.5 * values["width"], length)
-    profile = getattr(member, name).scaled(1.0 - values["loss"], start, stop)
+    start, stop = values["at"] - 0.5 * values["width"], values["at"] + 0.5 * values["width"]
+    if start < -EDGE * length or stop > (1.0 + EDGE) * length:
+        # what lies beyond the end changes nothing: place and width could not be told apart
+        raise ValueError(f"the stretch from {start:.4g} to {stop:.4g} reaches beyond the structure")
+    profile = getattr(member, name).scaled(1.0 - values["loss"], max(start, 0.0), min(stop, length))
     return resolved(rig, replace(member, **{name: profile}))
 
 
@@ -202,8 +205,8 @@ def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
 def _loss_starts(evidence, _):
     length = evidence.length
     for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
-        for loss in (0.03, 0.15, 0.45):
-            yield {"at": x * length, "width": 0.1 * length, "loss": loss}
+        for loss in (0.003, 0.01, 0.03, 0.12, 0.45):
+            yield {"at": x * length, "width": min(0.1, 1.5 * x, 1.5 - 1.5 * x) * length, "loss": loss}
 
 
 LOCAL_STIFFNESS_LOSS = Kind(
