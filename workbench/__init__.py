@@ -40,6 +40,7 @@ _HOMES = {
     "identification.refinement": ("Refined", "amplitudes", "bound", "refine"),
     "identification.order": ("Identified", "identify"),
     "identification.eigenfunctions": ("KnownEnds", "eigenfunctions"),
+    "identification.bands": ("Bands", "eigenfunction_bands"),
     "identification.distributions": ("Basis", "Distributions", "mass_and_stiffness"),
     "identification.selfcheck": ("choose_terms", "self_check"),
     "identification.synthesis": ("free_decay", "struck"),

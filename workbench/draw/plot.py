@@ -11,11 +11,13 @@ from workbench.design.how_many import HowMany
 from workbench.design.modal_filter import ModalFilter
 from workbench.design.placement import Placement
 from workbench.design.spillover import Spillover
+from workbench.draw.accuracy import plot_bands
 from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.verdict import Verdict
+from workbench.identification.bands import Bands
 from workbench.identification.refinement import Refined
 from workbench.records.record import Record
 from workbench.structure.modes import Modes, SampledModes
@@ -25,8 +27,8 @@ MOST_PANELS = 12
 
 @singledispatch
 def plot(result) -> Figure:
-    """A figure of a result: `Record`, `Modes`, `SampledModes`, `Refined`, `Response`, `Spillover`, `Explanation`,
-    `HowMany`, `Placement`, `ModalFilter` or `Verdict`.
+    """A figure of a result: `Record`, `Modes`, `SampledModes`, `Refined`, `Bands`, `Response`, `Spillover`,
+    `Explanation`, `HowMany`, `Placement`, `ModalFilter` or `Verdict`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -87,6 +89,11 @@ def _(result: Refined) -> Figure:
         ax.set_title(f"standard error of the {title}, relative")
     axes[1].set(xlabel="mode", xticks=modes)
     return figure
+
+
+@plot.register
+def _(result: Bands) -> Figure:
+    return plot_bands(result)
 
 
 @plot.register

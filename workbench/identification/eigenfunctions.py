@@ -153,7 +153,7 @@ def eigenfunctions(
     """
     if mass_per_length is not None and driven_at is not None:
         raise ValueError("modes are scaled by the mass distribution or by a driving point, not by both; give one")
-    splines = _Splines.through(sampled, length=length, ends=ends, degree=degree)
+    splines = Splines.through(sampled, length=length, ends=ends, degree=degree)
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
         density = as_profile(1.0 / length if mass_per_length is None else mass_per_length)
@@ -199,13 +199,13 @@ def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = Know
 
 
 @dataclass(frozen=True, eq=False)
-class _Splines:
+class Splines:
     """One spline a mode, grouped by degree: [(spline, modes), ...]."""
 
     groups: tuple[tuple[Spline, np.ndarray], ...]
 
     @classmethod
-    def through(cls, sampled: SampledModes, *, length: float, ends: KnownEnds, degree: int | None) -> "_Splines":
+    def through(cls, sampled: SampledModes, *, length: float, ends: KnownEnds, degree: int | None) -> "Splines":
         where: dict[str, Any] = {"length": length, "ends": ends}
         degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
         return cls(
@@ -275,7 +275,7 @@ def _knots(sites: np.ndarray, derivatives: list, length: float, degree: int) -> 
     return np.r_[[0.0] * (degree + 1), inner[left : left + wanted], [length] * (degree + 1)]
 
 
-def _scaled_by_blow(sampled: SampledModes, splines: _Splines, x0: float) -> np.ndarray:
+def _scaled_by_blow(sampled: SampledModes, splines: Splines, x0: float) -> np.ndarray:
     omega_d = np.abs(sampled.poles.imag)
     products = (1j * sampled.shapes * omega_d).real
     at_blow = splines(products, np.array([x0]))[0]

@@ -1,0 +1,115 @@
+"""Confidence bands of eigenfunctions: the sensors' covariance carried along the structure by the spline.
+
+With values v at the sensors, a spline W(x) v and the scale q = v^T M v, M = ∫ m W^T W dx, the eigenfunction is
+φ(x) = W(x) v / √q, and an error dv of the values moves it by
+
+    dφ(x) = J(x) dv,     J(x) = W(x) / √q - φ(x) (M v)^T / q
+
+so that its covariance along the structure is J C J^T. A band that holds the whole curve, not each point by itself, is
+wider: its width is the quantile of the largest |dφ(x)| / std(x) along the structure, drawn from that covariance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri
+
+from workbench.identification.eigenfunctions import KnownEnds, Splines, quadrature
+from workbench.identification.ibrahim import normalised_shapes
+from workbench.identification.refinement import Refined
+from workbench.structure.modes import frozen
+from workbench.structure.profile import ProfileLike, as_profile
+
+DRAWS = 4000
+# Of the largest standard error; below it an end holds the curve and there is nothing to be unsure of.
+HELD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Bands:
+    """Eigenfunctions along a structure, with what the noise leaves uncertain of them.
+
+    Attributes:
+        x: (n_points,) places, m.
+        phi: (n_points, n_modes) eigenfunctions, scaled as `eigenfunctions` does.
+        std: (n_points, n_modes) standard error at each place.
+        width: (n_modes,) standard errors either side that hold the whole curve with probability `level`.
+        level: of both bands.
+    """
+
+    x: np.ndarray
+    phi: np.ndarray
+    std: np.ndarray
+    width: np.ndarray
+    level: float
+
+    @property
+    def whole(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper edge of the band that holds each whole curve, (n_points, n_modes) each."""
+        return self.phi - self.width * self.std, self.phi + self.width * self.std
+
+    @property
+    def pointwise(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper edge of the interval at each place by itself, (n_points, n_modes) each."""
+        width = float(ndtri(0.5 * (1.0 + self.level)))
+        return self.phi - width * self.std, self.phi + width * self.std
+
+
+def eigenfunction_bands(
+    refined: Refined,
+    x: Sequence[float] | np.ndarray,
+    *,
+    length: float,
+    mass_per_length: ProfileLike | None = None,
+    ends: KnownEnds | None = None,
+    degree: int | None = None,
+    level: float = 0.95,
+    seed: int | np.random.Generator = 0,
+) -> Bands:
+    """Confidence bands of the eigenfunctions that `eigenfunctions` draws through refined shapes.
+
+    They hold what noise does to real shapes. What a spline misses between the sensors is not in them: see that it is
+    less, by a spline of another degree or more sensors.
+
+    Args:
+        refined: from `refine` or `identify(...).refined`, at placed sensors.
+        x: (n_points,) m.
+        length, mass_per_length, ends, degree: as `eigenfunctions` takes them.
+        level: between 0 and 1.
+        seed: of the draws that set the width of the band of the whole curve.
+
+    Raises:
+        ValueError: a level outside 0..1, places outside the structure; as `eigenfunctions`.
+    """
+    x = np.atleast_1d(np.asarray(x, float))
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
+    slack = 1e-9 * length
+    if not ((x >= -slack) & (x <= length + slack)).all():
+        outside = x[~((x >= -slack) & (x <= length + slack))][0]
+        raise ValueError(f"x = {outside:g} lies outside the structure, 0 to {length:g}")
+    modes, rng = refined.modes, np.random.default_rng(seed)
+    splines = Splines.through(modes, length=length, ends=ends or KnownEnds(), degree=degree)
+    density = as_profile(1.0 / length if mass_per_length is None else mass_per_length)
+    values = normalised_shapes(modes.shapes).real
+    phi, std = np.zeros((x.size, modes.n_modes)), np.zeros((x.size, modes.n_modes))
+    width = np.zeros(modes.n_modes)
+    for spline, those in splines.groups:
+        breaks = [b for b in density.breaks if 0 < b < length]
+        points, weights = quadrature(np.concatenate([spline.knots, breaks]), spline.degree)
+        inner, along = spline.matrix(points), spline.matrix(x)
+        mass = inner.T @ ((weights * density(points))[:, None] * inner)
+        for r in those:
+            v = values[:, r]
+            q = v @ mass @ v
+            phi[:, r] = along @ v / np.sqrt(q)
+            jacobian = along / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
+            strengths, directions = np.linalg.eigh(refined.shape_covariance[r])
+            root = jacobian @ (directions * np.sqrt(np.maximum(strengths, 0.0)))
+            std[:, r] = np.sqrt((root**2).sum(axis=1))
+            unsure = std[:, r] > HELD * std[:, r].max()
+            if unsure.any():
+                drawn = (root[unsure] / std[unsure, r, None]) @ rng.standard_normal((root.shape[1], DRAWS))
+                width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
+    return Bands(frozen(x), frozen(phi), frozen(std), frozen(width), level)
