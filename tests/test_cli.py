@@ -98,6 +98,17 @@ def test_place_does_better_than_even_places(rig, tmp_path):
     assert best["effort"] <= 1.5 * even["effort"] * (1 + 1e-6)
 
 
+def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
+    found = tmp_path / "places.json"
+    limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--proof", 0.05)
+    result = run("place", rig, "--control", 2, "--weight", 20, *limits, "--json", found)
+    assert result.exit_code == 0 and "no placement spills less than 95.0%" in result.output, result.output
+    written = json.loads(found.read_text())
+    best = written["placements"][0]
+    assert written["lower_bound"] == pytest.approx(0.95 * best["residual_work"])
+    assert best["peak_force"] <= 0.5 * (1 + 1e-5) and not any(4.9 < x < 5.6 for x in best["positions"])
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -307,8 +307,6 @@ def place(
     from workbench.design.placement import nodes_of_mode, placement_task
     from workbench.design.placement import place as least_work
 
-    if proof is not None and (forbid or math.isfinite(peak_force) or math.isfinite(condition)):
-        raise ValueError("a proof covers the limits of effort and spacing alone; leave out the others or the --proof")
     if proof is not None and not 0 < proof < 1:
         raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
     found = _structure_rig(rig)
@@ -316,18 +314,22 @@ def place(
     task = placement_task(modes, control, impulse_at=at, weight=weight)
     even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
     apart = modes.length / 20 if spacing is None else spacing
-    limits: dict[str, Any] = {"effort_limit": effort * even.effort, "spacing": apart}
-    best = least_work(
-        task, **limits, peak_limit=peak_force, condition_limit=condition, forbidden=[_stretch(s) for s in forbid or ()]
-    )
+    limits: dict[str, Any] = {
+        "effort_limit": effort * even.effort,
+        "spacing": apart,
+        "peak_limit": peak_force,
+        "condition_limit": condition,
+        "forbidden": [_stretch(s) for s in forbid or ()],
+    }
+    best = least_work(task, **limits)
     rows = [best, even]
     nodes = nodes_of_mode(modes, control)
     if nodes.size == control:
         rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
-    shown = Table("places", "W_R", "effort", "condition of B", "", box=None, pad_edge=False)
+    shown = Table("places", "W_R", "effort", "peak force", "condition of B", "", box=None, pad_edge=False)
     for row in rows:
         where = ", ".join(f"{x:.4g}" for x in row.positions)
-        figures = (row.residual_work, row.effort, row.condition)
+        figures = (row.residual_work, row.effort, row.peak_force, row.condition)
         shown.add_row(where, *(f"{value:.5g}" for value in figures), row.status)
     console.print(
         f"{control} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold"

@@ -9,7 +9,8 @@ from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lya
 from scipy.optimize import minimize
 
 from workbench.design.law import DesignError
-from workbench.design.placement import Limits
+from workbench.design.limits import Limits
+from workbench.design.peak import largest
 from workbench.design.placement_task import Placement
 from workbench.structure.modes import Modes
 
@@ -47,14 +48,12 @@ def coupled_figures(
     force = -(gain @ vectors) * held @ (1.0 / (1j * modes.omega[None, n:] - values[:, None]))
     by_mode = 0.5 * np.abs(np.einsum("rj,jr->r", shapes[n:], force)) ** 2
     gramian = solve_continuous_lyapunov(loop, -np.outer(start, start))
-    instants = np.linspace(0.0, 6.0 / omega.min(), 400)
-    peak = np.abs(((gain @ vectors) * held @ np.exp(np.outer(values, instants))).real).max()
     return Placement(
         positions=positions,
         residual_work=float(by_mode.sum()),
         by_mode=by_mode,
         effort=float(np.trace(gain @ gramian @ gain.T)),
-        peak_force=float(peak),
+        peak_force=largest(values, (gain @ vectors) * held, np.inf),
         condition=float(np.linalg.norm(np.linalg.pinv(shapes[:n])) * np.linalg.norm(shapes[:n])),
         status="coupled LQR",
     )
