@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from workbench.gap.decide import decide, decide_on_pairs, decide_on_random, figures, pairs_of, unexplained, with_nominal
 from workbench.gap.disturbance import RandomForceFit
@@ -77,7 +78,8 @@ def attribute(
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
     plain = FitData(tuple(records), noise, lead=round(settle / records[0].sample_time))
     seen, data = _plain_to_see(rig, plain)
-    with ThreadPoolExecutor(workers) as pool:
+    # the threads of the search and those of the linear algebra would wait for one another
+    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
         return _search(rig, seen, data, catalogue, report, pool, free_nominal)
 
 
