@@ -1,7 +1,7 @@
 """Before a fit: do the records fit the model, which effects could they show, and which could they not tell apart?"""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ SEEN = 25.0  # of chi-squared: five standard deviations
 TURNED = -0.95
 STUCK = 0.5
 THINNING = 3
+DECADES = (1e2, 1e-2, 1e4, 1e-4)
 
 
 class RecordsError(ValueError):
@@ -30,9 +31,9 @@ class Readiness:
     """What the records could tell, before anything is fitted.
 
     Attributes:
-        strengths: label of an effect -> how far it would move the residual, in standard deviations, at the strength
-            where a search would start.
-        invisible: labels of effects that these records cannot show at that strength.
+        strengths: label of an effect -> how far it would move the residual, in standard deviations, at the first
+            strength that these records show, or at the one they show most.
+        invisible: labels of effects that these records show at no strength.
         alike: pairs of labels whose responses are the same up to a factor, with their correlation.
     """
 
@@ -91,7 +92,7 @@ def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
 
 
 def readiness(rig: Rig, data: FitData, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Readiness:
-    """Simulate each effect once, at a strength where a search would start, and compare the responses."""
+    """Simulate each effect at a strength that the records show, and compare the responses."""
     evidence = Evidence.of(rig, data, 20)
     base = data.residual(rig)
     labels, signatures, strengths = [], [], {}
@@ -99,18 +100,10 @@ def readiness(rig: Rig, data: FitData, *, catalogue: tuple[Kind, ...] = CATALOGU
         if kind is RANDOM_DISTURBANCE:
             continue
         for target in kind.targets(rig):
-            values = next(iter(kind.starts(evidence, target)), None)
-            if values is None:
+            effect, change = _first_seen(kind, target, rig, data, evidence, base)
+            if effect is None:
                 continue
-            effect = Effect(kind, target, dict(values))
-            with np.errstate(over="ignore", invalid="ignore"):
-                try:
-                    change = (data.residual(effect.apply(rig)) - base)[::THINNING]
-                except (ValueError, np.linalg.LinAlgError):
-                    continue
-                size = float(np.linalg.norm(change))
-            if not np.isfinite(size):
-                continue
+            size = float(np.linalg.norm(change))
             strengths[effect.label] = size * float(np.sqrt(THINNING))
             if size**2 * THINNING > SEEN:
                 labels.append(effect.label)
@@ -127,3 +120,38 @@ def readiness(rig: Rig, data: FitData, *, catalogue: tuple[Kind, ...] = CATALOGU
         invisible=tuple(label for label, size in strengths.items() if size**2 <= SEEN),
         alike=tuple(sorted(alike, key=lambda pair: -pair[2])),
     )
+
+
+def _first_seen(kind: Kind, target, rig: Rig, data: FitData, evidence: Evidence, base: np.ndarray):
+    """The first strength of a kind that these records show, or the one that they show most; and what it changes."""
+    best, change, most = None, np.zeros(0), -1.0
+    for effect in _strengths(kind, target, rig, evidence):
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                moved = (data.residual(effect.apply(rig)) - base)[::THINNING]
+                size = float(moved @ moved) * THINNING
+            except (ValueError, np.linalg.LinAlgError):
+                continue
+        if np.isfinite(size) and size > most:
+            best, change, most = effect, moved, size
+        if most > SEEN:
+            break
+    return best, change
+
+
+def _strengths(kind: Kind, target, rig: Rig, evidence: Evidence) -> Iterator[Effect]:
+    """Where a search would start, and from there each number by decades up and down.
+
+    A search starts from the missing force, and where none is missing it starts from nothing.
+    """
+    effect = None
+    for values in kind.starts(evidence, target):
+        effect = Effect(kind, target, dict(values))
+        yield effect
+    if effect is None:
+        return
+    for factor in DECADES:
+        for parameter in effect.parameters(rig):
+            if parameter.name != "at":
+                moved = float(np.clip(effect.values[parameter.name] * factor, parameter.low, parameter.high))
+                yield replace(effect, values={**effect.values, parameter.name: moved})
