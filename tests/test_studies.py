@@ -13,9 +13,10 @@ ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("WORKBENCH_SHARED", ROOT.parent / "shared"))
 DATA = {"ruler": SHARED / "measured/ruler/ruler.mat", "blind_trials": SHARED / "gap-trials/blind"}
 DATA["arm_change"] = SHARED / "measured/arm-change"
+DATA["identification_peers"] = DATA["ruler"]
 DATA["silverbox"] = SHARED / "measured/silverbox/SNLS80mV.mat"
 LONG = {"blind_trials", "own_trials", "false_alarms", "many_cases", "design_scaling", "placement_front"}
-LONG |= {"identification_order"}
+LONG |= {"identification_order", "identification_peers", "identification_coverage"}
 STUDIES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
     for path in sorted((ROOT / "studies").glob("*.py"))
@@ -32,7 +33,8 @@ TABLES = {
 @pytest.mark.parametrize("path", STUDIES)
 def test_a_study_holds_when_run_anew(path, tmp_path):
     found = describe(path)
-    data = DATA.get(found.name) if found.needs_data else None
+    data = DATA.get(found.name)
+    data = data if found.needs_data or (data and data.exists()) else None
     if found.needs_data and (data is None or not data.exists()):
         pytest.skip(f"{found.needs_data} is not here; set WORKBENCH_SHARED")
     copy = tmp_path / "studies" / path.name
