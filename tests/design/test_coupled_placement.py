@@ -5,9 +5,11 @@ import pytest
 
 from workbench.design.closed_loop import close_loop, impulse_state, respond
 from workbench.design.coupled import coupled_lqr
-from workbench.design.coupled_placement import coupled_figures, place_coupled
+from workbench.design.coupled_placement import place_coupled
+from workbench.design.coupled_scan import scan_coupled
+from workbench.design.coupled_spillover import coupled_batch, coupled_figures
 from workbench.design.law import DesignError
-from workbench.design.placement import Limits
+from workbench.design.limits import Limits
 from workbench.design.spillover import effort, spillover
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
@@ -30,14 +32,23 @@ def test_figures_are_those_of_the_law(modes):
     assert found.peak_force == pytest.approx(np.abs(forces).max(), rel=1e-2)
 
 
+def test_many_at_once_are_each_by_itself(modes):
+    places = np.sort(np.random.default_rng(0).uniform(0.2, 9.8, (8, 3)), axis=1)
+    work, spent = coupled_batch(modes, 4, places, impulse_at=6.3, weight=10.0)
+    each = [coupled_figures(modes, 4, x, impulse_at=6.3, weight=10.0) for x in places]
+    np.testing.assert_allclose(work, [found.residual_work for found in each], rtol=1e-9)
+    np.testing.assert_allclose(spent, [found.effort for found in each], rtol=1e-9)
+    assert coupled_batch(modes, 2, np.array([[5.0]]), impulse_at=6.3, weight=10.0)[0] == np.inf
+
+
 def test_no_grid_beats_the_optimum(modes):
-    best = place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(spacing=0.5, effort=0.5), starts=4)
+    limits = Limits(spacing=0.5, effort=0.5, forbidden=((2.0, 2.4),))
+    best = place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=limits, starts=4)
     assert best.effort <= 0.5 and np.diff(best.positions)[0] >= 0.5
-    grid = np.linspace(0.5, 9.5, 19)
-    for i, x in enumerate(grid):
-        for y in grid[i + 1 :]:
-            found = coupled_figures(modes, 2, [x, y], impulse_at=6.3, weight=10.0)
-            assert found.effort > 0.5 or found.residual_work >= best.residual_work
+    coarse, fine = (scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=limits, n_places=k) for k in (25, 75))
+    assert coarse.tried < fine.tried
+    assert coarse.lower_bound <= fine.lower_bound <= best.residual_work <= fine.best.residual_work
+    assert not ((fine.best.positions > 2.0) & (fine.best.positions < 2.4)).any()
 
 
 def test_refusals(modes):
@@ -45,4 +56,6 @@ def test_refusals(modes):
         place_coupled(modes, 9, 2, impulse_at=6.3, weight=10.0, limits=Limits())
     with pytest.raises(DesignError, match="keeps the limits"):
         place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6))
+    with pytest.raises(DesignError, match="on the grid"):
+        scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6), n_places=9)
     assert coupled_figures(modes, 2, [5.0], impulse_at=6.3, weight=10.0).residual_work == np.inf
