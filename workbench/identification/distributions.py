@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from scipy.interpolate import BSpline
 from scipy.linalg import null_space
 
@@ -42,6 +43,12 @@ class Basis:
     def polynomial(cls, n_terms: int) -> "Basis":
         """1, x, x², ... (4.32)."""
         return cls(lambda x: np.vander(np.asarray(x, float), n_terms, increasing=True), n_terms)
+
+    @classmethod
+    def legendre(cls, n_terms: int, *, length: float) -> "Basis":
+        """Legendre polynomials of 2x / length - 1: the same sums as 1, x, x², ..., kept apart by round-off at any
+        number of terms."""
+        return cls(lambda x: legvander(2.0 * np.asarray(x, float) / length - 1.0, n_terms)[:, :n_terms], n_terms)
 
     @classmethod
     def splines(cls, n_terms: int, *, length: float, degree: int = 2) -> "Basis":

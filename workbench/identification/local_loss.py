@@ -12,6 +12,7 @@ of a false alarm. No measurement of the undamaged structure is needed.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,13 +23,14 @@ from scipy.stats import norm
 from workbench.identification.distributions import Basis
 from workbench.identification.refinement import Refined
 from workbench.identification.sensitivity import LocalLoss, SeriesStructure
-from workbench.identification.structure_fit import MOST_TERMS, FittedStructure, Problem, Task, choose
+from workbench.identification.structure_fit import MOST_TERMS, FittedStructure, Problem, Task, choose, with_spare_terms
 from workbench.structure.member import Bar, Beam
 
 FALSE_ALARM = 0.01
 N_PLACES = 60
 TYPICAL_WIDTH = 0.1  # of the length, in the first look along the structure
-MOST_STARTS = 3
+MOST_STARTS = 4
+FIRST_TERMS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +38,7 @@ class LossFound:
     """What the modes say of a local loss of stiffness.
 
     Attributes:
-        smooth: the best explanation without one.
+        smooth: the best explanation without one, or, where no number of terms comes near, that of most terms.
         lossy: the best with one, believed or not.
         evidence: what the loss lowers χ² + n_terms ln n_data by.
         limit: what noise lowers it by with the chance of a false alarm.
@@ -73,7 +75,7 @@ def find_loss(
     measured: Refined,
     nominal: Bar | Beam,
     *,
-    basis: Callable[[int], Basis] = Basis.polynomial,
+    basis: Callable[[int], Basis] | None = None,
     mass_terms: Iterable[int] = range(1, MOST_TERMS + 1),
     stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
     false_alarm: float = FALSE_ALARM,
@@ -90,24 +92,51 @@ def find_loss(
         ValueError: as `fit_structure`.
     """
     task = Task.of(measured, nominal, **known)
+    basis = basis or partial(Basis.legendre, length=nominal.length)
     terms = sorted(mass_terms), sorted(stiffness_terms)
-    lossy = choose(task, basis, *terms, _with_loss, exhaust=False)
-    smooth = choose(task, basis, *terms, lambda problem, near: problem.fit(near), exhaust=not lossy.explains)
-    if not (lossy.explains or smooth.explains):
-        lossy = choose(task, basis, *terms, _with_loss)
+    first = _from_anywhere(task.problem(*(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
+    lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
+    if not lossy.explains:
+        again = _from_anywhere(task.problem(*(basis(n) for n in lossy.n_terms)), lossy)
+        lossy = choose(task, basis, *terms, _near_the_last, near=again)
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
-    evidence = smooth.criterion - lossy.criterion + 3.0 * float(np.log(task.n_data))
-    return LossFound(smooth, lossy, evidence, limit)
+    smooth = _smooth(task, basis, terms, lossy, limit)
+    return LossFound(smooth, lossy, smooth.criterion - lossy.criterion + _price(task), limit)
 
 
-def _with_loss(problem: Problem, near: FittedStructure | None) -> FittedStructure:
-    """The most likely structure with a loss: near the one found before, or from the likeliest places."""
-    if near is not None:
-        return problem.fit(near, near.loss)
+def _price(task: Task) -> float:
+    """What the three parameters of a loss add to the criterion."""
+    return 3.0 * float(np.log(task.n_data))
+
+
+def _smooth(task: Task, basis, terms, lossy: FittedStructure, limit: float) -> FittedStructure:
+    """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
+
+    def alike(*n_terms: int) -> FittedStructure:
+        return task.problem(*(basis(n) for n in n_terms)).fit(lossy)
+
+    same = alike(*lossy.n_terms)
+    if same.chi2 - lossy.chi2 <= limit:
+        return with_spare_terms(same, task, basis)
+    most = alike(terms[0][-1], terms[1][-1])
+    if most.chi2 - lossy.criterion + _price(task) > limit:
+        return most
+    return choose(task, basis, *terms, lambda problem, near: problem.fit(near))
+
+
+def _near_the_last(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The most likely structure with a loss near the one found before."""
+    assert near is not None, "a search along the structure comes first"
+    return problem.fit(near, near.loss)
+
+
+def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The most likely structure with a loss, from the likeliest places and from what was found before."""
     smooth = problem.fit()
     width = TYPICAL_WIDTH * problem.task.nominal.length
-    fits = (problem.fit(smooth, LocalLoss(0.1, place, width)) for place in _likely_places(problem, smooth))
+    fits = [problem.fit(smooth, LocalLoss(0.1, place, width)) for place in _likely_places(problem, smooth)]
+    fits += [] if near is None else [problem.fit(near, near.loss)]
     return min(fits, key=lambda fit: fit.chi2)
 
 

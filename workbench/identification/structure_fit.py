@@ -13,6 +13,7 @@ criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978), which an unneeded te
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,7 +34,8 @@ from workbench.structure.profile import Profile
 TRUSTED = 1e-8
 SAME_MODE = 0.6  # least MAC with the mode of the nominal structure that a measured one is taken for
 UNLIKELY = 0.01
-MOST_TERMS = 6
+MOST_TERMS = 8
+SPARE = 2
 NARROWEST, WIDEST = 0.02, 0.5  # of the length: a loss narrower is a crack, one wider is no local one
 MOST_LOST = 0.95
 N_DRAWS = 1000
@@ -171,7 +173,7 @@ def choose_structure(
     measured: Refined,
     nominal: Bar | Beam,
     *,
-    basis: Callable[[int], Basis] = Basis.polynomial,
+    basis: Callable[[int], Basis] | None = None,
     mass_terms: Iterable[int] = range(1, MOST_TERMS + 1),
     stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
     **known: Any,
@@ -180,7 +182,7 @@ def choose_structure(
 
     Args:
         measured, nominal: as `fit_structure`.
-        basis: number of terms -> `Basis`.
+        basis: number of terms -> `Basis`; polynomials unless given.
         mass_terms, stiffness_terms: numbers to choose from.
         known: `known_mass`, `known_stiffness`, `mass_prior`, `stiffness_prior`, `numbers` of `fit_structure`.
 
@@ -192,10 +194,18 @@ def choose_structure(
 
 
 def choose(
-    task: "Task", basis, mass_terms: list[int], stiffness_terms: list[int], fit, *, exhaust: bool = True
+    task: "Task",
+    basis: Callable[[int], Basis] | None,
+    mass_terms: list[int],
+    stiffness_terms: list[int],
+    fit: Callable[["Problem", FittedStructure | None], FittedStructure],
+    *,
+    near: FittedStructure | None = None,
+    exhaust: bool = True,
 ) -> FittedStructure:
     """The fit of least criterion, from the fewest terms up as long as one or two more of either lower it; of all
-    numbers, with `exhaust`, where that leaves modes unexplained."""
+    numbers, with `exhaust`, where that leaves modes unexplained. Each is searched from the best so far, or `near`."""
+    basis = basis or partial(Basis.legendre, length=task.nominal.length)
     tried: dict[tuple[int, int], FittedStructure | None] = {}
     best: FittedStructure | None = None
     at, ahead, reason = (0, 0), 3, "no number of terms was given"
@@ -205,7 +215,7 @@ def choose(
                 if (i, j) in tried:
                     continue
                 try:
-                    tried[i, j] = fit(task.problem(basis(mass_terms[i]), basis(stiffness_terms[j])), best)
+                    tried[i, j] = fit(task.problem(basis(mass_terms[i]), basis(stiffness_terms[j])), best or near)
                 except ValueError as error:
                     tried[i, j], reason = None, str(error)
         good = {pair: found for pair, found in tried.items() if found is not None}
@@ -216,8 +226,25 @@ def choose(
         if better:
             continue
         if best.explains or ahead > 3 or not exhaust:
-            return best
+            return with_spare_terms(best, task, basis)
         ahead = len(mass_terms) + len(stiffness_terms)
+
+
+def with_spare_terms(chosen: FittedStructure, task: "Task", basis: Callable[[int], Basis]) -> FittedStructure:
+    """The same structure, the terms next in line left free as well in what is said of its errors.
+
+    They are too small to be told from the noise, not zero: left out, they would be missed by the bands (undersmoothing,
+    Hall, Ann. Statist. 20, 1992).
+    """
+    try:
+        problem = task.problem(*(basis(n + SPARE if n else 0) for n in chosen.n_terms))
+        wide = problem.report(problem.free_near(chosen))
+    except ValueError:
+        return chosen
+    if wide.chi2 > chosen.chi2 + 1.0:  # a basis that does not hold the smaller one
+        return chosen
+    kept = ("n_terms", "chi2", "freedom", "criterion")
+    return replace(wide, **{name: getattr(chosen, name) for name in kept})
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +359,7 @@ class Problem:
     def fit(self, near: FittedStructure | None = None, loss: LocalLoss | None = None) -> FittedStructure:
         """The most likely structure, searched from one found before, with a loss near `loss` if there is one."""
         length = self.task.nominal.length
-        z = self._start(near)
+        z = self._start() if near is None else self.free_near(near)[: self.n_free]
         low, high = np.full(z.size, -np.inf), np.full(z.size, np.inf)
         if loss is not None:
             z = np.r_[z, loss.share, loss.centre, loss.width]
@@ -416,7 +443,11 @@ class Problem:
         covariance = carry @ _inverse(slopes.T @ slopes) @ carry.T
         if freedom > 0 and chi2 > chi2_distribution.isf(UNLIKELY, freedom):
             covariance = covariance * chi2 / freedom
-        draws = np.random.default_rng(0).multivariate_normal(parameters, covariance, N_DRAWS, method="eigh")
+        size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        normal = np.random.default_rng(0).standard_normal((N_DRAWS, parameters.size))
+        draws = parameters + size * (normal @ root.T)
         n, m = d.size, d.size + e.size
         mass = _uncertain(task.nominal.mass_per_length, series.mass, d, draws[:, :n])
         stiffness = _uncertain(
@@ -453,17 +484,23 @@ class Problem:
             check=SelfCheck(found.omega / task.measured.modes.omega - 1.0, agreement),
         )
 
-    def _start(self, near: FittedStructure | None) -> np.ndarray:
-        """Free parameters of the structure found before, or of the nominal one at the measured frequencies."""
+    def free_near(self, found: FittedStructure) -> np.ndarray:
+        """Free parameters, a loss with them, of the series nearest to a structure found with other terms."""
+        nominal, length = self.task.nominal, self.task.nominal.length
+        x = (np.arange(100) + 0.5) / 100 * length
+        mass, stiffness = (
+            found.mass(x) / nominal.mass_per_length(x),
+            found.stiffness(x) / self.series.nominal_stiffness(x),
+        )
+        if found.loss is None:
+            return self._nearest(x, mass, stiffness)
+        whole = stiffness / found.loss.of(Profile.constant(1.0), length)(x)
+        return np.r_[self._nearest(x, mass, whole), found.parameters[-3:]]
+
+    def _start(self) -> np.ndarray:
+        """Free parameters of the nominal structure, scaled to the known values and the measured frequencies."""
         task, series = self.task, self.series
         x = (np.arange(100) + 0.5) / 100 * task.nominal.length
-        if near is not None:
-            stiffness = near.stiffness(x) / (
-                1.0 if near.loss is None else near.loss.of(Profile.constant(1.0), task.nominal.length)(x)
-            )
-            return self._nearest(
-                x, near.mass(x) / task.nominal.mass_per_length(x), stiffness / series.nominal_stiffness(x)
-            )
         size = np.ones(2)
         for i, (pairs, nominal) in enumerate(
             ((task.known_mass, task.nominal.mass_per_length), (task.known_stiffness, series.nominal_stiffness))
