@@ -12,7 +12,7 @@ from workbench.identification.telling import Told
 from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
-LABELS = ("printed in 1981", "two delays, as in 1981", "stacked delays")
+LABELS = ("printed in 1981", "two delays, as in 1981", "this project's default")
 
 
 def eigenvalue_errors(errors: Mapping, sensors: Sequence[int]) -> Figure:
@@ -54,7 +54,7 @@ def eigenfunction(found: Modes, exact: Modes, *, mode: int, positions: np.ndarra
 def distribution_errors(x: np.ndarray, curves: Mapping, sensors: Sequence[int], *, terms: int) -> Figure:
     """Errors of mass and stiffness along x; curves[m, terms, what] are (printed, cubic splines, default splines)."""
     figure, axes = new_figure(2, len(sensors), width=11, height=6, sharex=True, sharey=True)
-    labels = ("printed in 1981", "cubic splines", "default splines")
+    labels = ("printed in 1981", "cubic splines", "this project's default")
     for column, m in enumerate(sensors):
         for row, what in enumerate(("mass", "stiffness")):
             for curve, label, colour in zip(curves[m, terms, what], labels, (GREY, *COLOURS), strict=False):
