@@ -12,15 +12,28 @@ ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_the_example_runs_and_prints_what_it_says(tmp_path, monkeypatch):
-    code = re.search(r"```python\n(.*?)```", README, re.S).group(1)
-    promised = re.findall(r"print\(.*\)  # (.*)", code)
-    monkeypatch.chdir(tmp_path)
+def run_example(number, folder, monkeypatch) -> tuple[str, str]:
+    """The code of a block of the README, and what it prints."""
+    code = re.findall(r"```python\n(.*?)```", README, re.S)[number]
+    monkeypatch.chdir(folder)
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
-        exec(compile(code, "README.md", "exec"), {})
-    assert promised and printed.getvalue().split() == promised
+        exec(compile(code, "README.md", "exec"), {"__name__": "__main__"})
+    return code, printed.getvalue()
+
+
+def test_the_example_runs_and_prints_what_it_says(tmp_path, monkeypatch):
+    code, printed = run_example(0, tmp_path, monkeypatch)
+    promised = re.findall(r"print\(.*\)  # (.*)", code)
+    assert promised and printed.split() == promised
     assert (tmp_path / "response.png").stat().st_size > 5000
+
+
+def test_many_cases_run_are_kept_and_stand_in_a_table(tmp_path, monkeypatch):
+    _, printed = run_example(1, tmp_path, monkeypatch)
+    promised = re.search(r"```\n(5\.0 .*?)```", README, re.S).group(1)
+    assert printed == promised and len(list((tmp_path / "kept").rglob("*.json"))) == len(printed.splitlines())
+    assert len((tmp_path / "spilled.csv").read_text().splitlines()) == 1 + len(printed.splitlines())
 
 
 def test_every_public_name_is_there():
