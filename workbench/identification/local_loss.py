@@ -40,7 +40,8 @@ class LossFound:
     Attributes:
         smooth: the best explanation without one, or, where no number of terms comes near, that of most terms.
         lossy: the best with one, believed or not.
-        evidence: what the loss lowers χ² + n_terms ln n_data by.
+        evidence: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `lossy` does not explain
+            the modes either.
         limit: what noise lowers it by with the chance of a false alarm.
     """
 
@@ -94,6 +95,8 @@ def find_loss(
     task = Task.of(measured, nominal, **known)
     basis = basis or partial(Basis.legendre, length=nominal.length)
     terms = sorted(mass_terms), sorted(stiffness_terms)
+    if not (terms[0] and terms[1]):
+        raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
     first = _from_anywhere(task.problem(*(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
     lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
     if not lossy.explains:
@@ -102,7 +105,9 @@ def find_loss(
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
     smooth = _smooth(task, basis, terms, lossy, limit)
-    return LossFound(smooth, lossy, smooth.criterion - lossy.criterion + _price(task), limit)
+    evidence = smooth.criterion - lossy.criterion + _price(task)
+    # modes that not even a loss explains err by more than their standard errors, and count for less
+    return LossFound(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
 
 
 def _price(task: Task) -> float:
