@@ -22,7 +22,7 @@ from workbench.design.scan import scan
 from workbench.structure.modes import frozen
 
 MOST_ACTUATORS = 4
-BATCH = 20_000
+BATCH = 4_000
 TRIED = 50
 INSTANTS = 48
 
