@@ -87,3 +87,8 @@ def test_the_first_look_points_at_the_place():
     problem = task.problem(Basis.polynomial(2), Basis.polynomial(3))
     places, gain = scan(problem, problem.fit())
     assert abs(places[np.argmax(gain)] - 0.4) < 0.05
+
+
+def test_a_number_of_terms_must_be_given():
+    with pytest.raises(ValueError, match="no number of terms was given"):
+        find_loss(measured("beam", lost=0.0, centre=0.5), NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[])

@@ -40,8 +40,8 @@ class LossFound:
     Attributes:
         smooth: the best explanation without one, or, where no number of terms comes near, that of most terms.
         lossy: the best with one, believed or not.
-        evidence: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `lossy` does not explain
-            the modes either.
+        evidence: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `lossy` does not
+            explain the modes either.
         limit: what noise lowers it by with the chance of a false alarm.
     """
 
