@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2
 
+from workbench.identification.band import Band
 from workbench.identification.ibrahim import check_alike
 from workbench.identification.refinement import MOST_STEPS, Refined, project, refine, search
 from workbench.records.record import Record
@@ -77,7 +78,8 @@ def identify(
     """
     records = [records] if isinstance(records, Record) else list(records)
     check_alike(records)
-    told = _Told(records, false_alarm)
+    longest = max(record.n_samples for record in records)
+    told = Told(records, [_Grid(record, longest) for record in records], false_alarm)
     most_modes = min(most_modes, (min(r.n_samples for r in records) - 4) // 3)
     for _ in range(MOST_ROUNDS):
         if not (told.grow(most_modes) and told.prune()):
@@ -90,14 +92,16 @@ def identify(
     return told.report()
 
 
-class _Told:
-    """The search: poles so far, their fits, and what was refused."""
+class Told:
+    """The search: poles so far, their fits, and what was refused.
 
-    def __init__(self, records: Sequence[Record], false_alarm: float) -> None:
-        self.records = records
-        longest = max(record.n_samples for record in records)
-        self.grids = [_Grid(record, longest) for record in records]
-        cells = self.grids[0].n_cells
+    Records are searched as they are or as bands of a spectrum, each with the grid of swings to look for in it.
+    """
+
+    def __init__(self, records: Sequence[Record | Band], grids: Sequence, false_alarm: float) -> None:
+        self.records, self.grids = records, grids
+        self.offset = grids[0].offset
+        cells = grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
         # A mode is two amplitudes a signal and its pole, chosen among all cells of the grid.
@@ -156,12 +160,12 @@ class _Told:
         return bool(split.any())
 
     def report(self) -> Identified:
-        start = _bare(self.poles, self.records[0])
+        start = unshaped(self.poles, self.records[0])
         refined = refine(self.records, start, offset=True)
         evidence = self._evidence()[np.argsort(np.abs(self.poles))]
         refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
         noise = np.array([pole for pole, _ in refused], complex)
-        noise_modes = _bare(noise, self.records[0])
+        noise_modes = unshaped(noise, self.records[0])
         return Identified(
             refined, frozen(evidence), self.limit, noise_modes, frozen([evidence for _, evidence in refused])
         )
@@ -170,9 +174,9 @@ class _Told:
         """Poles, weights and fits after a search, sensors weighted by the noise found."""
         weights = getattr(self, "weights", np.ones(self.records[0].n_outputs))
         if poles.size == 0:
-            fits = [_constant(record) for record in self.records]
+            fits = [grid.nothing for grid in self.grids]
             return poles, 1.0 / _spread(fits), fits
-        poles, fits, *_ = search(self.records, poles, weights, True, most_steps)
+        poles, fits, *_ = search(self.records, poles, weights, self.offset, most_steps)
         return poles, 1.0 / _spread([fit.residual for fit in fits]), [fit.residual for fit in fits]
 
     def _without(self, r: int):
@@ -180,7 +184,7 @@ class _Told:
 
     def _evidence(self) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
-        fits = [project(record, self.poles, True) for record in self.records]
+        fits = [project(record, self.poles, self.offset) for record in self.records]
         self.amplitudes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
         n, strength = self.poles.size, np.zeros(self.poles.size)
         for fit in fits:
@@ -201,9 +205,9 @@ class _Told:
 
     def _colour(self, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the spectrum left over, 1 if white."""
-        left = np.abs(np.fft.rfft(self.fits[0] * self.weights, axis=0)[1:]) ** 2
-        left = left.mean(axis=1)
-        at = round(pole.imag / self.grids[0].bin_width) - 1
+        grid = self.grids[0]
+        left = grid.power(self.fits[0] * self.weights).mean(axis=1)
+        at = round((pole.imag - grid.lowest) / grid.bin_width)
         beside = left[max(at - BESIDE, 0) : at + BESIDE + 1]
         return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
 
@@ -228,12 +232,15 @@ class _Told:
 class _Grid:
     """Swings e^{λt} to compare a residual with: rates of decay by frequencies, (n_rates, n_frequencies)."""
 
+    offset = True
+
     def __init__(self, record: Record, n: int) -> None:
         self.record, dt = record, record.sample_time
+        self.nothing = (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
         self.size = 1 << int(np.ceil(np.log2(2 * n)))
         omega = 2.0 * np.pi * np.fft.rfftfreq(self.size, dt)
         span = n * dt
-        self.bin_width = 2.0 * np.pi / span
+        self.bin_width = self.lowest = 2.0 * np.pi / span
         fastest = 0.1 * np.pi / dt
         rates = np.r_[0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))]
         inside = (omega > np.pi / span) & (omega < np.pi / dt - np.pi / span)
@@ -242,6 +249,10 @@ class _Grid:
         self.poles = -rates[:, None] + 1j * omega[inside]
         self.allowed = rates[:, None] < MOST_DAMPED * omega[inside]
         self.n_cells = int(self.allowed.sum())
+
+    def power(self, residual: np.ndarray) -> np.ndarray:
+        """Of what is left at each frequency, (n_frequencies, n_outputs)."""
+        return np.abs(np.fft.rfft(residual, axis=0)[1:]) ** 2
 
     def near(self, pole: complex, bins: float) -> np.ndarray:
         """Frequencies within so many bins, or half as many rates of decay, of a pole's."""
@@ -300,17 +311,14 @@ def _geometric(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
     return np.where(small, n, (1.0 - np.outer(a**n, b**n)) / np.where(small, 1.0, gap))
 
 
-def _constant(record: Record) -> np.ndarray:
-    return (record.outputs - record.outputs.mean(axis=1, keepdims=True)).T
-
-
 def _spread(residuals: Sequence[np.ndarray]) -> np.ndarray:
     n = sum(r.shape[0] for r in residuals)
     squares = sum((r**2).sum(axis=0) for r in residuals)
     return np.sqrt(np.maximum(squares / n, 1e-28 * squares.max() + 1e-300))
 
 
-def _bare(poles: np.ndarray, record: Record) -> SampledModes:
+def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
+    """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
     omega = np.abs(poles)
     order = np.argsort(omega)
     shapes = np.ones((record.n_outputs, poles.size))

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.special import ndtri
 
+from workbench.identification.band import Band
 from workbench.identification.ibrahim import check_alike, normalised_shapes
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Record
@@ -26,6 +27,8 @@ MOST_STEPS = 60
 # A step is small once it moves the estimate by less than a thousandth of its standard error.
 SETTLED = 1e-6
 ROUND_OFF = 1e-13
+# Samples by modes up to which Φ is factored at once, and the samples of a part beyond.
+LARGEST_FACTORED, PART = 2_000_000, 8192
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,13 +170,11 @@ class Projection:
         return (self.coefficients[:n] - 1j * self.coefficients[n : 2 * n]).T
 
 
-def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
-    tau = record.sample_time * np.arange(record.n_samples)
-    # Complex powers cost one exponential a sample and mode; both real columns come from it.
-    decay = np.exp(np.outer(tau, poles))
-    phi = np.hstack([decay.real, decay.imag])
-    t_phi = tau[:, None] * phi
-    columns = np.hstack([phi, np.ones((tau.size, 1))]) if offset else phi
+def project(record: Record | Band, poles: np.ndarray, offset: bool) -> Projection:
+    if isinstance(record, Record) and record.n_samples * poles.size > LARGEST_FACTORED:
+        return _project_by_parts(record, poles, offset)
+    phi, t_phi = record.columns(poles) if isinstance(record, Band) else _columns(record, poles)
+    columns = np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi
     q, r = qr(columns, mode="economic", check_finite=False)
     y = record.outputs.T
     qy = q.T @ y
@@ -182,6 +183,51 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     rest = t_phi - q @ q_t
     inverse = solve_triangular(r, np.eye(r.shape[0]))
     return Projection(residual, inverse @ qy, rest.T @ rest, t_phi.T @ residual, inverse @ inverse.T, inverse @ q_t)
+
+
+def _columns(record: Record, poles: np.ndarray, first: int = 0, last: int | None = None):
+    """Φ and tΦ of the samples first..last, (n_samples, 2 n_modes) each."""
+    tau = record.sample_time * np.arange(first, record.n_samples if last is None else last)
+    # Complex powers cost one exponential a sample and mode; both real columns come from it.
+    decay = np.exp(np.outer(tau, poles))
+    phi = np.hstack([decay.real, decay.imag])
+    return phi, tau[:, None] * phi
+
+
+def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projection:
+    """The same from normal equations summed over parts of the record, where Φ would fill the memory.
+
+    They square the condition number, which long records of many modes, told apart by their length, can afford.
+    """
+    n, columns = 2 * poles.size, 2 * poles.size + int(offset)
+    parts = [(i, min(i + PART, record.n_samples)) for i in range(0, record.n_samples, PART)]
+    whole, tilted, doubly = np.zeros((columns, columns)), np.zeros((columns, n)), np.zeros((n, n))
+    seen, t_seen = np.zeros((columns, record.n_outputs)), np.zeros((n, record.n_outputs))
+
+    def part(first: int, last: int):
+        phi, t_phi = _columns(record, poles, first, last)
+        return (np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi), t_phi
+
+    for first, last in parts:
+        phi, t_phi = part(first, last)
+        y = record.outputs[:, first:last].T
+        whole += phi.T @ phi
+        tilted += phi.T @ t_phi
+        doubly += t_phi.T @ t_phi
+        seen += phi.T @ y
+        t_seen += t_phi.T @ y
+    scale = 1.0 / np.sqrt(np.diag(whole))
+    factor = cho_factor(whole * np.outer(scale, scale))
+
+    def solve(right: np.ndarray) -> np.ndarray:
+        return scale[:, None] * cho_solve(factor, scale[:, None] * right)
+
+    coefficients, tilt = solve(seen), solve(tilted)
+    residual = np.empty((record.n_samples, record.n_outputs))
+    for first, last in parts:
+        residual[first:last] = record.outputs[:, first:last].T - part(first, last)[0] @ coefficients
+    slopes = t_seen - tilted.T @ coefficients
+    return Projection(residual, coefficients, doubly - tilted.T @ tilt, slopes, solve(np.eye(columns)), tilt)
 
 
 def _directions(fit: Projection) -> np.ndarray:
@@ -255,7 +301,7 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
 def _tried(records, poles: np.ndarray, offset: bool) -> list[Projection] | None:
     """Projections; None where a mode no longer swings, passes half the sample rate, grows by more than e^20 over a
     record, decays faster than e^-1 a sample, or cannot be told from another."""
-    longest = max(r.n_samples * r.sample_time for r in records)
+    longest = max((r.whole if isinstance(r, Band) else r.n_samples) * r.sample_time for r in records)
     gone = -poles.real * records[0].sample_time > 1.0
     beyond = (poles.imag <= 0) | (poles.imag * records[0].sample_time >= np.pi)
     if beyond.any() or (poles.real * longest >= 20.0).any() or gone.any():
