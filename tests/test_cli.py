@@ -109,6 +109,14 @@ def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     assert best["peak_force"] <= 0.5 * (1 + 1e-5) and not any(4.9 < x < 5.6 for x in best["positions"])
 
 
+def test_places_are_chosen_from_those_there_are(rig, tmp_path):
+    found = tmp_path / "places.json"
+    given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort", 3, "--proof", 0.05)
+    result = run("place", rig, "--control", 3, "--weight", 20, *given, "--json", found)
+    assert result.exit_code == 0 and "no placement spills less than 100.0%" in result.output, result.output
+    assert set(json.loads(found.read_text())["placements"][0]["positions"]) <= {1.5, 3, 4.5, 6.5, 7, 8.5}
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -119,6 +127,8 @@ def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
         (("design", "{rig}", "--weight", -1), "positive"),
         (("place", "{rig}", "--control", 9), "residual"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
+        (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),
+        (("place", "{rig}", "--control", 4, "--at", "1 to 9"), "between commas"),
         (("diagnose", "nowhere"), "not a folder"),
         (("study", "nothing_of_that_name"), "no study is called"),
         (("report", "nowhere.json"), "no such file"),

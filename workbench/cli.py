@@ -294,6 +294,7 @@ def place(
     peak_force: Annotated[float, typer.Option(help="Largest force of any actuator, N.")] = math.inf,
     condition: Annotated[float, typer.Option(help="Largest condition of B (Frobenius).")] = math.inf,
     forbid: Annotated[list[str] | None, typer.Option(help="Stretch FROM:TO without actuators; repeat.")] = None,
+    at: Annotated[str | None, typer.Option(help="The only places there are: X,X,X,...; all choices are tried.")] = None,
     proof: Annotated[float | None, typer.Option(help="Prove the optimum global within this share, e.g. 0.05.")] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -304,14 +305,14 @@ def place(
     import numpy as np
 
     from workbench.design.certificate import certify
-    from workbench.design.placement import nodes_of_mode, placement_task
+    from workbench.design.placement import nodes_of_mode, placement_task, scan
     from workbench.design.placement import place as least_work
 
     if proof is not None and not 0 < proof < 1:
         raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
     found = _structure_rig(rig)
-    modes, at = found.modes, _blow(found, impulse_at)
-    task = placement_task(modes, control, impulse_at=at, weight=weight)
+    modes, blow = found.modes, _blow(found, impulse_at)
+    task = placement_task(modes, control, impulse_at=blow, weight=weight)
     even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
     apart = modes.length / 20 if spacing is None else spacing
     limits: dict[str, Any] = {
@@ -321,7 +322,9 @@ def place(
         "condition_limit": condition,
         "forbidden": [_stretch(s) for s in forbid or ()],
     }
-    best = least_work(task, **limits)
+    if at is not None:
+        limits["candidates"] = _places(at, modes.length)
+    best = least_work(task, **limits) if at is None else scan(task, **limits)[0]
     rows = [best, even]
     nodes = nodes_of_mode(modes, control)
     if nodes.size == control:
@@ -332,7 +335,7 @@ def place(
         figures = (row.residual_work, row.effort, row.peak_force, row.condition)
         shown.add_row(where, *(f"{value:.5g}" for value in figures), row.status)
     console.print(
-        f"{control} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold"
+        f"{control} of {modes.n_modes} modes controlled, unit blow at x = {blow:g}, R = {weight:g}", style="bold"
     )
     console.print(shown)
     proven = None
@@ -498,6 +501,16 @@ def bench(
             server.serve_forever()
         except KeyboardInterrupt:
             console.print("  ended")
+
+
+def _places(text: str, length: float) -> list[float]:
+    try:
+        places = sorted({float(x) for x in text.split(",")})
+    except ValueError:
+        raise ValueError(f"--at takes places between commas, such as 0.1,0.25,0.4; got {text!r}") from None
+    if not all(0 <= x <= length for x in places):
+        raise ValueError(f"--at names a place outside the structure, 0 to {length:g} m: {text}")
+    return places
 
 
 def _stretch(text: str) -> tuple[float, float]:
