@@ -89,7 +89,7 @@ def identify(
             f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
             " decay, measure longer or strike harder"
         )
-    return told.report()
+    return told.report(records)
 
 
 class Told:
@@ -159,13 +159,13 @@ class Told:
         split = (np.abs(self.poles.imag - pole.imag) < band) & (agree > SAME_SHAPE) & (size > size[r])
         return bool(split.any())
 
-    def report(self) -> Identified:
-        start = unshaped(self.poles, self.records[0])
-        refined = refine(self.records, start, offset=True)
+    def report(self, records: Sequence[Record]) -> Identified:
+        start = unshaped(self.poles, records[0])
+        refined = refine(records, start, offset=True)
         evidence = self._evidence()[np.argsort(np.abs(self.poles))]
         refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
         noise = np.array([pole for pole, _ in refused], complex)
-        noise_modes = unshaped(noise, self.records[0])
+        noise_modes = unshaped(noise, records[0])
         return Identified(
             refined, frozen(evidence), self.limit, noise_modes, frozen([evidence for _, evidence in refused])
         )
