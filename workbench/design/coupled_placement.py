@@ -1,7 +1,7 @@
 """Where the actuators of coupled LQR should stand: its forces depend on the places, so every place is a new design."""
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from workbench.design.coupled_spillover import coupled_batch, coupled_figures
 from workbench.design.law import DesignError
@@ -59,7 +59,7 @@ def place_coupled(
     draws = [modes.length * np.arange(1, n_actuators + 1) / (n_actuators + 1)]
     draws += list(np.sort(rng.uniform(0.01, 0.99, (DRAWN, n_actuators)) * modes.length, axis=1))
     work, effort = coupled_batch(modes, n_controlled, np.array(draws), impulse_at=impulse_at, weight=weight)
-    ends = []
+    ends: list[OptimizeResult] = []
     for i in np.argsort(np.where(effort <= limits.effort, work, np.inf))[:LOOKED_AT]:
         if len(ends) < starts and effort[i] <= limits.effort and np.isfinite(look(draws[i])[0]):
             options = {"maxfev": 250 * n_actuators, "xatol": 1e-6 * modes.length, "fatol": 1e-9}
