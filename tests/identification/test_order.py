@@ -50,3 +50,15 @@ def test_records_of_unequal_length_together_tell_more(truth):
     alone, both = identify(first), identify([first, second])
     assert both.modes.n_modes == truth.n_modes
     assert (both.refined.omega_std < alone.refined.omega_std).all()
+
+
+def test_a_mode_that_shifts_as_it_decays_is_no_crowd_of_modes():
+    """1 % higher where strong, as a hardening spring has it, rounded to counts: its side lines are no modes."""
+    time = 0.002 * np.arange(2000)
+    envelope = 50.0 * np.exp(-1.2 * time)
+    strong = envelope * np.cos(2 * np.pi * np.cumsum(18.0 * (1 + 4e-6 * envelope**2)) * 0.002)
+    other = 30.0 * np.exp(-2.0 * time) * np.cos(2 * np.pi * 52.0 * time + 0.4)
+    found = identify(Record(0.002, np.round(strong + other), (Channel("a", "acceleration"),))).modes
+    for frequency in (18.0, 52.0):
+        assert np.abs(found.frequencies_hz - frequency).min() < 0.01 * frequency
+    assert found.n_modes <= 6

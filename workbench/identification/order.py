@@ -28,8 +28,9 @@ FALSE_ALARM = 1e-3
 MOST_DAMPED = 0.3
 # Tries that fall below the limit in a row before the record counts as told.
 MOST_REFUSALS = 2
-# A record whose noise is not white may take modes in and put them out for ever.
+# A record whose noise is not white, or whose modes shift as they decay, may take modes in and put them out for ever.
 MOST_ROUNDS = 4
+MOST_SPLITS = 6
 # A swing whose part outside the modes there already is smaller than this share cannot be told from them.
 LEAST_APART = 1e-7
 SAME_SHAPE = 0.95
@@ -112,8 +113,8 @@ class Told:
 
     def grow(self, most_modes: int) -> bool:
         """Take in modes until what is left is noise; whether any came in."""
-        grown, refusals = False, 0
-        while self.poles.size < most_modes and refusals < MOST_REFUSALS:
+        grown, refusals, splits = False, 0, 0
+        while self.poles.size < most_modes and refusals < MOST_REFUSALS and splits < MOST_SPLITS:
             swing, strength = self._strongest_swing()
             if strength < self.enter * self._colour(swing):
                 break
@@ -124,6 +125,10 @@ class Told:
                 gain = 0.0
             if gain < self.limit * self._colour(swing):
                 refusals += 1
+                self.refuse(swing, gain)
+                continue
+            if self._no_modes(found[0]).any():
+                splits += 1
                 self.refuse(swing, gain)
                 continue
             (self.poles, self.weights, self.fits), grown, refusals = found, True, 0
@@ -137,8 +142,8 @@ class Told:
         self.poles, self.weights, self.fits = self._settled(self.poles)
         pruned = False
         while self.poles.size:
-            trials = [(self._ratio(found[2], self.fits), r, found) for r, found in self._suspects()]
-            weak = [t for t in trials if t[0] < self.limit * self._colour(self.poles[t[1]]) or self._no_mode(t[1])]
+            trials = [(self._ratio(found[2], self.fits), r, found, no_mode) for r, found, no_mode in self._suspects()]
+            weak = [t[:3] for t in trials if t[3] or t[0] < self.limit * self._colour(self.poles[t[1]])]
             if not weak:
                 return pruned
             gain, r, found = min(weak, key=lambda t: t[0])
@@ -147,17 +152,15 @@ class Told:
             pruned = True
         return pruned
 
-    def _no_mode(self, r: int) -> bool:
-        """Whether a pole is damped beyond what rings, or splits another mode that has its shape and its band."""
-        pole = self.poles[r]
-        if -pole.real > MOST_DAMPED * abs(pole):
-            return True
-        shapes = self.amplitudes
-        agree = mac(shapes[:, [r]], shapes)[0]
+    def _no_modes(self, poles: np.ndarray) -> np.ndarray:
+        """Which poles are damped beyond what rings, or split another mode that has their shape and their band."""
+        fits = [project(record, poles, self.offset) for record in self.records]
+        shapes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
         size = np.linalg.norm(shapes, axis=0)
-        band = np.abs(self.poles.real) + abs(pole.real) + self.grids[0].bin_width
-        split = (np.abs(self.poles.imag - pole.imag) < band) & (agree > SAME_SHAPE) & (size > size[r])
-        return bool(split.any())
+        band = np.abs(poles.real)[:, None] + np.abs(poles.real) + self.grids[0].bin_width
+        near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
+        split = near & (mac(shapes, shapes) > SAME_SHAPE) & (size[:, None] < size)
+        return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
 
     def report(self, records: Sequence[Record]) -> Identified:
         start = unshaped(self.poles, records[0])
@@ -185,7 +188,6 @@ class Told:
     def _evidence(self) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
         fits = [project(record, self.poles, self.offset) for record in self.records]
-        self.amplitudes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
         n, strength = self.poles.size, np.zeros(self.poles.size)
         for fit in fits:
             for r in range(n):
@@ -195,13 +197,17 @@ class Told:
         return strength
 
     def _suspects(self):
-        """Modes whose amplitudes stand out little, that stand close to another or that are no modes; each with what
-        the search finds without it."""
-        for r, strength in enumerate(self._evidence()):
+        """The weakest that is no mode, or else the modes whose amplitudes stand out little or that stand close to
+        another; each with what the search finds without it, and whether it is no mode."""
+        evidence, no_modes = self._evidence(), self._no_modes(self.poles)
+        if no_modes.any():
+            r = int(np.argmin(np.where(no_modes, evidence, np.inf)))
+            yield r, self._without(r), True
+            return
+        for r, strength in enumerate(evidence):
             near = np.abs(np.delete(self.poles, r) - self.poles[r]).min(initial=np.inf)
-            doubtful = strength < 4.0 * self.limit * self._colour(self.poles[r])
-            if doubtful or near < 2.0 * abs(self.poles[r].real) or self._no_mode(r):
-                yield r, self._without(r)
+            if strength < 4.0 * self.limit * self._colour(self.poles[r]) or near < 2.0 * abs(self.poles[r].real):
+                yield r, self._without(r), False
 
     def _colour(self, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the spectrum left over, 1 if white."""
