@@ -39,7 +39,6 @@ _HOMES = {
     "identification.ibrahim": ("stacked_delays", "two_delays"),
     "identification.refinement": ("Refined", "amplitudes", "bound", "refine"),
     "identification.order": ("Identified", "identify"),
-    "identification.wide": ("identify_in_bands",),
     "identification.eigenfunctions": ("KnownEnds", "eigenfunctions"),
     "identification.bands": ("Bands", "eigenfunction_bands"),
     "identification.distributions": ("Basis", "Distributions", "mass_and_stiffness"),

@@ -67,8 +67,7 @@ def stacked_delays(
     Args:
         records: free decay of the same sensors at one sample rate.
         n_modes: how many; a stabilisation diagram (`stabilise`, `real_modes`) helps to choose.
-        delays: copies of each signal; by default a third of the record, within what a matrix can hold. On a record so
-            long that this leaves a few, `identify_in_bands` tells the modes that these cannot.
+        delays: copies of each signal; by default a third of the record, within what a matrix can hold.
         branch: k of (3.23): frequencies lie between k and k + 1 times the Nyquist frequency.
 
     Returns:

@@ -23,8 +23,9 @@ TOGETHER = 2
 def identify_in_bands(record: Record, *, false_alarm: float = FALSE_ALARM) -> Refined:
     """The modes that a long free decay holds, as many as there are, each with its standard error.
 
-    What `identify` says of a short record, at a cost linear in the samples: for many sensors, tens of thousands of
-    samples and up to hundreds of modes. The poles are refined together on the whole record.
+    What `identify` says of a short record, at a cost linear in the samples. The poles are refined together on the
+    whole record: look at `converged`. Where many modes crowd within a few hundred bins some are missed and the search
+    does not settle; then measure longer, or take `identify`.
 
     Args:
         record: free decay in white noise; each output may hold a constant.
