@@ -1,0 +1,106 @@
+"""Where a record becomes free decay: behind the last force that it feels.
+
+Free decay, read backwards, follows from itself: y(t) = Σ_k c_k y(t + kΔt), the same c_k for every output, for any
+modes with constants and drifts besides. The c_k are learned from the end of the record on, by recursive least squares
+with a short memory, and each few samples are foretold from those after them. A force breaks the rule: what it leaves
+unforetold stands out of the level of what came after. The same is done at a quarter, a sixteenth, ... of the sample
+rate, behind a low-pass filter that leaves free decay one, for what is too slow to be seen from sample to sample.
+"""
+
+import numpy as np
+from scipy.signal import oaconvolve
+from scipy.signal.windows import blackman
+
+from workbench.records.record import Record
+
+# Samples from which the one before is foretold; taken so many at a time, and forgotten over so many times as many.
+ORDER, BLOCK, MEMORY, LEVEL_MEMORY = 32, 4, 4, 2
+MOST_SIGNALS, MOST_SAMPLES = 8, 40_000
+# Means fewer than these cannot teach the rule and be told by it.
+SHORTEST = (4 + LEVEL_MEMORY) * ORDER
+COARSER = 4
+# Squared, of a sample not foretold over the level: alone, and where the motion also rises by so much in energy.
+BREAK, BREAK_RISING, RISE = 100.0, 25.0, 4.0
+# A break that leaves less of the record's energy behind it is not what the decay began with.
+LEAST_LEFT = 0.01
+
+
+def decay_start(record: Record) -> float:
+    """The time from which a record is free decay, s, from its outputs alone.
+
+    The first sample behind the last break of the rule above that leaves a hundredth of the motion's energy behind it:
+    a blow, a hand let go, a second blow. At 40 dB it is found to half the shortest period; at 30 dB a hand lifted off
+    softly may go unseen by sensors of displacement. A record that is free decay throughout, or shorter than two
+    hundred samples, begins with its first sample.
+
+    Args:
+        record: outputs that quieten down at the end; what came before may be anything.
+    """
+    signals, rounding = _scaled(record)
+    n = record.n_samples
+    if not signals.any():
+        return float(record.start_time)
+    left = np.cumsum((signals[:, ::-1] ** 2).sum(axis=0))[::-1]
+    matters = left >= LEAST_LEFT * left[0]
+    starts = np.zeros(1, int)
+    step = 1
+    while n > MOST_SAMPLES * step:
+        step *= COARSER
+    while n // step >= SHORTEST:
+        window = blackman(6 * step, sym=False) if step > 1 else np.ones(1)
+        window /= window.sum()
+        means = oaconvolve(signals, window[None], mode="valid", axes=1)
+        means = means[:, (means.shape[1] - 1) % step :: step]
+        first = n - window.size - step * (means.shape[1] - 1)
+        broken = first + step * np.flatnonzero(_breaks(means, rounding * (window**2).sum()))
+        broken = broken[matters[broken]]
+        # A break known already from more samples is seen by every window that holds it.
+        known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
+        starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
+        step *= COARSER
+    return float(record.time[min(starts.max(), n - 1)])
+
+
+def _scaled(record: Record) -> tuple[np.ndarray, float]:
+    """Strongest combinations of the outputs about where they end, (n_signals, n_samples), and the variance that
+    rounding to the sensors' steps leaves in them."""
+    end = np.median(record.outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
+    about = record.outputs - end
+    # Differences weigh sensors by how they move, not by how they drift.
+    size = np.sqrt((np.diff(about, axis=1) ** 2).mean(axis=1))
+    moving = size > 0
+    if not moving.any():
+        return np.zeros((1, record.n_samples)), 0.0
+    scaled = about[moving] / size[moving, None]
+    steps = [np.diff(np.unique(row)).min(initial=np.inf) for row in scaled]
+    if len(scaled) > MOST_SIGNALS:
+        _, directions = np.linalg.eigh(scaled @ scaled.T)
+        scaled = directions[:, -MOST_SIGNALS:].T @ scaled
+    return scaled, float(np.mean(np.square(steps)) / 12.0)
+
+
+def _breaks(y: np.ndarray, rounding: float) -> np.ndarray:
+    """Samples (n_samples,) that those after them do not foretell."""
+    m, n = y.shape
+    forget, forget_level = np.exp(-BLOCK / (MEMORY * ORDER)), np.exp(-BLOCK / (LEVEL_MEMORY * ORDER))
+    energy = np.r_[np.cumsum((y**2).sum(axis=0)[::-1])[::-1], 0.0]
+    ridge = np.sqrt(max(rounding, 1e-24 * energy[0] / n)) * np.eye(ORDER, ORDER + 1)
+    factor = np.zeros((0, ORDER + 1))
+    ratio, level, weight = np.zeros(n), 0.0, 0.0
+    for t in range(n - ORDER, BLOCK - 1, -BLOCK):
+        at = np.arange(t - BLOCK, t)
+        after = y[:, at[:, None] + np.arange(1, ORDER + 1)].reshape(-1, ORDER)
+        here = y[:, at].reshape(-1)
+        if n - t >= 3 * ORDER:
+            # Rounding enters as a ridge, and as the least level.
+            r = np.linalg.qr(np.vstack([factor, ridge]), mode="r")
+            c = np.linalg.solve(r[:ORDER, :ORDER], r[:ORDER, ORDER])
+            missed = ((here - after @ c).reshape(m, BLOCK) ** 2).mean(axis=0)
+            if n - t >= (3 + LEVEL_MEMORY) * ORDER:
+                ratio[at] = missed / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
+            level, weight = forget_level * level + missed.mean(), forget_level * weight + 1.0
+        factor = np.linalg.qr(np.vstack([np.sqrt(forget) * factor, np.column_stack([after, here])]), mode="r")
+    after = np.arange(1, n + 1)
+    width = np.minimum(after, np.minimum(ORDER, n - after))
+    rises = energy[after] - energy[after + width] > RISE * (energy[after - width] - energy[after])
+    return (ratio > BREAK) | ((ratio > BREAK_RISING) & rises)
