@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import chi2
 
+from workbench.identification.ailments import check_fit
 from workbench.identification.band import Band
 from workbench.identification.ibrahim import check_alike
 from workbench.identification.refinement import MOST_STEPS, Refined, project, refine, search
@@ -75,10 +76,13 @@ def identify(
         false_alarm: chance that noise alone is taken for a mode.
 
     Raises:
-        ValueError: no mode rises above the noise; records that differ in sensors or rate; too few samples.
+        ValueError: no mode rises above the noise; a sensor ails (`check_fit`); records that differ in sensors or rate;
+            too few samples.
     """
     records = [records] if isinstance(records, Record) else list(records)
     check_alike(records)
+    for record in records:
+        check_fit(record)
     longest = max(record.n_samples for record in records)
     told = Told(records, [_Grid(record, longest) for record in records], false_alarm)
     most_modes = min(most_modes, (min(r.n_samples for r in records) - 4) // 3)

@@ -1,0 +1,140 @@
+"""What ails a record, before any mode is sought in it: sensors that are dead, copied, clipped or slower than told."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.records.record import Record
+
+# Values a sensor that moves takes at least.
+FEWEST_VALUES = 4
+# Samples piled up at the end of a range: so many, and so many times those of the next value. A swing that turns back
+# of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before.
+LEAST_PILED, PILED = 8, 6.0
+FEWEST_CHANGES = 16
+SLOWEST = 64
+# Relative to the part of a signal that cannot be foretold from the samples before it.
+COPIED = 1e-2
+FORETOLD_FROM, LONGEST = 16, 20_000
+NOISE_FREE = 1e-9
+
+
+@dataclass(frozen=True)
+class Ailment:
+    """Something in a record that would make identification wrong.
+
+    Attributes:
+        kind: "dead", "copied", "clipped" or "slower".
+        outputs: names of those that have it.
+        message: what, where, why it matters and the way out.
+        until: the last time it touches, s; None where it is all through.
+    """
+
+    kind: str
+    outputs: tuple[str, ...]
+    message: str
+    until: float | None = None
+
+
+def ailments(record: Record) -> tuple[Ailment, ...]:
+    """All that ails a record, empty where nothing does.
+
+    dead: an output takes fewer than four values. copied: two outputs are the same but for scale and a constant, so that
+    their noise would count as two. clipped: samples pile up at an end of an output's range. slower: an output changes
+    at every k-th sample only, because it was sampled at another rate and held, or joined by straight lines.
+    """
+    dead = list(_dead(record))
+    alive = [j for j in range(record.n_outputs) if record.output_names[j] not in {d.outputs[0] for d in dead}]
+    return (*dead, *_copied(record, alive), *_clipped(record, alive), *_slower(record, alive))
+
+
+def check_fit(record: Record) -> None:
+    """Refuse a record that ails.
+
+    Raises:
+        ValueError: the first of `ailments`.
+    """
+    for ailment in ailments(record):
+        raise ValueError(f"record {record.name!r}: {ailment.message}")
+
+
+def _dead(record: Record) -> Iterator[Ailment]:
+    for name, row in zip(record.output_names, record.outputs, strict=True):
+        # the first samples tell of most signals that they move, at no cost
+        few = np.unique(row[:64]).size < FEWEST_VALUES and np.unique(row).size
+        if few and few < FEWEST_VALUES <= record.n_samples:
+            what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
+            yield Ailment("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
+
+
+def _copied(record: Record, alive: list[int]) -> Iterator[Ailment]:
+    if len(alive) < 2:
+        return
+    part = record.outputs[alive, :LONGEST]
+    about = part - part.mean(axis=1, keepdims=True)
+    size = np.sqrt((about**2).mean(axis=1))
+    # A part that stands still has no copy to tell.
+    moving = size > 1e-12 * size.max()
+    scaled = about[moving] / size[moving, None]
+    names = [record.output_names[j] for j, moves in zip(alive, moving, strict=True) if moves]
+    alike = scaled @ scaled.T / part.shape[1]
+    for i, j in zip(*np.nonzero(np.triu(np.abs(alike) > 1.0 - 1e-6, 1)), strict=True):
+        noise = _unforetold(scaled[i])
+        apart = np.sqrt(((scaled[i] - np.sign(alike[i, j]) * scaled[j]) ** 2).mean())
+        # Without noise, sensors of a single mode are the same but for scale.
+        if noise > NOISE_FREE and apart < COPIED * noise:
+            yield Ailment(
+                "copied",
+                (names[i], names[j]),
+                f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
+                " twice; leave one out",
+            )
+
+
+def _unforetold(row: np.ndarray) -> float:
+    """Standard deviation of what the samples before do not foretell."""
+    k = min(FORETOLD_FROM, row.size // 4)
+    if k == 0:
+        return 0.0
+    before = np.lib.stride_tricks.sliding_window_view(row, k)[:-1]
+    return float(np.std(row[k:] - before @ np.linalg.lstsq(before, row[k:], rcond=None)[0]))
+
+
+def _clipped(record: Record, alive: list[int]) -> Iterator[Ailment]:
+    for j in alive:
+        row, name = record.outputs[j], record.output_names[j]
+        for end, side in ((row.max(), "above"), (row.min(), "below")):
+            at = row == end
+            others = row[~at]
+            beside = others[np.argmin(np.abs(others - end))]
+            piled = int(at.sum())
+            if piled >= LEAST_PILED and piled > PILED * np.count_nonzero(row == beside):
+                last = float(record.time[np.flatnonzero(at)[-1]])
+                yield Ailment(
+                    "clipped",
+                    (name,),
+                    f"output {name!r} is cut off {side} at {end:g}, {piled} samples up to {last:g} s: swings beyond it"
+                    " are lost and would be read as modes; begin later, or measure with a larger range",
+                    until=last,
+                )
+                break
+
+
+def _slower(record: Record, alive: list[int]) -> Iterator[Ailment]:
+    for j in alive:
+        row, name = record.outputs[j], record.output_names[j]
+        for order, how in ((1, "held"), (2, "joined by straight lines")):
+            moves = np.abs(np.diff(row, order))
+            changes = np.flatnonzero(moves > 1e-9 * np.abs(row).max())
+            every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= FEWEST_CHANGES else 1
+            # What rests for long and moves again would have its changes far apart.
+            if 1 < every <= SLOWEST and changes.size > 0.5 * (np.ptp(changes) // every):
+                yield Ailment(
+                    "slower",
+                    (name,),
+                    f"output {name!r} changes at every {every}th sample only: it was sampled at"
+                    f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"
+                    " out, or bring all outputs to that rate",
+                )
+                break
