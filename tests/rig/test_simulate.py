@@ -21,7 +21,7 @@ from workbench.rig.elements import (
 )
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import move, simulate
 from workbench.rig.statespace import state_space
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -186,6 +186,14 @@ def test_two_point_elements_and_linear_ones_agree_with_the_structure():
     a = simulate(stepped, inputs, sample_time=DT, substeps=64).outputs
     b = simulate(exact, inputs, sample_time=DT).outputs
     assert np.abs(a - b).max() < 2e-4 * np.abs(b).max()
+
+
+def test_accelerations_where_damping_couples_the_modes_and_a_law_is_not_linear():
+    damped = rig((CubicSpring(4.0, 50.0),), modes=beam(attachments=(PointDamper(3.0, 0.2),)).modes(6))
+    beside = rig((CubicSpring(4.0, 50.0), LinearDamper(3.0, 0.2)))
+    a, b = (move(r, drive(), sample_time=DT, substeps=32) for r in (damped, beside))
+    assert np.abs(damped.modes.damping[0, 1]) > 0.01
+    assert np.abs(a.acceleration - b.acceleration).max() < 1e-3 * np.abs(b.acceleration).max()
 
 
 @pytest.mark.parametrize(

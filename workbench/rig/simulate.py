@@ -230,7 +230,8 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     )
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(n_samples)
     stiffness = modes.omega[:, None] ** 2 * q * scale
-    return Motion(q, v, participation @ at_samples + f - stiffness - modes.damping @ v)
+    # the forces f hold what couples the modes; only each mode's own damping is left
+    return Motion(q, v, participation @ at_samples + f - stiffness - diagonal[:, None] * v)
 
 
 @cache
