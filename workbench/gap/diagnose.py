@@ -8,12 +8,13 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Kind, apply_all
 from workbench.gap.experiment import Experiment, next_experiment
 from workbench.gap.locate import locate
-from workbench.gap.shrinkage import measure
+from workbench.gap.shrinkage import Shrinkage, measure
 from workbench.gap.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 RIVAL = 0.01  # probability from which a rival is worth an experiment
+HELD_OUT, BEYOND = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
 
 
 def diagnose(
@@ -62,21 +63,38 @@ def diagnose(
         free_nominal=free_nominal,
     )
     corrected = apply_all(rig, found.best.effects)
-    effects = found.best.effects if found.outcome in ("none", "explained") else ()
+    shrinkage = measure(rig, corrected, validation, settle=settle)
+    outcome = "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
+    effects = found.best.effects if outcome in ("none", "explained") else ()
     return Verdict(
         case=name,
-        outcome=found.outcome,
+        outcome=outcome,
         effects=found.best.effects,
         alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in found.rivals),
         where=locate(found.evidence, effects),
-        shrinkage=measure(rig, corrected, validation, settle=settle),
+        shrinkage=shrinkage,
         corrected=corrected,
         nominal=rig,
         attribution=found,
         readiness=readiness(rig, found.data, catalogue=catalogue),
         experiment=_next(rig, found),
-        notes=_notes(found),
+        notes=_notes(found, outcome),
     )
+
+
+def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None) -> bool:
+    """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
+
+    Enough effects of the wrong kind bend to the records that they are fitted to, not to others.
+    """
+    if shrinkage is None or _unpredictable(found):
+        return False
+    left = any(shrinkage.after[n] ** 2 > (1.0 + BEYOND) * shrinkage.floor[n] ** 2 for n in shrinkage.after)
+    return left and shrinkage.overall < HELD_OUT
+
+
+def _unpredictable(found: Attribution) -> set[str]:
+    return {effect.kind.name for effect in found.best.effects} & {"random_disturbance", "sensor_quantisation"}
 
 
 def _check(rig: Rig, record: Record) -> None:
@@ -100,9 +118,11 @@ def _next(rig: Rig, found: Attribution) -> Experiment | None:
     return None
 
 
-def _notes(found: Attribution) -> tuple[str, ...]:
-    names = {effect.kind.name for effect in found.best.effects}
+def _notes(found: Attribution, outcome: str) -> tuple[str, ...]:
+    names = _unpredictable(found)
     notes = []
+    if outcome != found.outcome:
+        notes.append("The nearest set explains the records it was fitted to, but not those it has not seen.")
     if "random_disturbance" in names:
         notes.append("A random disturbance leaves a remainder that no model can predict; its statistics were fitted.")
     if "sensor_quantisation" in names:

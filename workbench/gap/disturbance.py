@@ -7,6 +7,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import minimize
 
+from workbench.gap.effects.environment import tone
 from workbench.gap.missing_force import (
     ForceFilter,
     SampledModel,
@@ -23,6 +24,7 @@ COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3)
 LEVEL_SPREAD = 0.15
 WHITENED = 0.08
 FOLLOWS = 0.1
+TONAL = 0.7
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,7 @@ class RandomForceFit:
         chi2_by_record: (n_records,) mean squares of the whitened residual.
         rms_by_record: (n_records,) of the smoothed force, N.
         follows: largest share of the force that the inputs and the motion of its record account for.
+        tonal: least share of the force of a record that one sinusoid accounts for.
     """
 
     at: float
@@ -49,13 +52,16 @@ class RandomForceFit:
     chi2_by_record: np.ndarray
     rms_by_record: np.ndarray
     follows: float
+    tonal: float
 
     @property
     def holds(self) -> bool:
-        """Whether the force is the same in every record, whatever the level, and follows nothing that the rig does."""
+        """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
+        no single tone, which could be predicted.
+        """
         spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
         whitened = np.abs(self.chi2_by_record - 1.0).max()
-        return bool(spread < LEVEL_SPREAD and whitened < WHITENED and self.follows < FOLLOWS)
+        return bool(spread < LEVEL_SPREAD and whitened < WHITENED and self.follows < FOLLOWS and self.tonal < TONAL)
 
 
 def fit_random_force(
@@ -116,7 +122,14 @@ def fit_random_force(
             _followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
             for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
         ),
+        tonal=min(_tonal(force, data.counted[0].sample_time) for force in forces),
     )
+
+
+def _tonal(force: np.ndarray, sample_time: float) -> float:
+    """Share of a force that its strongest sinusoid accounts for."""
+    _, amplitude, _ = tone(force, sample_time)
+    return float(min(0.5 * amplitude**2 / max(force.var(), 1e-300), 1.0))
 
 
 def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceFilter:

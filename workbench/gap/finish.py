@@ -1,63 +1,77 @@
 """A set of effects brought to its end: finer steps, other places, simpler forms, and its rank among others."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.containment import simpler_forms
+from workbench.gap.effects.containment import fewer, simpler_forms
+from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.search import Search
+
+FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
 def finished(search: Search, candidate: Fit) -> Fit:
     """The same set on all records with finer substeps, to the end."""
-    return fit(search.rig, candidate.effects, search.data.stepped(8), iterations=12, tolerance=1e-7)
+    return fit(search.rig, candidate.effects, search.data.stepped(8), iterations=25, tolerance=1e-7)
 
 
 def relocated(search: Search, candidate: Fit) -> Fit:
     """The set with its places tried elsewhere: a symmetric structure has a twin valley at the mirrored place."""
-    length = search.rig.modes.length
-    places = [*(length * np.linspace(0.04, 0.96, 13))]
     for i, effect in enumerate(candidate.effects):
         if "at" not in effect.values or effect.kind.path not in ("structure", "environment"):
             continue
-        moved = []
-        for at in (length - effect.values["at"], *places):
-            elsewhere = replace(effect, values={**effect.values, "at": float(at)})
-            effects = (*candidate.effects[:i], elsewhere, *candidate.effects[i + 1 :])
-            moved.append((cost_of(search.rig, effects, search.quick), effects))
-        moved.sort(key=lambda item: item[0])
-        # the mirrored place is always worth a fit of its own, whatever its cost before it
-        mirrored = (
-            *candidate.effects[:i],
-            replace(effect, values={**effect.values, "at": length - effect.values["at"]}),
-        )
-        trials = [moved[0][1], moved[1][1], (*mirrored, *candidate.effects[i + 1 :])]
-        for effects in trials:
-            started = fit(search.rig, effects, search.quick, iterations=6)
+        for moved in _elsewhere(search, candidate.effects, i):
+            started = fit(search.rig, moved, search.quick, iterations=6)
             trial = fit(search.rig, started.effects, search.data, iterations=10)
             if trial.cost < candidate.cost:
                 candidate = trial
     return finished(search, candidate)
 
 
+def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tuple[Effect, ...]]:
+    """The set with effect i at the two likeliest other places, each at its likeliest strength, and mirrored."""
+    effect, length = effects[i], search.rig.modes.length
+
+    def moved(at: float, factor: float = 1.0) -> tuple[Effect, ...]:
+        values = {**effect.values, "at": float(at)}
+        if strength is not None:
+            values[strength.name] = float(np.clip(factor * values[strength.name], strength.low, strength.high))
+        return (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
+
+    strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name != "at"), None)
+    factors = FACTORS if strength is not None else (1.0,)
+    likeliest = []
+    for at in length * np.linspace(0.04, 0.96, 13):
+        # where the structure moves less, the same effect takes more strength
+        tried = [(cost_of(search.rig, moved(at, factor), search.first), at, factor) for factor in factors]
+        likeliest.append(min(tried))
+    likeliest.sort()
+    # the mirrored place is always worth a fit of its own, whatever its cost before it
+    return [*(moved(at, factor) for _, at, factor in likeliest[:2]), moved(length - effect.values["at"])]
+
+
 def simplest(search: Search, candidate: Fit) -> Fit:
-    """The set with each effect replaced by one it contains as a limit, where the records cannot tell them apart."""
+    """The set with effects replaced by simpler or fewer ones, where the records cannot tell them apart."""
     improved = True
     while improved:
         improved = False
-        for i, effect in enumerate(candidate.effects):
-            for simpler in simpler_forms(effect, search.rig):
-                effects = (*candidate.effects[:i], simpler, *candidate.effects[i + 1 :])
-                trial = fit(search.rig, effects, search.data.stepped(8), iterations=12, tolerance=1e-7)
-                extra = max(candidate.n_parameters - trial.n_parameters, 1)
-                if search.explains(trial) and not search.surely_better(candidate, trial.cost, extra):
-                    candidate, improved = trial, True
-                    break
-            if improved:
+        for effects in _simpler_sets(search, candidate):
+            trial = fit(search.rig, effects, search.data.stepped(8), iterations=12, tolerance=1e-7)
+            extra = max(candidate.n_parameters - trial.n_parameters, 1)
+            if search.explains(trial) and not search.surely_better(candidate, trial.cost, extra):
+                candidate, improved = trial, True
                 break
     return candidate
+
+
+def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]]:
+    yield from fewer(candidate.effects)
+    for i, effect in enumerate(candidate.effects):
+        for simpler in simpler_forms(effect, search.rig):
+            yield (*candidate.effects[:i], simpler, *candidate.effects[i + 1 :])
 
 
 def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:

@@ -10,6 +10,7 @@ from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
 
 HOPELESS = 1e300
+BENT, MOST_BENT = 0.1, 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +132,7 @@ def fit(rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int =
         improved: np.ndarray | None = None
         for _ in range(7):
             step = -np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
+            step = step + _bend(problem, free, residual, jacobian, normal + damping * np.diag(diagonal), step)
             step = np.clip(step, -_LONGEST * _reach(problem), _LONGEST * _reach(problem))
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
@@ -148,6 +150,21 @@ def fit(rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int =
             status = "settled"
             break
     return _result(problem, free, residual, normal, status)
+
+
+def _bend(problem: _Problem, free, residual, jacobian, damped, step) -> np.ndarray:
+    """What the step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
+
+    Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
+    """
+    if step.size < 2:
+        return np.zeros_like(step)
+    beside = problem.residual(free + BENT * step)
+    if beside is None:
+        return np.zeros_like(step)
+    curvature = 2.0 / BENT * ((beside - residual) / BENT - jacobian @ step)
+    turn = -0.5 * np.linalg.solve(damped, jacobian.T @ curvature)
+    return turn if 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step) else np.zeros_like(step)
 
 
 _LONGEST = 1.0

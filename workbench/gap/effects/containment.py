@@ -1,5 +1,9 @@
 """Which effects contain another as a limit: the simpler one is meant where the records cannot tell them apart."""
 
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+
 from workbench.gap.effects.effect import Effect
 from workbench.gap.effects.nonlinear import BOUC_WEN, CLEARANCE, COULOMB_FRICTION
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER, SUPPORT_ROTATION, TRUNCATED_MODES
@@ -35,3 +39,13 @@ def _turned_by(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
     if arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
         return ()
     return (Effect(SUPPORT_ROTATION, end, {"rotational_stiffness": v["stiffness"] * arm**2}),)
+
+
+def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    """The set with two effects of one kind made one, with values to start a fit from: two springs may stand for one."""
+    for one, other in combinations(effects, 2):
+        if one.kind is other.kind and one.target == other.target and "at" in one.values:
+            rest = [effect for effect in effects if effect is not one and effect is not other]
+            places = (one.values["at"], other.values["at"])
+            for at in (*places, 0.5 * sum(places)):
+                yield (*rest, replace(one, values={**one.values, "at": at}))
