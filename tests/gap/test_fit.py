@@ -1,0 +1,117 @@
+"""Fits of what a place and a strength make up for between them, on a beam with known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import _fails_unseen
+from workbench.gap.disturbance import _tonal
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.containment import fewer, simpler_forms
+from workbench.gap.effects.effect import Effect
+from workbench.gap.fit import cost_of, fit
+from workbench.gap.prediction import FitData
+from workbench.gap.shrinkage import Shrinkage
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+NOISE, DT = 1e-5, 0.01
+CUBIC, SPRING, LOSS = (kind_named(n) for n in ("cubic_spring", "ground_spring", "local_stiffness_loss"))
+
+
+@pytest.fixture(scope="module")
+def rig():
+    beam = Beam(
+        length=2.0,
+        mass_per_length=1.0,
+        bending_stiffness=4.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    sensors = [Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
+    return Rig(beam.modes(6), (Actuator("F", 0.45),), sensors, structure=beam)
+
+
+def measured(rig, real):
+    rng = np.random.default_rng(3)
+    command = np.repeat(rng.normal(size=100), 10)[None]
+    clean = simulate(real, command, sample_time=DT, substeps=8).outputs
+    record = Record(
+        sample_time=DT,
+        outputs=clean + NOISE * rng.normal(size=clean.shape),
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
+        inputs=command,
+        input_channels=(Channel("F", "force", at=0.45),),
+    )
+    return FitData((record,), np.full(4, NOISE))
+
+
+def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(rig):
+    real = replace(rig, elements=(CubicSpring(0.2, 400.0),))
+    data = measured(rig, real)
+    nominal = cost_of(rig, (), data)
+    # where the beam moves half as much a spring must be sixteen times as hard
+    found = fit(rig, (Effect(CUBIC, None, {"at": 0.1, "stiffness": 16 * 400.0}),), data, iterations=20)
+    values, spread = found.effects[0].values, found.effects[0].deviations
+    assert nominal > 100 and found.cost < 1.02
+    assert values["at"] == pytest.approx(0.2, abs=4 * spread["at"] + 1e-3)
+    assert values["stiffness"] == pytest.approx(400.0, rel=0.05)
+
+
+def test_a_local_loss_stays_on_the_structure(rig):
+    softened = LOSS.apply(rig, None, {"at": 0.11, "width": 0.2, "loss": 0.1})
+    assert softened.modes.omega[0] < rig.modes.omega[0]
+    with pytest.raises(ValueError, match="beyond the structure"):
+        LOSS.apply(rig, None, {"at": 0.09, "width": 0.2, "loss": 0.1})
+
+
+def test_a_spring_beside_a_hinge_is_a_hinge_that_resists_turning(rig):
+    (left,) = simpler_forms(Effect(SPRING, None, {"at": 0.05, "stiffness": 400.0}), rig)
+    (right,) = simpler_forms(Effect(SPRING, None, {"at": 1.95, "stiffness": 400.0}), rig)
+    assert (left.target, right.target) == ("left", "right")
+    assert left.values["rotational_stiffness"] == pytest.approx(400.0 * 0.05**2)
+    spring = SPRING.apply(rig, None, {"at": 0.01, "stiffness": 1e4}).modes.omega
+    turning = left.kind.apply(rig, "left", {"rotational_stiffness": 1.0}).modes.omega
+    assert spring[:3] == pytest.approx(turning[:3], rel=2e-3) and turning[0] > 1.01 * rig.modes.omega[0]
+    assert simpler_forms(Effect(SPRING, None, {"at": 1.0, "stiffness": 400.0}), rig) == ()
+
+
+def test_two_effects_of_one_kind_may_be_one():
+    first, second = (Effect(CUBIC, None, {"at": at, "stiffness": 1.0}) for at in (0.5, 0.9))
+    other = Effect(SPRING, None, {"at": 1.2, "stiffness": 2.0})
+    sets = list(fewer((first, other, second)))
+    assert [s[0] for s in sets] == [other] * 3
+    assert sorted(s[1].values["at"] for s in sets) == pytest.approx([0.5, 0.7, 0.9])
+    assert not list(fewer((first, other)))
+
+
+def test_a_tone_is_no_random_force():
+    time = DT * np.arange(2000)
+    noise = np.random.default_rng(0).normal(size=2000)
+    slow = np.convolve(noise, np.exp(-np.arange(400) / 80.0), "same")
+    assert _tonal(np.sin(2 * np.pi * 0.33 * time + 1.0) + 0.1 * noise, DT) > 0.95
+    assert _tonal(noise, DT) < 0.1 and _tonal(slow, DT) < 0.6
+
+
+class Found:
+    def __init__(self, *kinds):
+        self.best = type("Fit", (), {"effects": tuple(Effect(kind_named(k), None, {}) for k in kinds)})
+
+
+def test_a_set_must_hold_on_records_it_has_not_seen():
+    def unseen(after, overall):
+        return Shrinkage({"v": 0.5}, {"v": after}, {"v": 0.01}, {"v": overall}, overall, (overall, overall))
+
+    assert _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77))
+    assert not _fails_unseen(Found("cubic_spring"), unseen(0.02, 0.97))
+    assert not _fails_unseen(Found("cubic_spring"), unseen(0.0102, 0.8)), "what is left is noise"
+    assert not _fails_unseen(Found("random_disturbance"), unseen(0.3, 0.1)), "no prediction can hold it"
+    assert not _fails_unseen(Found("cubic_spring"), None)
