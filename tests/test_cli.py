@@ -201,3 +201,22 @@ def test_every_command_explains_itself_with_an_example():
     for name in ("study", "identify", "design", "place", "diagnose", "trial", "report", "bench"):
         result = run(name, "--help")
         assert result.exit_code == 0 and "Example: workbench" in result.output
+
+
+def test_identify_cuts_a_record_to_its_decay_and_says_what_it_did(tmp_path):
+    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
+                damping=ModalDamping(0.01))  # fmt: skip
+    decay = struck(beam.modes(2), at=7.3, positions=[1.0, 3.0])
+    record = free_decay(decay, sample_time=0.5, n_samples=1000, quantity="velocity", noise_std=0.003, seed=3)
+    quiet = 0.003 * np.random.default_rng(0).standard_normal((2, 400))
+    columns = np.vstack([0.5 * np.arange(1400), np.hstack([quiet, record.outputs]), np.arange(1400)]).T
+    path, found = tmp_path / "ring.txt", tmp_path / "found.json"
+    np.savetxt(path, columns, header="t y1 y2 count")
+    refused = run("identify", path)
+    assert refused.exit_code == 2 and "'count' is a straight line, a clock or a counter" in refused.output
+    result = run("identify", path, "--outputs", "y1,y2", "--json", found)
+    assert result.exit_code == 0 and "free decay from 200 s on" in result.output, result.output
+    told = json.loads(found.read_text())
+    assert told["start"] == 200.0 and len(told["frequencies_hz"]) == len(told["remarks"]) == 2
+    later = run("identify", path, "--outputs", "y1,y2", "--start", 250, "--modes", 2)
+    assert later.exit_code == 0 and "900 samples at 2 Hz from 250 s on" in later.output

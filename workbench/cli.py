@@ -159,32 +159,45 @@ def _run(found, data: Path | None, scheduler: str | None) -> bool:
 @_guarded
 def identify(
     record: Annotated[Path, typer.Argument(help="A ring-down: .csv, .txt, .npz, .mat, .h5, .uff.")],
-    modes: Annotated[int | None, typer.Option(help="How many modes; found by stabilisation unless given.")] = None,
+    modes: Annotated[int | None, typer.Option(help="How many modes; those above the noise unless given.")] = None,
     sample_rate_hz: Annotated[float | None, typer.Option(help="Where the file tells no time.")] = None,
-    start: Annotated[float | None, typer.Option(help="Time from which the decay is free, s.")] = None,
+    start: Annotated[
+        float | None, typer.Option(help="Time from which it decays freely, s; found unless given.")
+    ] = None,
     inputs: Annotated[str, typer.Option(help="Names of channels that are inputs, with commas between.")] = "",
+    outputs: Annotated[str, typer.Option(help="Names of the outputs to read, with commas between; else all.")] = "",
     json_path: JsonPath = None,
 ) -> None:
     """Find the modes of a ring-down, each figure with its standard error.
 
-    Example: workbench identify ringdown.csv --modes 5 --json modes.json
+    Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """
     from workbench.records.files import read_record
-    from workbench.study.ring_down import modes_of
+    from workbench.study.ring_down import ring_down
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
-    names = tuple(name.strip() for name in inputs.split(",") if name.strip())
-    read = read_record(record, sample_rate_hz=sample_rate_hz, inputs=names).between(start)
-    found = modes_of(read, n_modes=modes)
-    shown = Table("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity", box=None, pad_edge=False)
+    read = read_record(record, sample_rate_hz=sample_rate_hz, inputs=_names(inputs))
+    if outputs:
+        read = read.only(_names(outputs))
+    told = ring_down(read, start=start, n_modes=modes)
+    found, read = told.refined, told.record
+    shown = Table(box=None, pad_edge=False)
+    for heading in ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity", ""):
+        shown.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
     straight = found.modes.phase_collinearity
-    for r, (f, zeta) in enumerate(zip(found.modes.frequencies_hz, found.modes.zeta)):
-        f_std, zeta_std = found.omega_std[r] / TURN, 100 * found.zeta_std[r]
-        row = (f"{f:.6g}", f"{f_std:.1g}", f"{100 * zeta:.4g}", f"{zeta_std:.1g}", f"{straight[r]:.4f}")
-        shown.add_row(str(r + 1), *row)
-    console.print(f"{read.n_outputs} sensors, {read.n_samples} samples at {read.sample_rate_hz:.6g} Hz", style="bold")
+    for r, remark in enumerate(told.remarks):
+        f, f_std = _to_its_error(found.modes.frequencies_hz[r], found.omega_std[r] / TURN)
+        zeta, zeta_std = _to_its_error(100 * found.modes.zeta[r], 100 * found.zeta_std[r])
+        shown.add_row(str(r + 1), f, f_std, zeta, zeta_std, f"{straight[r]:.4f}", remark)
+    counted = f"{read.n_outputs} sensor{'s' * (read.n_outputs > 1)}, {read.n_samples} samples"
+    console.print(f"{counted} at {read.sample_rate_hz:.6g} Hz from {read.start_time:.6g} s on", style="bold")
     console.print(shown)
+    for note in told.notes:
+        console.print(f"  {note}", markup=False)
+    if told.noise_modes.n_modes:
+        refused = ", ".join(f"{f:.4g}" for f in told.noise_modes.frequencies_hz)
+        console.print(f"  tried and refused, as noise or parts of a mode found: {refused} Hz")
     if not found.converged:
         console.print("  the refinement did not settle: ask for other --modes, or a later --start")
     _write_json(
@@ -192,16 +205,33 @@ def identify(
         {
             "sensors": read.output_names,
             "positions": [channel.at for channel in read.output_channels],
+            "start": read.start_time,
             "frequencies_hz": found.modes.frequencies_hz,
             "frequencies_std_hz": found.omega_std / TURN,
             "damping_ratios": found.modes.zeta,
             "damping_std": found.zeta_std,
             "shapes_real": found.modes.shapes.real,
             "shapes_imag": found.modes.shapes.imag,
+            "phase_collinearity": straight,
+            "remarks": told.remarks,
+            "noise_modes_hz": told.noise_modes.frequencies_hz,
             "noise_std": found.noise_std,
+            "notes": told.notes,
             "converged": found.converged,
         },
     )
+
+
+def _names(text: str) -> tuple[str, ...]:
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def _to_its_error(value: float, error: float) -> tuple[str, str]:
+    """A figure and its standard error, both to the second digit of the error."""
+    if not (math.isfinite(error) and error > 1e-9 * abs(value)):
+        return f"{value:.10g}", f"{error:.1g}"
+    digits = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"
 
 
 @app.command()

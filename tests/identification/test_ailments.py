@@ -57,6 +57,10 @@ def test_dead_sensor(sound):
     assert (found.kind, found.outputs) == ("dead", ("y3",)) and "'y3' stays at 5" in found.message
 
 
+def test_counter_is_no_sensor(sound):
+    assert "clock or a counter" in only(with_row(sound, 2, np.arange(800.0))).message
+
+
 @pytest.mark.parametrize("scale", [1.0, -2.5])
 def test_copied_sensor(sound, scale):
     found = only(with_row(sound, 3, scale * sound.outputs[1] + 0.2))

@@ -40,9 +40,10 @@ class Ailment:
 def ailments(record: Record) -> tuple[Ailment, ...]:
     """All that ails a record, empty where nothing does.
 
-    dead: an output takes fewer than four values. copied: two outputs are the same but for scale and a constant, so that
-    their noise would count as two. clipped: samples pile up at an end of an output's range. slower: an output changes
-    at every k-th sample only, because it was sampled at another rate and held, or joined by straight lines.
+    dead: an output takes fewer than four values, or is a straight line. copied: two outputs are the same but for scale
+    and a constant, so that their noise would count as two. clipped: samples pile up at an end of an output's range.
+    slower: an output changes at every k-th sample only, because it was sampled at another rate and held, or joined by
+    straight lines.
     """
     dead = list(_dead(record))
     alive = [j for j in range(record.n_outputs) if record.output_names[j] not in {d.outputs[0] for d in dead}]
@@ -66,6 +67,12 @@ def _dead(record: Record) -> Iterator[Ailment]:
         if few and few < FEWEST_VALUES <= record.n_samples:
             what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
             yield Ailment("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
+        elif few is False and record.n_samples > 2 and _straight(row):
+            yield Ailment("dead", (name,), f"output {name!r} is a straight line, a clock or a counter; leave it out")
+
+
+def _straight(row: np.ndarray) -> bool:
+    return bool(np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]))
 
 
 def _copied(record: Record, alive: list[int]) -> Iterator[Ailment]:
@@ -104,21 +111,26 @@ def _unforetold(row: np.ndarray) -> float:
 def _clipped(record: Record, alive: list[int]) -> Iterator[Ailment]:
     for j in alive:
         row, name = record.outputs[j], record.output_names[j]
-        for end, side in ((row.max(), "above"), (row.min(), "below")):
-            at = row == end
-            others = row[~at]
-            beside = others[np.argmin(np.abs(others - end))]
-            piled = int(at.sum())
-            if piled >= LEAST_PILED and piled > PILED * np.count_nonzero(row == beside):
-                last = float(record.time[np.flatnonzero(at)[-1]])
-                yield Ailment(
-                    "clipped",
-                    (name,),
-                    f"output {name!r} is cut off {side} at {end:g}, {piled} samples up to {last:g} s: swings beyond it"
-                    " are lost and would be read as modes; begin later, or measure with a larger range",
-                    until=last,
-                )
-                break
+        ends = {"above": row.max(), "below": row.min()}
+        piled = {side: np.flatnonzero(row == end) for side, end in ends.items()}
+        clear = [side for side, at in piled.items() if at.size >= LEAST_PILED and at.size > PILED * _beside(row, at)]
+        if clear:
+            # Where one end of the range is too near, so may be the other: two alike tell.
+            last = float(record.time[max(at[-1] for at in piled.values() if at.size > 1)])
+            yield Ailment(
+                "clipped",
+                (name,),
+                f"output {name!r} is cut off {clear[0]} at {ends[clear[0]]:g}, {piled[clear[0]].size} samples; up to"
+                f" {last:g} s swings beyond the range are lost and would be read as modes; begin later, or measure with"
+                " a larger range",
+                until=last,
+            )
+
+
+def _beside(row: np.ndarray, at: np.ndarray) -> int:
+    """Samples that have the value next to that of the samples `at`."""
+    others = np.delete(row, at)
+    return int(np.count_nonzero(others == others[np.argmin(np.abs(others - row[at[0]]))]))
 
 
 def _slower(record: Record, alive: list[int]) -> Iterator[Ailment]:

@@ -1,4 +1,4 @@
-"""CSV: a header line of names, one row a sample; the first column is time where it is called so."""
+"""CSV: a header line of names, plain or behind #, one row a sample; the first column is time where it is called so."""
 
 import csv
 import json
@@ -21,28 +21,37 @@ def read(path: Path) -> Signals:
     """(time or None, signals by name, header text or None)."""
     header_text: str | None = None
     names: list[str] = []
+    comment = ""
     cells = array("d")
     delimiter = ","
     for number, line in _lines(path):
         if line.startswith(MARK):
             header_text = line[len(MARK) :]
-        elif not line.strip() or line.startswith("#"):
             continue
-        elif not names:
+        if not line.strip() or line.startswith("#"):
+            comment = line if line.strip() else comment
+            continue
+        if not names:
             delimiter = next((d for d in ",;\t" if d in line), " ")
-            names = _names(path, number, _fields(line, delimiter))
-        else:
-            row = _fields(line, delimiter)
-            if len(row) != len(names):
-                raise RecordFileError(f"{path}, row {number} has {len(row)} fields; the header has {len(names)}")
-            try:
-                cells.extend(map(_number, row))
-            except ValueError:
-                name, cell = next((n, c) for n, c in zip(names, row) if not _is_number(c))
-                text = cell if len(cell) < 40 else f"{cell[:40]}..."
-                raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number") from None
-            if number % 1000 == 0:
-                check_counts(path, len(names), len(cells))
+            names = _fields(line, delimiter)
+            # Programs that put comments before numbers, as numpy's savetxt, put the names into the last of them.
+            behind = comment and all(map(_is_number, names))
+            told = _fields(comment.lstrip("# "), delimiter) if behind else []
+            if len(told) != len(names):
+                names = _names(path, number, names)
+                continue
+            names = _names(path, number, told)
+        row = _fields(line, delimiter)
+        if len(row) != len(names):
+            raise RecordFileError(f"{path}, row {number} has {len(row)} fields; the header has {len(names)}")
+        try:
+            cells.extend(map(_number, row))
+        except ValueError:
+            name, cell = next((n, c) for n, c in zip(names, row) if not _is_number(c))
+            text = cell if len(cell) < 40 else f"{cell[:40]}..."
+            raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number") from None
+        if number % 1000 == 0:
+            check_counts(path, len(names), len(cells))
     if not names:
         raise RecordFileError(f"{path} holds no rows")
     check_counts(path, len(names), len(cells))

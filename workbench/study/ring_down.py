@@ -1,49 +1,180 @@
-"""A record as a user has it to refined modes, in one call."""
+"""A record as a user has it to the modes in it, in one call."""
+
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from workbench.identification.ailments import ailments, check_fit
+from workbench.identification.decay import decay_start
+from workbench.identification.drift import without_drift
 from workbench.identification.ibrahim import stacked_delays
-from workbench.identification.refinement import Refined, refine
+from workbench.identification.order import Identified, identify, unshaped
+from workbench.identification.refinement import Refined, project, refine
+from workbench.identification.remarks import SURE, remarks
 from workbench.identification.stabilisation import real_modes, stabilise
 from workbench.records.record import Record
+from workbench.structure.modes import SampledModes
 
 MOST_MODES = 20
+DRIFT_ROUNDS = 3
+# Of the energy of the first quarter, in the last; from there on a record must know its phase after half its length.
+AS_STRONG, REMEMBERED = 0.5, 0.3
 
 
-def modes_of(record: Record, *, n_modes: int | None = None) -> Refined:
-    """The refined modes of a free decay.
+@dataclass(frozen=True, eq=False)
+class RingDown:
+    """What a record holds.
 
-    Unless their number is given, those that stay in a stabilisation diagram are refined, and of these the ones kept
-    without which the record is less likely.
+    Attributes:
+        record: what was read: from the start of the free decay on, without drift.
+        refined: its modes.
+        remarks: one a mode, empty where nothing speaks against it.
+        noise_modes: tried and taken for noise.
+        noise_evidence: (n_noise,) theirs, below `limit`.
+        limit: evidence from which on a mode counts.
+        notes: what was done to the record, and what is left over.
+    """
+
+    record: Record = field(repr=False)
+    refined: Refined
+    remarks: tuple[str, ...]
+    noise_modes: SampledModes = field(repr=False)
+    noise_evidence: np.ndarray = field(repr=False)
+    limit: float
+    notes: tuple[str, ...]
+
+
+def ring_down(record: Record, *, start: float | None = None, n_modes: int | None = None) -> RingDown:
+    """The modes of a record that becomes free decay.
+
+    It is cut where free decay begins and no sample is cut off any more, and a drift is taken out. Unless their number
+    is given, the modes are those that rise above the noise.
+
+    Args:
+        record: of any length before and after the decay.
+        start: where the decay is free, s; found unless given.
+        n_modes: as many as are to be found.
 
     Raises:
-        ValueError: too few samples, or nothing in the record that decays freely.
+        ValueError: a sensor ails; too few samples; nothing in the record that decays freely.
     """
-    if n_modes is not None:
-        if n_modes < 1:
-            raise ValueError(f"at least one mode must be asked for; got {n_modes}")
-        return refine(record, stacked_delays(record, n_modes=n_modes))
+    notes = []
+    if start is None:
+        start, notes = _start(record)
+    cut = record.between(start)
+    check_fit(cut)
+    _check_undriven(cut)
+    try:
+        found, cut, more = _without_drift(cut, n_modes)
+    except np.linalg.LinAlgError:
+        found, more = _by_stabilisation(cut), ("the order could not be told by likelihood: by stabilisation instead",)
+    _check_decays(cut, found.refined)
+    return RingDown(
+        cut,
+        found.refined,
+        remarks(found.refined, cut),
+        found.noise_modes,
+        found.noise_evidence,
+        found.limit,
+        (*notes, *more, *_left_over(cut, found.refined)),
+    )
+
+
+def _start(record: Record) -> tuple[float, list[str]]:
+    """Where free decay begins and nothing is clipped any more, and what to say of it."""
+    start, notes = decay_start(record), []
+    if start > record.start_time:
+        notes.append(f"free decay from {start:.6g} s on; --start sets another time")
+    clipped = [a for a in ailments(record.between(start)) if a.until is not None]
+    behind = max((a.until or start for a in clipped), default=start) + record.sample_time
+    if clipped and behind - start < 0.5 * (record.time[-1] - start):
+        notes.append(f"output {clipped[0].outputs[0]!r} is cut off at an end of its range: read from {behind:.6g} s on")
+        start = behind
+    return start, notes
+
+
+def _without_drift(record: Record, n_modes: int | None) -> tuple[Identified, Record, tuple[str, ...]]:
+    """Modes and drift in turn, as each hides in the other, until neither changes."""
+    size, cleared, poles = np.zeros(record.n_outputs), record, np.zeros(0, complex)
+    span = record.n_samples * record.sample_time
+    for _ in range(DRIFT_ROUNDS):
+        found = _identified(cleared, n_modes)
+        before, poles = poles, found.modes.poles
+        poles = poles[np.abs(poles) * span > 2.0 * np.pi]
+        drift = without_drift(record, poles)
+        if not drift.size.any() or (poles.size == before.size and size.any()):
+            break
+        cleared, size = drift.record, drift.size
+    if not size.any():
+        return found, record, ()
+    largest = int(np.argmax(size / found.refined.noise_std))
+    if size[largest] < found.refined.noise_std[largest]:
+        return found, cleared, ()
+    name = record.output_names[largest]
+    return found, cleared, (f"a drift of {size[largest]:.3g} was taken out of output {name!r}",)
+
+
+def _identified(record: Record, n_modes: int | None) -> Identified:
+    if n_modes is None:
+        return identify(record)
+    if n_modes < 1:
+        raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+    return _as_identified(refine(record, stacked_delays(record, n_modes=n_modes), offset=True), record)
+
+
+def _by_stabilisation(record: Record) -> Identified:
     highest = max(2, min(MOST_MODES, record.n_samples // 8))
     start = real_modes(stabilise(record, orders=range(2, highest + 1))).modes
     if start.n_modes == 0:
         raise ValueError(f"record {record.name!r} holds no mode that stays from order to order: is it a free decay?")
-    return _without_noise_modes(record, refine(record, start))
+    return _as_identified(refine(record, start, offset=True), record)
 
 
-def _without_noise_modes(record: Record, found: Refined) -> Refined:
-    """Leave out the weakest mode as long as the record is as likely without it.
+def _as_identified(refined: Refined, record: Record) -> Identified:
+    """Modes that were asked for: no evidence, none refused."""
+    none = np.zeros(0)
+    return Identified(refined, none, 0.0, unshaped(none.astype(complex), record), none)
 
-    Each mode is 2 n_outputs + 2 numbers; by Schwarz's criterion (Annals of Statistics 6 (1978) 461) it must raise
-    twice the log likelihood by that many times the logarithm of the number of readings.
+
+def _check_undriven(record: Record) -> None:
+    """Refuse a record that is as strong at its end as at its beginning and has forgotten its phase meanwhile.
+
+    A free decay that hardly decays repeats itself after any time; what random forces drive forgets.
     """
-    n, m = record.n_samples, record.n_outputs
-    price = (2 * m + 2) * np.log(n * m)
-    while found.modes.n_modes > 1:
-        strength = (np.abs(found.amplitudes[0]) / found.noise_std[:, None]).max(axis=0)
-        weakest = int(np.argmin(strength))
-        others = [r for r in range(found.modes.n_modes) if r != weakest]
-        without = refine(record, found.modes.select(others))
-        if 2.0 * n * np.log(without.noise_std / found.noise_std).sum() > price:
-            return found
-        found = without
-    return found
+    about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+    about = about / np.maximum(about.std(axis=1, keepdims=True), 1e-300)
+    n = record.n_samples
+    energy = [float((part**2).sum()) for part in np.array_split(about, 4, axis=1)]
+    power = (np.abs(np.fft.rfft(about, 2 * n, axis=1)) ** 2).sum(axis=0)
+    correlation = np.abs(np.fft.irfft(power)[1:n] / (n - np.arange(1, n)))
+    soon, late = correlation[: max(n // 20, 1)].max(), correlation[2 * n // 5 : n // 2].max(initial=0.0)
+    # Noise forgets at once, and holds no mode; that is said elsewhere.
+    swings = soon > REMEMBERED * len(about)
+    if swings and energy[3] > AS_STRONG * energy[0] and late < REMEMBERED * soon:
+        raise ValueError(
+            f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and has"
+            " forgotten its phase. Cut it to where nothing drives it; or, if unknown forces drive it all along, take"
+            " ambient_decays"
+        )
+
+
+def _check_decays(record: Record, refined: Refined) -> None:
+    """Refuse a record whose strongest mode grows."""
+    strongest = int(np.argmax((np.abs(refined.amplitudes[0] / refined.noise_std[:, None]) ** 2).sum(axis=0)))
+    zeta = refined.modes.zeta[strongest]
+    if zeta < -SURE * refined.zeta_std[strongest]:
+        raise ValueError(
+            f"record {record.name!r} grows: its strongest mode, {refined.modes.frequencies_hz[strongest]:.4g} Hz, has a"
+            f" damping ratio of {zeta:.2g}. It is driven, or unstable; cut it to where it decays"
+        )
+
+
+def _left_over(record: Record, refined: Refined) -> tuple[str, ...]:
+    """What to say of what the modes leave, where it is not noise."""
+    residual = project(record, refined.modes.poles, True).residual.T
+    about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+    share = float((residual**2).sum() / (about**2).sum())
+    coloured = float((residual[:, 1:] * residual[:, :-1]).sum() / np.maximum((residual**2).sum(), 1e-300))
+    if share < 1e-12 or abs(coloured) < SURE / np.sqrt(residual.size):
+        return ()
+    return (f"what the modes leave, {100 * np.sqrt(share):.2g} % of the motion, is not white: trust errors less",)

@@ -1,0 +1,102 @@
+"""A record as it really comes: before the decay, drifting, clipped, or no decay at all."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workbench.identification.synthesis import free_decay
+from workbench.records.record import Channel, Record
+from workbench.structure.modes import SampledModes
+from workbench.study.ring_down import _check_undriven, ring_down
+
+ROOT = Path(__file__).resolve().parents[2]
+ARM = Path(os.environ.get("WORKBENCH_SHARED", ROOT.parent / "shared")) / "measured" / "arm-ringdown"
+MODES = SampledModes([8.0, 30.0], [0.01, 0.02], [[1.0, 0.5], [0.3, -0.8]], [0.0, 1.0])
+RNG = np.random.default_rng(4)
+
+
+def decay(n=1000, noise=0.005):
+    return free_decay(MODES, sample_time=0.02, n_samples=n, noise_std=noise, quantity="velocity", seed=3)
+
+
+def found_within_errors(told):
+    omega = told.refined.modes.omega
+    return omega.shape == (2,) and (np.abs(omega - MODES.omega) < 4 * told.refined.omega_std).all()
+
+
+def test_quiet_before_the_blow_and_a_drift_all_along():
+    after = decay()
+    outputs = np.hstack([0.005 * RNG.standard_normal((2, 300)), after.outputs])
+    outputs = outputs + [[1.0], [-0.5]] * np.exp(-0.02 * np.arange(1300) / 9.0)
+    told = ring_down(replace(after, outputs=outputs))
+    assert told.record.start_time == pytest.approx(6.0, abs=0.05)
+    assert found_within_errors(told) and told.remarks == ("", "")
+    assert "free decay from" in told.notes[0] and "a drift of" in told.notes[1]
+
+
+@pytest.mark.parametrize(("n", "limit"), [(1000, 5.0), (190, 10.0)])
+def test_clipped_part_is_left_out(n, limit):
+    """In a long record clipping breaks the rule of free decay; a short one cannot tell that rule."""
+    record = decay(n=n, noise=0.01)
+    outputs = record.outputs.copy()
+    outputs[0] = np.clip(outputs[0], -limit, limit)
+    told = ring_down(replace(record, outputs=outputs))
+    last = record.time[np.abs(record.outputs[0]) > limit][-1]
+    assert last - 0.1 < told.record.start_time < last + 0.5 and found_within_errors(told)
+    if n == 190:
+        begins = f"read from {told.record.start_time:g} s on"
+        assert told.notes == (f"output 'y1' is cut off at an end of its range: {begins}",)
+    with pytest.raises(ValueError, match="begin later, or measure with a larger range"):
+        ring_down(replace(record, outputs=outputs), start=0.0)
+
+
+def test_growth_is_refused():
+    record = decay()
+    with pytest.raises(ValueError, match=r"grows: its strongest mode, 1\.27"):
+        ring_down(replace(record, outputs=record.outputs[:, ::-1]))
+
+
+def test_noise_is_refused():
+    noise = Record(0.01, RNG.standard_normal((3, 800)), tuple(Channel(f"y{i}") for i in range(3)))
+    with pytest.raises(ValueError, match="no mode that rises above its noise"):
+        ring_down(noise)
+
+
+def test_driven_record_is_refused():
+    n, pole = 2000, np.exp((-0.24 + 8.0j) * 0.02)
+    swing = np.zeros(n, complex)
+    force = RNG.standard_normal(n)
+    for k in range(1, n):
+        swing[k] = pole * swing[k - 1] + force[k]
+    driven = Record(0.02, np.vstack([swing.real, 0.5 * swing.real + 0.3 * force]), (Channel("a"), Channel("b")))
+    with pytest.raises(ValueError, match="has forgotten its phase"):
+        ring_down(driven, start=0.0)
+
+
+def test_many_modes_that_hardly_decay_are_not_taken_for_driven():
+    omega = np.sort(RNG.uniform(5.0, 140.0, 20))
+    modes = SampledModes(omega, np.full(20, 1e-5), RNG.standard_normal((3, 20)), np.arange(3.0))
+    _check_undriven(free_decay(modes, sample_time=0.02, n_samples=2000, noise_std=0.5))
+
+
+def test_number_of_modes_as_asked():
+    assert ring_down(decay(), n_modes=1).refined.modes.n_modes == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "seen"),
+    [("hold_and_release_1", (2.5, 18.0, 53.0, 107.0, 178.5)), ("ping_mid_beam_hard", (2.5, 18.0, 53.0, 107.0, 178.5))],
+)
+def test_modes_of_the_measured_arm(name, seen):
+    """Those seen by eye in its spectra; the second record drifts by more than the modes swing."""
+    if not ARM.is_dir():
+        pytest.skip(f"measured records are not at {ARM}")
+    table = np.loadtxt(ARM / f"{name}.txt")
+    told = ring_down(Record(0.002, table[:, -1][None], (Channel("a", "acceleration"),)))
+    sure = told.refined.modes.frequencies_hz[[not remark for remark in told.remarks]]
+    for frequency in seen:
+        assert np.abs(sure / frequency - 1.0).min() < 0.02
