@@ -1,0 +1,239 @@
+from dataclasses import replace
+
+import control
+import numpy as np
+import pytest
+from scipy.optimize import approx_fprime
+
+from workbench.identification.driven import identify_driven
+from workbench.identification.synthesis import free_decay
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.rig.statespace import state_space
+from workbench.structure.member import Beam
+from workbench.structure.modes import SampledModes, mac
+
+DT, N = 0.01, 1000
+OMEGA, ZETA = 2 * np.pi * np.array([3.0, 9.0, 9.27, 20.0]), np.array([0.01, 0.006, 0.012, 0.02])
+POLES = -ZETA * OMEGA + 1j * OMEGA * np.sqrt(1 - ZETA**2)
+
+
+def system(n_outputs=3, n_inputs=2, seed=1):
+    """Four modes, two of them 3 % apart, complex shapes and loads, written out in real modal form."""
+    rng = np.random.default_rng(seed)
+    c = rng.standard_normal((n_outputs, 4)) + 0.1j * rng.standard_normal((n_outputs, 4))
+    loads = rng.standard_normal((4, n_inputs)) + 0.1j * rng.standard_normal((4, n_inputs))
+    blocks = [np.array([[p.real, -p.imag], [p.imag, p.real]]) for p in POLES]
+    a = np.zeros((8, 8))
+    for r, block in enumerate(blocks):
+        a[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] = block
+    b = np.stack([loads.real, loads.imag], axis=1).reshape(8, n_inputs)
+    cc = 2 * np.stack([c.real, -c.imag], axis=2).reshape(n_outputs, 8)
+    return control.ss(a, b, cc, 0.1 * rng.standard_normal((n_outputs, n_inputs)))
+
+
+def excitation(kind, n_inputs=2, n=N, seed=99):
+    rng = np.random.default_rng(seed)
+    if kind == "noise":
+        return rng.standard_normal((n_inputs, n))
+    if kind == "prbs":
+        return np.sign(rng.standard_normal((n_inputs, n)))
+    if kind == "multisine":
+        lines = np.exp(2j * np.pi * rng.random((n_inputs, n // 2 + 1)))
+        return np.fft.irfft(lines, n) * np.sqrt(n)
+    blows = np.zeros((n_inputs, n))
+    for i in range(n_inputs):
+        blows[i, 10 + i * n // n_inputs :][:4] = [20.0, 60.0, 60.0, 20.0]
+    return blows
+
+
+def measured(plant, u, *, fraction=0.0, start=None, seed=0, name="driven"):
+    """Answer to held inputs by python-control, with white noise of a share of each output's rms."""
+    start = np.zeros(plant.nstates) if start is None else start
+    y = control.forced_response(control.c2d(plant, DT, "zoh"), DT * np.arange(u.shape[1]), u, start).outputs
+    y = y.reshape(plant.noutputs, -1)
+    std = fraction * np.sqrt((y**2).mean(axis=1, keepdims=True))
+    y = y + std * np.random.default_rng(seed).standard_normal(y.shape)
+    outputs = tuple(Channel(f"y{j}", "displacement") for j in range(plant.noutputs))
+    inputs = tuple(Channel(f"u{i}", "force") for i in range(plant.ninputs))
+    return Record(DT, y, outputs, u, inputs, name=name)
+
+
+@pytest.mark.parametrize("kind", ["noise", "prbs", "multisine", "hammer"])
+def test_noise_free_is_exact_whatever_the_excitation(kind):
+    plant = system()
+    start = 0.3 * np.random.default_rng(5).standard_normal(8)
+    found = identify_driven(measured(plant, excitation(kind), start=start))
+    assert found.modes.n_modes == 4
+    assert np.abs(found.modes.poles / POLES - 1).max() < 1e-9
+    w = 1j * np.array([1.0, 18.0, 57.0, 58.0, 200.0])
+    assert np.abs(found.state_space(w) - plant(w)).max() < 1e-8 * np.abs(plant(w)).max()
+    assert np.abs(found.feedthrough - plant.D).max() < 1e-8
+    # the initial state in the true coordinates: each mode's free decay at the first sample
+    c = plant.C[:, 0::2] - 1j * plant.C[:, 1::2]
+    decay = c * (start[0::2] + 1j * start[1::2])
+    assert np.allclose(2 * found.modes.shapes * found.initial[0], decay, atol=1e-7)
+
+
+def test_covariance_is_the_cramer_rao_bound_by_brute_force():
+    """The Fisher information of all unknowns at once, from python-control's response by finite differences."""
+    plant, u, std = system(), excitation("noise", n=400), 0.02
+    clean = measured(plant, u)
+    time = clean.time
+
+    def signal(unknowns):
+        poles = unknowns[0:4] + 1j * unknowns[4:8]
+        a = np.zeros((8, 8))
+        for r, p in enumerate(poles):
+            a[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] = [[p.real, -p.imag], [p.imag, p.real]]
+        b, c, d = unknowns[8:24].reshape(8, 2), unknowns[24:48].reshape(3, 8), unknowns[48:54].reshape(3, 2)
+        start, constant = unknowns[54:62], unknowns[62:65]
+        discrete = control.c2d(control.ss(a, b, c, d), DT, "zoh")
+        return (control.forced_response(discrete, time, u, start).outputs + constant[:, None]).ravel()
+
+    at = np.concatenate([POLES.real, POLES.imag, plant.B.ravel(), plant.C.ravel(), plant.D.ravel(), np.zeros(11)])
+    jacobian = approx_fprime(at, signal, 1e-6)
+    # scales of the states are free, so the information is singular; that of the poles and of D is not touched by it
+    bound = std**2 * np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-9)
+    noisy = replace(clean, outputs=clean.outputs + std * np.random.default_rng(0).standard_normal(clean.outputs.shape))
+    found = identify_driven(noisy)
+    x, y, omega = POLES.real, POLES.imag, OMEGA
+    by_omega = np.hstack([np.diag(x / omega), np.diag(y / omega)])
+    by_zeta = np.hstack([np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)])
+    omega_std = np.sqrt(np.diag(by_omega @ bound[:8, :8] @ by_omega.T))
+    zeta_std = np.sqrt(np.diag(by_zeta @ bound[:8, :8] @ by_zeta.T))
+    # the noise is estimated from the record too
+    assert np.allclose(found.omega_std, omega_std, rtol=0.12)
+    assert np.allclose(found.zeta_std, zeta_std, rtol=0.12)
+    assert np.allclose(found.feedthrough_std, np.sqrt(np.diag(bound)[48:54]).reshape(3, 2), rtol=0.12)
+
+
+def normalised_errors(draws):
+    plant, u = system(), excitation("noise")
+    c = plant.C[:, 0::2] - 1j * plant.C[:, 1::2]
+    loads = plant.B[0::2] + 1j * plant.B[1::2]
+    figures, shapes, residues = [], [], []
+    for seed in range(draws):
+        found = identify_driven(measured(plant, u, fraction=0.01, start=0.3 * np.ones(8), seed=seed))
+        assert found.modes.n_modes == 4
+        omega, zeta = found.modes.omega - OMEGA, found.modes.zeta - ZETA
+        figures.append(np.r_[omega / found.omega_std, zeta / found.zeta_std])
+        k, r = np.abs(found.modes.shapes).argmax(axis=0), np.arange(4)
+        error = (found.modes.shapes / found.modes.shapes[k, r] - c / c[k, r]).real
+        std = found.shape_std
+        shapes.append((error[std > 0] / std[std > 0]).ravel())
+        true = loads * (0.5 * c[k, r] / found.modes.shapes[k, r])[:, None]
+        residues.append(np.abs(found.participation - true) / found.participation_std)
+    return np.array(figures), np.concatenate(shapes), np.array(residues)
+
+
+def test_errors_are_as_large_as_they_are_said_to_be():
+    figures, shapes, participation = normalised_errors(6)
+    # 48 normalised errors of unit variance: their mean square strays from 1 by 0.2 (one sigma)
+    assert 0.45 < (figures**2).mean() < 1.6
+    assert 0.45 < (shapes**2).mean() < 1.6
+    assert 0.45 < 0.5 * (participation**2).mean() < 1.6
+
+
+@pytest.mark.slow
+def test_intervals_cover():
+    figures, shapes, participation = normalised_errors(300)
+    assert 0.93 < (np.abs(figures) < 1.96).mean() < 0.97
+    assert 0.93 < (np.abs(shapes) < 1.96).mean() < 0.97
+    assert 0.93 < 0.5 * (participation**2).mean() < 1.07
+    assert np.sqrt((figures**2).mean(axis=0)).max() < 1.2
+
+
+def test_response_is_the_records_within_noise():
+    plant, u = system(), excitation("prbs")
+    start = 0.3 * np.ones(8)
+    record = measured(plant, u, fraction=0.05, start=start)
+    found = identify_driven(record)
+    model = control.c2d(found.state_space, DT, "zoh")
+    assert found.state_space.input_labels == ["u0", "u1"]
+    assert found.state_space.output_labels == ["y0", "y1", "y2"]
+    answer = control.forced_response(model, record.time, u, found.initial_state()).outputs
+    noise = (record.outputs - measured(plant, u, start=start).outputs).std(axis=1)
+    assert np.allclose((answer - record.outputs).std(axis=1), noise, rtol=0.03)
+
+
+def test_blows_one_record_each_give_one_set_of_modes():
+    plant = system()
+    first, second = (np.array([[1.0], [0.0]]) * excitation("hammer"), np.array([[0.0], [1.0]]) * excitation("hammer"))
+    records = [measured(plant, u, fraction=0.01, seed=k, name=f"blow {k}") for k, u in enumerate((first, second))]
+    found = identify_driven(records)
+    assert found.modes.n_modes == 4
+    assert np.abs((found.modes.omega - OMEGA) / found.omega_std).max() < 4
+    resting = identify_driven(records, at_rest=True)
+    assert (resting.omega_std < found.omega_std).all()
+    with pytest.raises(ValueError, match="input 'u1' is zero throughout"):
+        identify_driven(records[0])
+
+
+def test_ahead_of_realisation_from_markov_parameters():
+    """python-control's own way from the same record: least squares Markov parameters, then ERA, order given."""
+    plant, u = system(), excitation("noise")
+    ours, theirs = [], []
+    for seed in range(2):
+        record = measured(plant, u, fraction=0.01, seed=seed)
+        found = identify_driven(record)
+        ours.append(np.abs(found.modes.omega / OMEGA - 1).max())
+        markov = control.markov(record.outputs, u, 100, dt=DT)
+        realised = control.eigensys_realization(markov, 8, dt=DT)[0]
+        poles = np.log(realised.poles()) / DT
+        omega = np.sort(np.abs(poles[poles.imag > 0]))
+        theirs.append(np.abs(omega / OMEGA - 1).max() if omega.size == 4 else 1.0)
+    assert max(ours) < 0.2 * min(theirs)
+
+
+def test_accelerations_of_a_beam():
+    """A cantilever under two forces: modes, shapes and response of the rig, found from its accelerometers."""
+    beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")
+    modes = replace(beam.modes(4), damping=np.array([0.01, 0.006, 0.008, 0.01]))
+    actuators = (Actuator("shaker", 0.37), Actuator("tip", 1.0))
+    sensors = tuple(Sensor(f"a{k}", x, "acceleration") for k, x in enumerate((0.25, 0.5, 0.75, 1.0)))
+    u = excitation("noise")
+    record = simulate(Rig(modes, actuators, sensors), u, sample_time=0.02)
+    noise = 0.001 * record.outputs.std() * np.random.default_rng(1).standard_normal(record.outputs.shape)
+    found = identify_driven(replace(record, outputs=record.outputs + noise))
+    assert found.modes.n_modes == 4
+    assert np.abs((found.modes.omega - modes.omega) / found.omega_std).max() < 4
+    assert np.diag(mac(found.modes.shapes, modes.phi(record.positions))).min() > 0.999
+    w = 1j * np.r_[1.0, modes.omega]
+    true = state_space(modes, actuators, sensors)(w)
+    assert np.abs(found.state_space(w) - true).max() < 0.01 * np.abs(true).max()
+
+
+def test_inputs_that_run_straight_between_samples():
+    plant = system(n_outputs=2, n_inputs=1)
+    u = np.cumsum(excitation("noise", 1), axis=1) * 0.1
+    fine = 20
+    time = DT / fine * np.arange((N - 1) * fine + 1)
+    # first order hold by python-control: a ramp is linear in time, so lsim of the continuous system has it
+    y = control.forced_response(plant, time, np.interp(time, DT * np.arange(N), u[0])).outputs[:, ::fine]
+    record = Record(DT, y, (Channel("a"), Channel("b")), u, (Channel("f", "force"),))
+    found = identify_driven(record, straight=True)
+    assert np.abs(found.modes.poles / POLES - 1).max() < 1e-7
+    w = 1j * OMEGA
+    assert np.abs(found.state_space(w) - plant(w)).max() < 1e-6 * np.abs(plant(w)).max()
+
+
+def test_what_cannot_be_identified_is_refused():
+    decay = free_decay(SampledModes([10.0], [0.01], [[1.0]], [0.0]), sample_time=DT, n_samples=200)
+    with pytest.raises(ValueError, match="has no inputs; of a free decay"):
+        identify_driven(decay)
+    record = measured(system(), excitation("noise"))
+    twice = replace(record, inputs=np.vstack([record.inputs[0], 3.0 * record.inputs[0]]))
+    with pytest.raises(ValueError, match="'u0' and 'u1' are the same signal"):
+        identify_driven(twice)
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="no mode between inputs u0, u1"):
+        identify_driven(replace(record, outputs=rng.standard_normal(record.outputs.shape)))
+    with pytest.raises(ValueError, match="too few"):
+        identify_driven(record.between(0.0, 0.1))
+    other = replace(record, input_channels=(Channel("u0"), Channel("w")))
+    with pytest.raises(ValueError, match="the same inputs"):
+        identify_driven([record, other])
