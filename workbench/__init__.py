@@ -39,6 +39,7 @@ _HOMES = {
     "identification.ibrahim": ("stacked_delays", "two_delays"),
     "identification.refinement": ("Refined", "amplitudes", "bound", "refine"),
     "identification.order": ("Identified", "identify"),
+    "identification.driven": ("Driven", "identify_driven"),
     "identification.ailments": ("ailments", "check_fit"),
     "identification.decay": ("decay_start",),
     "identification.eigenfunctions": ("KnownEnds", "eigenfunctions"),
