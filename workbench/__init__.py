@@ -41,6 +41,7 @@ _HOMES = {
     "identification.order": ("Identified", "identify"),
     "identification.driven": ("Driven", "identify_driven"),
     "identification.ailments": ("ailments", "check_fit"),
+    "identification.ambient": ("AmbientModes", "ambient_decays", "identify_ambient"),
     "identification.decay": ("decay_start",),
     "identification.eigenfunctions": ("KnownEnds", "eigenfunctions"),
     "identification.bands": ("Bands", "eigenfunction_bands"),
