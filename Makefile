@@ -14,7 +14,7 @@ study: $(BIN)/workbench  ## the main job: a beam from measured response to contr
 	$(BIN)/workbench study beam
 
 test: $(BIN)/workbench  ## the default test run
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
 test-slow: $(BIN)/workbench  ## the longer trials
 	$(BIN)/python -m pytest -q -m slow
