@@ -195,6 +195,20 @@ def identify(
     console.print(shown)
     for note in told.notes:
         console.print(f"  {note}", markup=False)
+    stretches = told.by_amplitude
+    amplitudes = {}
+    for r in [r for r, depends in enumerate(stretches.depends) if depends]:
+        seen = [w for w, omega in enumerate(stretches.omega[:, r]) if math.isfinite(omega)]
+        at = [(stretches.amplitude[w, r], stretches.omega[w, r] / TURN, stretches.zeta[w, r]) for w in seen]
+        shown_at = "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for size, f, zeta in at)
+        console.print(f"  mode {r + 1} depends on amplitude: {shown_at}")
+        amplitudes[str(r + 1)] = {
+            "amplitude": stretches.amplitude[seen, r],
+            "frequencies_hz": stretches.omega[seen, r] / TURN,
+            "frequencies_std_hz": stretches.omega_std[seen, r] / TURN,
+            "damping_ratios": stretches.zeta[seen, r],
+            "damping_std": stretches.zeta_std[seen, r],
+        }
     if told.noise_modes.n_modes:
         refused = ", ".join(f"{f:.4g}" for f in told.noise_modes.frequencies_hz)
         console.print(f"  tried and refused, as noise or parts of a mode found: {refused} Hz")
@@ -214,6 +228,7 @@ def identify(
             "shapes_imag": found.modes.shapes.imag,
             "phase_collinearity": straight,
             "remarks": told.remarks,
+            "depends_on_amplitude": amplitudes,
             "noise_modes_hz": told.noise_modes.frequencies_hz,
             "noise_std": found.noise_std,
             "notes": told.notes,

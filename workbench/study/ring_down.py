@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from workbench.identification.ailments import ailments, check_fit
+from workbench.identification.amplitude import AmplitudeDependence, amplitude_dependence
 from workbench.identification.decay import decay_start
 from workbench.identification.drift import without_drift
 from workbench.identification.ibrahim import stacked_delays
@@ -17,8 +18,10 @@ from workbench.structure.modes import SampledModes
 
 MOST_MODES = 20
 DRIFT_ROUNDS = 3
-# Of the energy of the first quarter, in the last; from there on a record must know its phase after half its length.
-AS_STRONG, REMEMBERED = 0.5, 0.3
+# Energy of the second half over that of the first, either way; such a record must know its phase after a third of it.
+AS_STRONG, REMEMBERED = 0.5, 0.5
+# Correlation of noise, times the root of its samples, is 1.
+FORGETFUL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,7 @@ class RingDown:
         noise_modes: tried and taken for noise.
         noise_evidence: (n_noise,) theirs, below `limit`.
         limit: evidence from which on a mode counts.
+        by_amplitude: its modes stretch by stretch of the decay.
         notes: what was done to the record, and what is left over.
     """
 
@@ -41,6 +45,7 @@ class RingDown:
     noise_modes: SampledModes = field(repr=False)
     noise_evidence: np.ndarray = field(repr=False)
     limit: float
+    by_amplitude: AmplitudeDependence
     notes: tuple[str, ...]
 
 
@@ -76,6 +81,7 @@ def ring_down(record: Record, *, start: float | None = None, n_modes: int | None
         found.noise_modes,
         found.noise_evidence,
         found.limit,
+        amplitude_dependence(cut, found.refined),
         (*notes, *more, *_left_over(cut, found.refined)),
     )
 
@@ -139,18 +145,21 @@ def _as_identified(refined: Refined, record: Record) -> Identified:
 def _check_undriven(record: Record) -> None:
     """Refuse a record that is as strong at its end as at its beginning and has forgotten its phase meanwhile.
 
-    A free decay that hardly decays repeats itself after any time; what random forces drive forgets.
+    A free decay that hardly decays repeats itself after any time; what random forces drive forgets. Of
+    records of twenty decay times three in four are told, of a hundred nine in ten.
     """
     about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
     about = about / np.maximum(about.std(axis=1, keepdims=True), 1e-300)
     n = record.n_samples
-    energy = [float((part**2).sum()) for part in np.array_split(about, 4, axis=1)]
+    energy = [float((part**2).sum()) for part in np.array_split(about, 2, axis=1)]
     power = (np.abs(np.fft.rfft(about, 2 * n, axis=1)) ** 2).sum(axis=0)
-    correlation = np.abs(np.fft.irfft(power)[1:n] / (n - np.arange(1, n)))
-    soon, late = correlation[: max(n // 20, 1)].max(), correlation[2 * n // 5 : n // 2].max(initial=0.0)
+    correlation = np.fft.irfft(power)[1:n] / (n - np.arange(1, n)) / len(about)
+    soon, late = (
+        float(np.sqrt((part**2).mean())) for part in (correlation[: n // 20 + 1], correlation[n // 3 : n // 2])
+    )
     # Noise forgets at once, and holds no mode; that is said elsewhere.
-    swings = soon > REMEMBERED * len(about)
-    if swings and energy[3] > AS_STRONG * energy[0] and late < REMEMBERED * soon:
+    swings = soon > FORGETFUL / np.sqrt(n)
+    if swings and AS_STRONG < energy[1] / max(energy[0], 1e-300) < 1.0 / AS_STRONG and late < REMEMBERED * soon:
         raise ValueError(
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and has"
             " forgotten its phase. Cut it to where nothing drives it; or, if unknown forces drive it all along, take"
