@@ -268,7 +268,7 @@ class Told:
 
 def tell(drive: Drive, *, most_modes: int, false_alarm: float = FALSE_ALARM) -> Told:
     """The modes whose likelihood ratio is more than noise would give, taken in one by one and each tried again."""
-    outputs, drives = drive.values.shape[1], drive.answers(1j * 0.5 * drive.highest)[0].shape[1]
+    outputs, drives = drive.values.shape[1], drive.answers((-0.1 + 0.5j) * drive.highest)[0].shape[1]
     limit = float(chi2.isf(false_alarm / drive.cells, 2 * (outputs + drives)))
     fit = projected(drive, np.zeros(0, complex), np.zeros((0, drives), complex))
     for _ in range(MOST_ROUNDS):

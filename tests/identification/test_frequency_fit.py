@@ -1,0 +1,95 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from workbench.identification.frequency_fit import coherence_noise, identify_transfer
+from workbench.records.record import Channel
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import state_space
+from workbench.structure.member import Beam
+from workbench.structure.modes import mac
+
+SHARED = Path(os.environ.get("WORKBENCH_SHARED", Path(__file__).resolve().parents[3] / "shared"))
+RULER = SHARED / "measured" / "ruler" / "ruler.mat"
+F = np.arange(1.0, 26.0, 0.02)
+PLACES = (0.2, 0.45, 0.7, 1.0)
+
+
+def beam(quantity):
+    """Accelerance or receptance of a cantilever of eight modes under two hammers, by python-control.
+
+    Modes 2 to 4 lie in the band, one below and four above.
+    """
+    structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")
+    modes = structure.modes(8)
+    modes = type(modes)(modes.omega, np.full(8, 0.01), modes.shapes, modes.length, modes.essential)
+    sensors = [Sensor(f"y{k}", x, quantity) for k, x in enumerate(PLACES)]
+    plant = state_space(modes, [Actuator("h1", 0.37), Actuator("h2", 0.93)], sensors)
+    return modes, plant(2j * np.pi * F), tuple(Channel(s.name, quantity, at=s.at) for s in sensors)
+
+
+def noisy(h, seed, fraction=0.01):
+    rng = np.random.default_rng(seed)
+    std = fraction * np.abs(h).mean() * np.broadcast_to(1.0 + np.sin(F) ** 2, h.shape)
+    return h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape)), std
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
+def test_modes_of_the_band_whatever_lies_beyond(quantity):
+    modes, h, channels = beam(quantity)
+    errors = []
+    for seed in range(3):
+        measured, std = noisy(h, seed)
+        found = identify_transfer(measured, F, channels=channels, noise_std=std)
+        assert found.modes.n_modes == 3
+        assert np.diag(mac(found.modes.shapes, modes.phi(np.array(PLACES))[:, 1:4])).min() > 0.999
+        assert np.abs(found.fitted - h).max() < 0.02 * np.abs(h).max()
+        errors.append(np.r_[(found.modes.omega - modes.omega[1:4]) / found.omega_std])
+        errors.append((found.modes.zeta - 0.01) / found.zeta_std)
+        # participation of the two hammers goes as the shape where they strike
+        ratio = found.participation[:, 1] / found.participation[:, 0]
+        struck = modes.phi(np.array([0.37, 0.93]))[:, 1:4]
+        assert np.allclose(ratio, struck[1] / struck[0], rtol=0.05)
+    assert 0.3 < (np.array(errors) ** 2).mean() < 2.2
+
+
+def test_noise_from_coherence():
+    """H1 of noisy averages against its own scatter over many trials."""
+    rng, averages, trials = np.random.default_rng(0), 40, 3000
+    u = rng.standard_normal((trials, averages)) + 1j * rng.standard_normal((trials, averages))
+    y = (2.0 - 1.0j) * u + 0.5 * (rng.standard_normal(u.shape) + 1j * rng.standard_normal(u.shape))
+    crossed, own, out = (y * u.conj()).sum(1), (np.abs(u) ** 2).sum(1), (np.abs(y) ** 2).sum(1)
+    h, squared = crossed / own, np.abs(crossed) ** 2 / (own * out)
+    assert coherence_noise(h, squared, averages=averages).mean() == pytest.approx(h.real.std(), rel=0.05)
+    with pytest.raises(ValueError, match="two averages"):
+        coherence_noise(h, squared, averages=1)
+
+
+def test_what_is_no_transfer_function_is_refused():
+    _, h, channels = beam("displacement")
+    with pytest.raises(ValueError, match="Is frequency the last axis"):
+        identify_transfer(h[:, 0].T, F, channels=channels)
+    with pytest.raises(ValueError, match="0 lines lie between 90 and 95 Hz"):
+        identify_transfer(h, F, channels=channels, band_hz=(90, 95))
+    with pytest.raises(ValueError, match="noise_std must be positive"):
+        identify_transfer(h, F, channels=channels, noise_std=np.zeros(h.shape))
+
+
+@pytest.mark.skipif(not RULER.is_file(), reason=f"the measured ruler is not at {RULER}")
+def test_the_measured_ruler():
+    """Frequencies seen by eye; points measured one after another disagree a little, which broad modes take up."""
+    transfer = loadmat(RULER)["yspec"].T
+    lines = np.linspace(0.0, 10_000.0, transfer.shape[1])
+    places = np.linspace(0.003, 0.983, 10)
+    channels = tuple(Channel(f"point {k}", "acceleration", at=float(x)) for k, x in enumerate(places))
+    found = identify_transfer(transfer, lines, channels=channels, band_hz=(25.0, 800.0), most_modes=14)
+    rings = found.modes.select(np.flatnonzero(found.modes.zeta < 0.1))
+    seen = np.array([39.4, 108.8, 212.0, 352.6, 517.9, 551.0, 729.0])
+    assert rings.n_modes == seen.size
+    assert np.abs(rings.frequencies_hz / seen - 1).max() < 0.005
+    free = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(6)
+    assert np.diag(mac(rings.shapes[:, :4], free.phi(places)[:, 2:6])).min() > 0.95
