@@ -3,11 +3,12 @@
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 
 from workbench.identification.ailments import ailments, check_fit
 from workbench.identification.amplitude import AmplitudeDependence, amplitude_dependence
 from workbench.identification.decay import decay_start
-from workbench.identification.drift import without_drift
+from workbench.identification.drift import HIGHEST_DEGREE, without_drift
 from workbench.identification.ibrahim import stacked_delays
 from workbench.identification.order import Identified, identify, unshaped
 from workbench.identification.refinement import Refined, project, refine
@@ -148,9 +149,11 @@ def _check_undriven(record: Record) -> None:
     A free decay that hardly decays repeats itself after any time; what random forces drive forgets. Of
     records of twenty decay times three in four are told, of a hundred nine in ten.
     """
-    about = record.outputs - record.outputs.mean(axis=1, keepdims=True)
-    about = about / np.maximum(about.std(axis=1, keepdims=True), 1e-300)
+    # Drifts may be strong at both ends, and swing not at all.
     n = record.n_samples
+    slow = np.linalg.qr(legvander(np.linspace(-1.0, 1.0, n), HIGHEST_DEGREE))[0]
+    about = record.outputs - (record.outputs @ slow) @ slow.T
+    about = about / np.maximum(about.std(axis=1, keepdims=True), 1e-300)
     energy = [float((part**2).sum()) for part in np.array_split(about, 2, axis=1)]
     power = (np.abs(np.fft.rfft(about, 2 * n, axis=1)) ** 2).sum(axis=0)
     correlation = np.fft.irfft(power)[1:n] / (n - np.arange(1, n)) / len(about)
