@@ -183,16 +183,19 @@ def identify(
     told = ring_down(read, start=start, n_modes=modes)
     found, read = told.refined, told.record
     shown = Table(box=None, pad_edge=False)
-    for heading in ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity", ""):
+    for heading in ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity"):
         shown.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
     straight = found.modes.phase_collinearity
-    for r, remark in enumerate(told.remarks):
+    for r in range(found.modes.n_modes):
         f, f_std = _to_its_error(found.modes.frequencies_hz[r], found.omega_std[r] / TURN)
         zeta, zeta_std = _to_its_error(100 * found.modes.zeta[r], 100 * found.zeta_std[r])
-        shown.add_row(str(r + 1), f, f_std, zeta, zeta_std, f"{straight[r]:.4f}", remark)
+        shown.add_row(str(r + 1), f, f_std, zeta, zeta_std, f"{straight[r]:.4f}")
     counted = f"{read.n_outputs} sensor{'s' * (read.n_outputs > 1)}, {read.n_samples} samples"
     console.print(f"{counted} at {read.sample_rate_hz:.6g} Hz from {read.start_time:.6g} s on", style="bold")
     console.print(shown)
+    for r, remark in enumerate(told.remarks):
+        if remark:
+            console.print(f"  mode {r + 1}: {remark}")
     for note in told.notes:
         console.print(f"  {note}", markup=False)
     stretches = told.by_amplitude

@@ -47,7 +47,7 @@ class AmplitudeDependence:
     @property
     def depends(self) -> np.ndarray:
         """Modes (n_modes,) that depend on amplitude: chance under one in a thousand over all that was compared."""
-        return (self.probability < SURE / self.probability.size).any(axis=0)
+        return np.any(self.probability < SURE / self.probability.size, axis=0)
 
 
 def amplitude_dependence(record: Record, refined: Refined, *, stretches: int = STRETCHES) -> AmplitudeDependence:
@@ -77,7 +77,7 @@ def amplitude_dependence(record: Record, refined: Refined, *, stretches: int = S
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
         try:
-            found = refine(_samples(record, first, last), modes.select(there), offset=True)
+            found = refine(_samples(record, first, last), modes.select(list(there)), offset=True)
         except np.linalg.LinAlgError:
             continue
         if not found.converged:

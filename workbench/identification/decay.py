@@ -93,13 +93,14 @@ def _breaks(y: np.ndarray, rounding: float) -> np.ndarray:
         here = y[:, at].reshape(-1)
         if n - t >= 3 * ORDER:
             # Rounding enters as a ridge, and as the least level.
-            r = np.linalg.qr(np.vstack([factor, ridge]), mode="r")
+            r = np.asarray(np.linalg.qr(np.vstack([factor, ridge]), mode="r"))
             c = np.linalg.solve(r[:ORDER, :ORDER], r[:ORDER, ORDER])
             missed = ((here - after @ c).reshape(m, BLOCK) ** 2).mean(axis=0)
             if n - t >= (3 + LEVEL_MEMORY) * ORDER:
                 ratio[at] = missed / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
             level, weight = forget_level * level + missed.mean(), forget_level * weight + 1.0
-        factor = np.linalg.qr(np.vstack([np.sqrt(forget) * factor, np.column_stack([after, here])]), mode="r")
+        rows = np.vstack([np.sqrt(forget) * factor, np.column_stack([after, here])])
+        factor = np.asarray(np.linalg.qr(rows, mode="r"))
     after = np.arange(1, n + 1)
     width = np.minimum(after, np.minimum(ORDER, n - after))
     rises = energy[after] - energy[after + width] > RISE * (energy[after - width] - energy[after])

@@ -64,7 +64,7 @@ def ring_down(record: Record, *, start: float | None = None, n_modes: int | None
     Raises:
         ValueError: a sensor ails; too few samples; nothing in the record that decays freely.
     """
-    notes = []
+    notes: list[str] = []
     if start is None:
         start, notes = _start(record)
     cut = record.between(start)
