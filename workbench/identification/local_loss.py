@@ -127,7 +127,7 @@ def _smooth(task: Task, basis, terms, lossy: FittedStructure, limit: float) -> F
     most = alike(terms[0][-1], terms[1][-1])
     if most.chi2 - lossy.criterion + _price(task) > limit:
         return most
-    return choose(task, basis, *terms, lambda problem, near: problem.fit(near))
+    return choose(task, basis, terms[0], terms[1], lambda problem, near: problem.fit(near))
 
 
 def _near_the_last(problem: Problem, near: FittedStructure | None) -> FittedStructure:
