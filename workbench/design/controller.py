@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.design.closed_loop import ClosedLoop
+from workbench.design.closed_loop import ClosedLoop, close_loop
 from workbench.design.law import Law
 from workbench.design.modal_filter import ModalFilter
 from workbench.rig.sensors import MEASURED, Sensor
@@ -86,8 +86,10 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     return Controller(law, tuple(sensors), *empty, direct, f"{law.name} through a modal filter")
 
 
-def close_with(modes: Modes, controller: Controller) -> ClosedLoop:
-    """The loop of all modes, controlled and residual, states (q, q', z)."""
+def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
+    """The loop of all modes, controlled and residual, states (q, q', z); a law alone reads exact modal coordinates."""
+    if isinstance(controller, Law):
+        return close_loop(modes, controller)
     n = modes.n_modes
     b = input_matrix(modes, controller.law.actuators)
     force = np.vstack([np.zeros_like(b), b])

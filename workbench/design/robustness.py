@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from workbench.design.controller import Controller, close_with
 from workbench.design.explain import stability_margin
-from workbench.design.law import DesignError
+from workbench.design.law import DesignError, Law
 from workbench.design.spillover import finite_spillover
 from workbench.structure.modes import Modes, frozen
 
@@ -109,7 +109,7 @@ def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
 
 
 def survive(
-    possible: list[Modes], designs: Mapping[str, Controller], *, state: np.ndarray, final_time: float
+    possible: list[Modes], designs: Mapping[str, Controller | Law], *, state: np.ndarray, final_time: float
 ) -> dict[str, Survival]:
     """Each design on each possible structure.
 

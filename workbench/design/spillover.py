@@ -125,13 +125,13 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
         raise ValueError(f"the final time must be positive and finite; got {final_time}")
     n = loop.modes.n_modes
     state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
-    moments = _second_moments(loop.matrix, state, final_time)
+    moments = second_moments(loop.matrix, state, final_time)
     force_rows = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
     work = np.array([force_rows[r] @ moments[:, n + r] for r in range(n)])
     return Spillover(work, loop.law.controlled, final_time)
 
 
-def _second_moments(a: np.ndarray, state: np.ndarray, final_time: float) -> np.ndarray:
+def second_moments(a: np.ndarray, state: np.ndarray, final_time: float) -> np.ndarray:
     """∫_0^t x xᵀ dt for x' = A x: from dM/dt = A M + M Aᵀ + x0 x0ᵀ, doubled up from a short time.
 
     Balanced first: displacements and rates of a fast structure differ by its frequency, and round-off by its square.
