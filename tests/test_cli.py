@@ -125,6 +125,11 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
         (("design", "nowhere.toml"), "no such file"),
         (("design", "{rig}", "--control", 5), "5 controlled modes need as many actuators"),
         (("design", "{rig}", "--weight", -1), "positive"),
+        (("design", "{rig}", "--control", -1), "-1 modes cannot be controlled of 9"),
+        (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
+        (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
+        (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
+        (("place", "{rig}", "--control", 4, "--forbid", "0.5:10"), "find room for 3 on the stretches left"),
         (("place", "{rig}", "--control", 9), "residual"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),
@@ -157,6 +162,25 @@ def test_a_study_that_does_not_hold_ends_in_code_1(tmp_path, monkeypatch):
     assert result.exit_code == 1 and "does not hold: two: 2.0 against 1.0" in result.output
     assert json.loads((tmp_path / "studies/results/wrong.json").read_text())["checks"][0]["holds"] is False
     assert (tmp_path / "out/wrong.html").is_file()
+
+
+def test_an_unfinished_study_keeps_no_other_from_running(tmp_path, monkeypatch):
+    (tmp_path / "studies").mkdir()
+    (tmp_path / "studies/begun.py").write_text("def study(outcome,")
+    (tmp_path / "studies/falls.py").write_text('"""Does it?"""\n\ndef study(outcome, data=None):\n    raise OSError\n')
+    (tmp_path / "studies/whole.py").write_text(
+        '"""Is one one?"""\n\ndef study(outcome, data=None):\n    outcome.check("one", 1.0, 1.0)\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    listed = run("study")
+    assert listed.exit_code == 0 and "whole  Is one one?" in listed.output
+    assert "begun  cannot be run: studies" in listed.output.replace(str(tmp_path) + "/", "")
+    assert run("study", "whole").exit_code == 0
+    named = run("study", "begun")
+    assert named.exit_code == 2 and "begun.py is not a study" in named.output
+    every = run("study", "--all")
+    assert every.exit_code == 1 and "1 of 1 checks hold" in every.output
+    assert "begun.py is not a study" in every.output and "falls: OSError" in every.output
 
 
 def test_words_of_several_lines_are_told_in_one(tmp_path, monkeypatch):

@@ -56,17 +56,20 @@ def _guarded(command: Callable) -> Callable:
         except typer.Exit:
             raise
         except (ValueError, OSError, MemoryError) as error:
-            errors.print(f"workbench: {' '.join(str(error).split())}", style="red", markup=False)
+            _tell(str(error))
             raise typer.Exit(BAD_INPUT) from None
         except KeyboardInterrupt:
-            errors.print("workbench: interrupted", style="red", markup=False)
+            _tell("interrupted")
             raise typer.Exit(FAILURE) from None
         except Exception as error:
-            told = f"{type(error).__name__}: {' '.join(str(error).split())}"
-            errors.print(f"workbench: {told}", style="red", markup=False)
+            _tell(f"{type(error).__name__}: {error}")
             raise typer.Exit(FAILURE) from None
 
     return guarded
+
+
+def _tell(fault: str) -> None:
+    errors.print(f"workbench: {' '.join(fault.split())}", style="red", markup=False)
 
 
 def _progress() -> Progress:
@@ -100,24 +103,38 @@ def study(
 
     if name is None and not every:
         entries = list_studies()
-        width = max(len(entry.name) for entry in entries)
+        width = max((len(entry.name) for entry in entries), default=0)
         for entry in entries:
             needs = f" (needs --data: {entry.needs_data})" if entry.needs_data else ""
-            console.print(f"{entry.name:<{width}}  {entry.question}{needs}", markup=False)
+            told = f"cannot be run: {entry.fault}" if entry.fault else f"{entry.question}{needs}"
+            console.print(f"{entry.name:<{width}}  {told}", markup=False)
         return
     if name is None or every:
         chosen = [entry for entry in list_studies() if not entry.needs_data]
     else:
         chosen = [find_study(name)]
-    held = [_run(entry, data, scheduler) for entry in chosen]
-    if not all(held):
+    # of several, one that fails keeps none of the others from running
+    run = _run if len(chosen) == 1 else _run_of_several
+    if not all([run(entry, data, scheduler) for entry in chosen]):
         raise typer.Exit(FAILURE)
+
+
+def _run_of_several(found, data: Path | None, scheduler: str | None) -> bool:
+    try:
+        return _run(found, data, scheduler)
+    except Exception as error:
+        _tell(f"{found.name}: {type(error).__name__}: {error}")
+        return False
 
 
 def _run(found, data: Path | None, scheduler: str | None) -> bool:
     """Run one study, print what it found, and say whether its checks hold."""
     from workbench.study.catalogue import run_study
     from workbench.study.outcome import Outcome
+
+    if found.fault:
+        _tell(found.fault)
+        return False
 
     root = found.path.resolve().parent.parent
     with _progress() as progress:
@@ -270,7 +287,9 @@ def design(
     from workbench.design.comparison import compare, through_sensors
     from workbench.design.coupled import coupled_lqr
     from workbench.design.imsc import imsc
+    from workbench.study.whole_file import check_target
 
+    check_target(json_path)
     found = _structure_rig(rig)
     actuators = [a for a in found.actuators if not a.direct]
     n = len(actuators) if control is None else control
@@ -355,7 +374,9 @@ def place(
     from workbench.design.certificate import certify
     from workbench.design.placement import nodes_of_mode, placement_task, scan
     from workbench.design.placement import place as least_work
+    from workbench.study.whole_file import check_target
 
+    check_target(json_path)
     if proof is not None and not 0 < proof < 1:
         raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
     found = _structure_rig(rig)

@@ -8,7 +8,7 @@ import numpy as np
 from workbench.design.closed_loop import close_loop, respond
 from workbench.design.controller import Controller, filtered
 from workbench.design.explain import Explanation, explain
-from workbench.design.law import Law
+from workbench.design.law import DesignError, Law
 from workbench.design.modal_filter import displacement_filter
 from workbench.design.observers import luenberger
 from workbench.design.spillover import Spillover, effort, finite_spillover, quadratic_cost
@@ -63,6 +63,8 @@ def compare(
         weight: R of the cost.
         final_time: s, of work and peak force.
     """
+    if not (np.isfinite(final_time) and final_time > 0):
+        raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
     time = np.linspace(0.0, final_time, SHOWN_INSTANTS)
     rows = []
     for law in laws:

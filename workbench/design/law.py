@@ -54,8 +54,11 @@ def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[i
     Raises:
         DesignError: modes that are not there, or named twice.
     """
-    index = range(controlled) if isinstance(controlled, int) else controlled
-    index = tuple(int(r) for r in index)
+    if isinstance(controlled, int) and not 1 <= controlled <= modes.n_modes:
+        raise DesignError(
+            f"{controlled} modes cannot be controlled of {modes.n_modes} at hand: control 1 or more of these"
+        )
+    index = tuple(int(r) for r in (range(controlled) if isinstance(controlled, int) else controlled))
     if not index or len(set(index)) != len(index) or min(index) < 0 or max(index) >= modes.n_modes:
         raise DesignError(
             f"controlled modes {list(index)} are not distinct modes of the {modes.n_modes} at hand (from 0)"

@@ -10,6 +10,7 @@ from workbench.design.law import DesignError
 from workbench.design.placement_task import Placement, PlacementTask, batch_figures
 
 KEPT = 2e-6
+APART = 1e-6  # of the length: actuators closer than this stand at one place
 DRAWS = 20_000
 
 
@@ -73,7 +74,19 @@ class Limits:
                 f"{n} actuators {self.spacing:g} apart and {self.margin:g} from the ends need {needed:g} m; the"
                 f" structure has {length:g}: lower spacing or margin"
             )
-        return self.allowed(length)
+        stretches = self.allowed(length)
+        apart, at, fit = max(self.spacing, APART * length), -np.inf, 0
+        for low, high in stretches:
+            at = max(low, at + apart)
+            while at <= high * (1 + APART) and fit < n:
+                fit, at = fit + 1, at + apart
+            at -= apart
+        if fit < n:
+            raise DesignError(
+                f"{n} actuators {self.spacing:g} apart find room for {fit} on the stretches left,"
+                f" {', '.join(f'{low:g} to {high:g}' for low, high in stretches)} m: forbid less or lower the spacing"
+            )
+        return stretches
 
     def broken(self, positions: np.ndarray, figures) -> dict[str, np.ndarray]:
         """By name of limit, by how much each of many placements (n_placements, n) breaks it, relative; <= 0 is kept."""

@@ -20,12 +20,14 @@ class StudyFile:
         name: its stem.
         question: the first line of its docstring.
         needs_data: what --data must name, where it must be given.
+        fault: why it cannot be run, where it cannot.
     """
 
     path: Path
     name: str
     question: str
     needs_data: str | None
+    fault: str | None = None
 
 
 def studies_folder() -> Path:
@@ -43,21 +45,31 @@ def describe(path: Path) -> StudyFile:
     """Read a study's question without running it."""
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"))
-    except (SyntaxError, UnicodeDecodeError, OSError) as error:
+    except (SyntaxError, ValueError, RecursionError, OSError) as error:
         raise StudyError(f"{path} is not a study: {error}") from error
     if not any(isinstance(node, ast.FunctionDef) and node.name == "study" for node in tree.body):
         raise StudyError(f"{path} defines no function study(outcome, data)")
     needs = None
     for node in tree.body:
         if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "NEEDS_DATA":
-            needs = ast.literal_eval(node.value)
+            try:
+                needs = str(ast.literal_eval(node.value))
+            except ValueError:
+                raise StudyError(f"{path}: NEEDS_DATA is a text that says what --data must name") from None
     question = (ast.get_docstring(tree) or "").splitlines()
     return StudyFile(path, path.stem, question[0] if question else "", needs)
 
 
 def list_studies() -> list[StudyFile]:
-    """All studies, by name."""
-    return [describe(path) for path in sorted(studies_folder().glob("*.py"))]
+    """All studies, by name; one that is unfinished has a fault and keeps no other from running."""
+    return [_described(path) for path in sorted(studies_folder().glob("*.py"))]
+
+
+def _described(path: Path) -> StudyFile:
+    try:
+        return describe(path)
+    except StudyError as error:
+        return StudyFile(path, path.stem, "", None, str(error))
 
 
 def find_study(name: str) -> StudyFile:
@@ -71,10 +83,10 @@ def find_study(name: str) -> StudyFile:
         if not path.is_file():
             raise StudyError(f"there is no file {path}")
         return describe(path)
-    found = {study.name: study for study in list_studies()}
+    found = {path.stem: path for path in sorted(studies_folder().glob("*.py"))}
     if name not in found:
         raise StudyError(f"no study is called {name!r}; there are {', '.join(found)}")
-    return found[name]
+    return describe(found[name])
 
 
 def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
