@@ -244,3 +244,26 @@ def test_a_short_segment_leaves_a_rigid_body_rigid():
         attachments=(PointMass(0.5, 1.0), PointMass(0.172, 1.0)),
     )
     assert beam.modes(3).omega[0] == 0
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("left", ["clamped", "free"])
+@pytest.mark.parametrize("distance", [8e-4, 1.5e-4, 5e-5])
+def test_mass_just_short_of_the_tip(left, distance):
+    """Rayleigh: moved by -d, a mass m changes ω by m φ(L) φ'(L) d of itself, φ the shapes with the mass at the tip."""
+    mass = 0.3
+    at_tip, beside = (
+        Beam(
+            length=1.0,
+            mass_per_length=1.0,
+            bending_stiffness=1.0,
+            left=left,
+            right="free",
+            attachments=(PointMass(at, mass),),
+        ).modes(8)
+        for at in (1.0, 1.0 - distance)
+    )
+    shape, slope = (at_tip.shapes(np.array([1.0]), derivative)[0] for derivative in (0, 1))
+    bending = at_tip.omega > 0
+    found = beside.omega[bending] / at_tip.omega[bending] - 1.0
+    np.testing.assert_allclose(found, (mass * shape * slope)[bending] * distance, rtol=2e-3)

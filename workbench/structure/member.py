@@ -16,6 +16,7 @@ from workbench.structure.supports import HELD, Attachment, End, PointDamper, Poi
 
 HIGHEST_DEGREE = 48
 MOST_FUNCTIONS = 2400
+THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
@@ -68,8 +69,8 @@ class _Member:
         """Segments that can carry n_modes half waves, with `extra` more degrees than the bare count."""
         nodes = self._nodes((*self.mass_per_length.breaks, *stiffness.breaks))
         for part in self.attachments:
-            # a node at an attachment keeps its kink out of the polynomials; a sliver of a segment would cost more
-            if np.abs(nodes - part.at).min() > 1e-3 * self.length:
+            # a node at an attachment keeps its kink out of the polynomials
+            if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
                 nodes = np.sort(np.r_[nodes, part.at])
         degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / self.length)) + 12 + extra
         pieces = int(np.ceil(degree / HIGHEST_DEGREE))
@@ -77,6 +78,17 @@ class _Member:
             nodes = np.unique(np.concatenate([np.linspace(a, b, pieces + 1) for a, b in zip(nodes, nodes[1:])]))
             degree = int(np.ceil(1.7 * n_modes / pieces)) + 12 + extra // pieces
         return Segments(nodes, min(degree, HIGHEST_DEGREE), continuity)
+
+    def _thinnest(self, continuity: int) -> float:
+        return THINNEST[continuity] * self.length
+
+    def _seen_at(self, segments: Segments, at: float, derivative: int) -> np.ndarray:
+        """The row that tells what an attachment moves by; one just beside a node hangs on it by a rigid lever."""
+        node = segments.nodes[np.argmin(np.abs(segments.nodes - at))]
+        if segments.continuity == 0 or abs(at - node) >= self._thinnest(segments.continuity):
+            return segments.evaluation(at, derivative)
+        lever = (at - node) * segments.evaluation(node, 1) if derivative == 0 else 0.0
+        return segments.evaluation(node, derivative) + lever
 
     def _solve(self, n_modes: int, stiffness: Profile, continuity: int, tension: float, tolerance: float) -> Modes:
         if n_modes < 1:
@@ -127,11 +139,11 @@ class _Member:
         for part in self.attachments:
             if isinstance(part, PointMass):
                 for derivative, value in enumerate((part.mass, part.rotary_inertia)):
-                    row = segments.evaluation(part.at, derivative)
+                    row = self._seen_at(segments, part.at, derivative)
                     mass += value * row.T @ row
             elif isinstance(part, PointSpring):
                 for derivative, value in enumerate((part.stiffness, part.rotational_stiffness)):
-                    springs.append((value, segments.evaluation(part.at, derivative)))
+                    springs.append((value, self._seen_at(segments, part.at, derivative)))
         for spring, row in springs:
             rigidity += spring * row.T @ row
         free = np.setdiff1d(np.arange(segments.n_functions), held)
@@ -146,12 +158,10 @@ class _Member:
             np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle)) * (np.pi / self.length) ** (2 * order)
         )
         try:
-            nu, vectors = eigh(mass, rigidity + shift * mass, subset_by_index=[free.size - n_modes, free.size - 1])
+            _, vectors = eigh(mass, rigidity + shift * mass, subset_by_index=[free.size - n_modes, free.size - 1])
         except LinAlgError as error:
             raise ValueError(_unstable(tension)) from error
-        nu, vectors = nu[::-1], vectors[:, ::-1]
-        if (1.0 / nu - shift < -1e-7 * shift).any():
-            raise ValueError(_unstable(tension))
+        vectors = vectors[:, ::-1]
         coefficients = np.zeros((segments.n_functions, n_modes))
         coefficients[free] = vectors / np.sqrt(np.einsum("ir,ij,jr->r", vectors, mass, vectors, optimize=True))
         # Rayleigh's quotient, from the curvatures themselves: on a short segment the entries of K, EI/h³, cancel in a
@@ -161,6 +171,8 @@ class _Member:
             eigenvalues += segments.form(lambda x: np.full(x.shape, tension), 1, coefficients)
         for spring, row in springs:
             eigenvalues += spring * (row @ coefficients)[0] ** 2
+        if (eigenvalues < -1e-7 * shift).any():
+            raise ValueError(_unstable(tension))
         omega = np.sqrt(np.where(eigenvalues < RIGID * shift, 0.0, eigenvalues))
         rigid = np.flatnonzero(omega == 0)
         if rigid.size == 2:
@@ -192,7 +204,7 @@ class _Member:
             if isinstance(part, PointDamper):
                 for derivative, value in enumerate((part.coefficient, part.rotational_coefficient)):
                     if value:
-                        row = segments.evaluation(part.at, derivative) @ coefficients
+                        row = self._seen_at(segments, part.at, derivative) @ coefficients
                         matrix = matrix + value * row.T @ row
         return matrix
 
