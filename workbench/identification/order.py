@@ -12,21 +12,23 @@ swing left is no stronger than the strongest of so many in noise.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from typing import NoReturn
 
 import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.ailments import check_fit
-from workbench.identification.band import Band
 from workbench.identification.ibrahim import check_alike
-from workbench.identification.refinement import MOST_STEPS, Refined, project, refine, search
+from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
+from workbench.identification.long_records import identify_long
+from workbench.identification.projection import project
+from workbench.identification.refinement import MOST_STEPS, refine, search
 from workbench.records.record import Record
-from workbench.structure.modes import SampledModes, frozen, mac
+from workbench.structure.modes import frozen
 
-# Chance that a record of nothing but noise yields a mode.
-FALSE_ALARM = 1e-3
-MOST_DAMPED = 0.3
+# Values in all from which modes are taken in many at a time.
+LONG = 200_000
+MOST_MODES = 40
 # Tries that fall below the limit in a row before the record counts as told.
 MOST_REFUSALS = 2
 # A record whose noise is not white, or whose modes shift as they decay, may take modes in and put them out for ever.
@@ -34,45 +36,21 @@ MOST_ROUNDS = 4
 MOST_SPLITS = 6
 # A swing whose part outside the modes there already is smaller than this share cannot be told from them.
 LEAST_APART = 1e-7
-SAME_SHAPE = 0.95
 # Bins on either side from which the colour of the noise is taken.
 BESIDE = 50
-
-
-@dataclass(frozen=True, eq=False)
-class Identified:
-    """The modes of a record, and what was taken for noise.
-
-    Attributes:
-        refined: the modes, with covariance.
-        evidence: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
-        limit: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
-        noise_modes: tried and refused, each with an evidence below the limit or no underdamped decay.
-        noise_evidence: (n_noise,) theirs.
-    """
-
-    refined: Refined
-    evidence: np.ndarray
-    limit: float
-    noise_modes: SampledModes = field(repr=False)
-    noise_evidence: np.ndarray = field(repr=False)
-
-    @property
-    def modes(self) -> SampledModes:
-        return self.refined.modes
 
 
 def identify(
     records: Record | Sequence[Record],
     *,
-    most_modes: int = 40,
+    most_modes: int | None = None,
     false_alarm: float = FALSE_ALARM,
 ) -> Identified:
     """The modes that a free decay holds, as many as there are, each with its standard error.
 
     Args:
         records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
-        most_modes: where to stop at the latest.
+        most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
         false_alarm: chance that noise alone is taken for a mode.
 
     Raises:
@@ -83,27 +61,29 @@ def identify(
     check_alike(records)
     for record in records:
         check_fit(record)
+    fit_in = (min(r.n_samples for r in records) - 4) // 3
+    if sum(r.outputs.size for r in records) > LONG:
+        found = identify_long(records, most_modes=min(most_modes or 10 * MOST_MODES, fit_in), false_alarm=false_alarm)
+        return found if found is not None else _refuse(records)
     longest = max(record.n_samples for record in records)
     told = Told(records, [_Grid(record, longest) for record in records], false_alarm)
-    most_modes = min(most_modes, (min(r.n_samples for r in records) - 4) // 3)
     for _ in range(MOST_ROUNDS):
-        if not (told.grow(most_modes) and told.prune()):
+        if not (told.grow(min(most_modes or MOST_MODES, fit_in)) and told.prune()):
             break
-    if told.poles.size == 0:
-        raise ValueError(
-            f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
-            " decay, measure longer or strike harder"
-        )
-    return told.report(records)
+    return told.report(records) if told.poles.size else _refuse(records)
+
+
+def _refuse(records: Sequence[Record]) -> NoReturn:
+    raise ValueError(
+        f"record {records[0].name!r} holds no mode that rises above its noise: is it a free decay? Cut it to the"
+        " decay, measure longer or strike harder"
+    )
 
 
 class Told:
-    """The search: poles so far, their fits, and what was refused.
+    """The search: poles so far, their fits, and what was refused, each record with the grid of swings to look for."""
 
-    Records are searched as they are or as bands of a spectrum, each with the grid of swings to look for in it.
-    """
-
-    def __init__(self, records: Sequence[Record | Band], grids: Sequence, false_alarm: float) -> None:
+    def __init__(self, records: Sequence[Record], grids: Sequence, false_alarm: float) -> None:
         self.records, self.grids = records, grids
         self.offset = grids[0].offset
         cells = grids[0].n_cells
@@ -160,11 +140,7 @@ class Told:
         """Which poles are damped beyond what rings, or split another mode that has their shape and their band."""
         fits = [project(record, poles, self.offset) for record in self.records]
         shapes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
-        size = np.linalg.norm(shapes, axis=0)
-        band = np.abs(poles.real)[:, None] + np.abs(poles.real) + self.grids[0].bin_width
-        near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-        split = near & (mac(shapes, shapes) > SAME_SHAPE) & (size[:, None] < size)
-        return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
+        return no_modes(poles, shapes, self.grids[0].bin_width)
 
     def report(self, records: Sequence[Record]) -> Identified:
         start = unshaped(self.poles, records[0])
@@ -325,11 +301,3 @@ def _spread(residuals: Sequence[np.ndarray]) -> np.ndarray:
     n = sum(r.shape[0] for r in residuals)
     squares = sum((r**2).sum(axis=0) for r in residuals)
     return np.sqrt(np.maximum(squares / n, 1e-28 * squares.max() + 1e-300))
-
-
-def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
-    """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
-    omega = np.abs(poles)
-    order = np.argsort(omega)
-    shapes = np.ones((record.n_outputs, poles.size))
-    return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)

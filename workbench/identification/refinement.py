@@ -14,11 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtri
 
-from workbench.identification.band import Band
 from workbench.identification.ibrahim import check_alike, normalised_shapes
+from workbench.identification.projection import Projection, project
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
@@ -27,8 +27,6 @@ MOST_STEPS = 60
 # A step is small once it moves the estimate by less than a thousandth of its standard error.
 SETTLED = 1e-6
 ROUND_OFF = 1e-13
-# Samples by modes up to which Φ is factored at once, and the samples of a part beyond.
-LARGEST_FACTORED, PART = 2_000_000, 8192
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +111,7 @@ def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: b
         steps += taken
         noise = noise_level(records, fit)
         weights = 1.0 / noise
-    return _report(records, poles, fit, noise, {"converged": bool(converged), "steps": steps})
+    return as_refined(records, poles, fit, noise, converged=converged, steps=steps)
 
 
 def bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[float]) -> Refined:
@@ -131,7 +129,8 @@ def bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[fl
     amplitude = modes.shapes * modes.poles**derivative
     clean = replace(record, outputs=(amplitude @ np.exp(modes.poles[:, None] * record.time)).real)
     noise = np.broadcast_to(np.asarray(noise_std, float), (record.n_outputs,))
-    return _report([clean], modes.poles, [project(clean, modes.poles, False)], noise, {"converged": True, "steps": 0})
+    fits = [project(clean, modes.poles, False)]
+    return as_refined([clean], modes.poles, fits, noise, converged=True, steps=0)
 
 
 def amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: bool = False) -> SampledModes:
@@ -150,98 +149,6 @@ def amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: 
     lag = np.exp(modes.poles * (at - record.start_time))
     derivative = time_derivatives(record.output_channels)
     return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
-
-
-@dataclass(frozen=True, eq=False)
-class Projection:
-    """A record projected on the columns Φ of given poles."""
-
-    residual: np.ndarray  # (n_samples, n_outputs)
-    coefficients: np.ndarray  # (n_columns, n_outputs)
-    gram: np.ndarray  # G
-    slopes: np.ndarray  # (tΦ)^T residual, (2 n_modes, n_outputs)
-    spread: np.ndarray  # (Φ^T Φ)^-1
-    tilt: np.ndarray  # Φ^+ tΦ, (n_columns, 2 n_modes)
-
-    @property
-    def complex_amplitudes(self) -> np.ndarray:
-        """a_jr = α - iβ of α cos + β sin, (n_outputs, n_modes)."""
-        n = self.gram.shape[0] // 2
-        return (self.coefficients[:n] - 1j * self.coefficients[n : 2 * n]).T
-
-
-def project(record: Record | Band, poles: np.ndarray, offset: bool) -> Projection:
-    if isinstance(record, Record) and record.n_samples * poles.size > LARGEST_FACTORED:
-        return _project_by_parts(record, poles, offset)
-    phi, t_phi = record.columns(poles) if isinstance(record, Band) else _columns(record, poles)
-    columns = np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi
-    q, r = qr(columns, mode="economic", check_finite=False)
-    y = record.outputs.T
-    qy = q.T @ y
-    residual = y - q @ qy
-    q_t = q.T @ t_phi
-    rest = t_phi - q @ q_t
-    inverse = solve_triangular(r, np.eye(r.shape[0]))
-    return Projection(residual, inverse @ qy, rest.T @ rest, t_phi.T @ residual, inverse @ inverse.T, inverse @ q_t)
-
-
-def _columns(record: Record, poles: np.ndarray, first: int = 0, last: int | None = None):
-    """Φ and tΦ of the samples first..last, (n_samples, 2 n_modes) each."""
-    tau = record.sample_time * np.arange(first, record.n_samples if last is None else last)
-    # Complex powers cost one exponential a sample and mode; both real columns come from it.
-    decay = np.exp(np.outer(tau, poles))
-    phi = np.hstack([decay.real, decay.imag])
-    return phi, tau[:, None] * phi
-
-
-def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projection:
-    """The same from normal equations summed over parts of the record, where Φ would fill the memory.
-
-    They square the condition number, which long records of many modes, told apart by their length, can afford.
-    """
-    n, columns = 2 * poles.size, 2 * poles.size + int(offset)
-    parts = [(i, min(i + PART, record.n_samples)) for i in range(0, record.n_samples, PART)]
-    whole, tilted, doubly = np.zeros((columns, columns)), np.zeros((columns, n)), np.zeros((n, n))
-    seen, t_seen = np.zeros((columns, record.n_outputs)), np.zeros((n, record.n_outputs))
-
-    def part(first: int, last: int):
-        phi, t_phi = _columns(record, poles, first, last)
-        return (np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi), t_phi
-
-    for first, last in parts:
-        phi, t_phi = part(first, last)
-        y = record.outputs[:, first:last].T
-        whole += phi.T @ phi
-        tilted += phi.T @ t_phi
-        doubly += t_phi.T @ t_phi
-        seen += phi.T @ y
-        t_seen += t_phi.T @ y
-    scale = 1.0 / np.sqrt(np.diag(whole))
-    factor = cho_factor(whole * np.outer(scale, scale))
-
-    def solve(right: np.ndarray) -> np.ndarray:
-        return scale[:, None] * cho_solve(factor, scale[:, None] * right)
-
-    coefficients, tilt = solve(seen), solve(tilted)
-    residual = np.empty((record.n_samples, record.n_outputs))
-    for first, last in parts:
-        residual[first:last] = record.outputs[:, first:last].T - part(first, last)[0] @ coefficients
-    slopes = t_seen - tilted.T @ coefficients
-    return Projection(residual, coefficients, doubly - tilted.T @ tilt, slopes, solve(np.eye(columns)), tilt)
-
-
-def _directions(fit: Projection) -> np.ndarray:
-    """How each pole parameter moves the model within tΦ: (2 n_modes parameters, 2 n_modes, n_outputs).
-
-    For σ_r: -(α, β); for ω_dr: (β, -α); on the two columns of mode r only.
-    """
-    n = fit.gram.shape[0] // 2
-    alpha, beta = fit.coefficients[:n], fit.coefficients[n : 2 * n]
-    moves = np.zeros((2 * n, 2 * n, alpha.shape[1]))
-    r = np.arange(n)
-    moves[r, r], moves[r, n + r] = -alpha, -beta
-    moves[n + r, r], moves[n + r, n + r] = beta, -alpha
-    return moves
 
 
 def _normal(fits: Sequence[Projection], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -270,7 +177,8 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
     fits = [project(record, poles, offset) for record in records]
     cost = _cost(fits, weights)
     free = sum(r.outputs.size for r in records) - 2 * n - sum(f.coefficients.size for f in fits)
-    signal = sum(((r.outputs * weights[:, None]) ** 2).sum() for r in records)
+    signal = sum(float(weights**2 @ np.einsum("jt,jt->j", r.outputs, r.outputs)) for r in records)
+    blur = max(fit.round_off for fit in fits) * signal
     damping = 1e-3
     for step in range(1, most_steps + 1):
         h, g = _normal(fits, weights)
@@ -284,13 +192,13 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
                 continue
             trial = poles - move[:n] + 1j * move[n:]
             gain = float(move @ g)
-            small = gain <= SETTLED * cost / free or gain <= ROUND_OFF**2 * signal
+            small = gain <= max(SETTLED * cost / free, ROUND_OFF**2 * signal, 1e-4 * blur)
             fits_there = _tried(records, trial, offset)
             cost_there = np.inf if fits_there is None else _cost(fits_there, weights)
-            if cost_there <= cost or small or damping > 1e8:
+            if cost_there <= cost + blur or small or damping > 1e8:
                 break
             damping *= 8.0
-        if fits_there is not None and cost_there <= cost:
+        if fits_there is not None and cost_there <= cost + blur:
             poles, fits, cost = trial, fits_there, cost_there
         damping = max(0.1 * damping, 1e-12)
         if small or damping > 1e6:
@@ -301,7 +209,7 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
 def _tried(records, poles: np.ndarray, offset: bool) -> list[Projection] | None:
     """Projections; None where a mode no longer swings, passes half the sample rate, grows by more than e^20 over a
     record, decays faster than e^-1 a sample, or cannot be told from another."""
-    longest = max((r.whole if isinstance(r, Band) else r.n_samples) * r.sample_time for r in records)
+    longest = max(r.n_samples * r.sample_time for r in records)
     gone = -poles.real * records[0].sample_time > 1.0
     beyond = (poles.imag <= 0) | (poles.imag * records[0].sample_time >= np.pi)
     if beyond.any() or (poles.real * longest >= 20.0).any() or gone.any():
@@ -313,20 +221,21 @@ def _tried(records, poles: np.ndarray, offset: bool) -> list[Projection] | None:
 
 
 def _cost(fits, weights: np.ndarray) -> float:
-    return float(sum((weights**2 * (fit.residual**2).sum(axis=0)).sum() for fit in fits))
+    return float(sum(weights**2 @ fit.squares for fit in fits))
 
 
 def noise_level(records, fits) -> np.ndarray:
     """Standard deviation of the residual of each output, the degrees of freedom the fit took away made good."""
     n_poles, m = fits[0].gram.shape[0], records[0].n_outputs
     free = sum(r.n_samples - f.coefficients.shape[0] for r, f in zip(records, fits, strict=True)) - n_poles / m
-    squares = sum((f.residual**2).sum(axis=0) for f in fits)
-    signal = sum((r.outputs**2).sum(axis=1) for r in records)
+    squares = sum(np.einsum("tj,tj->j", f.residual, f.residual) for f in fits)
+    signal = sum(np.einsum("jt,jt->j", r.outputs, r.outputs) for r in records)
     floor = np.maximum(1e-32 * signal, 1e-32 * signal.max() + 1e-300)
     return np.sqrt(np.maximum(squares, floor) / max(free, 1.0))
 
 
-def _report(records, poles, fits, noise, search: dict) -> Refined:
+def as_refined(records, poles, fits, noise, *, converged: bool, steps: int) -> Refined:
+    """What a search ended with, with the covariance that follows from it."""
     n = poles.size
     h, _ = _normal(fits, 1.0 / noise)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
@@ -354,7 +263,8 @@ def _report(records, poles, fits, noise, search: dict) -> Refined:
         amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
         shape_covariance=frozen(shape_covariance[order]),
         noise_std=frozen(noise),
-        **search,
+        converged=bool(converged),
+        steps=steps,
     )
 
 
@@ -366,13 +276,15 @@ def _shape_covariance(fit: Projection, poles, derivative, pole_covariance, noise
     """
     shapes = fit.complex_amplitudes / poles**derivative
     n, m = poles.size, shapes.shape[0]
-    moves = _directions(fit)
-    drift = -np.einsum("ck,pkj->cpj", fit.tilt, moves)  # (n_columns, 2 n_modes, n_outputs)
+    alpha, beta = fit.coefficients[:n], fit.coefficients[n : 2 * n]
     result = np.zeros((n, m, m))
     root = _root(pole_covariance)
     for r in range(n):
         k = int(np.argmax(np.abs(shapes[:, r])))
-        with_poles = ((drift[r] - 1j * drift[n + r]).T @ root) / poles[r] ** derivative
+        # dΦ of mode p is -(α, β) tΦ_p by σ and (β, -α) tΦ_p by ω_d.
+        cosine, sine = (np.array([1.0, -1j]) @ fit.tilt[[r, n + r]]).reshape(2, n, 1)
+        moved = np.vstack([cosine * alpha + sine * beta, sine * alpha - cosine * beta])
+        with_poles = (moved.T @ root) / poles[r] ** derivative
         own = fit.spread[np.ix_([r, n + r], [r, n + r])]
         pair = np.array([1.0, -1j]) @ _root(own)
         each = noise[:, None] * pair / poles[r] ** derivative  # (n_outputs, 2)

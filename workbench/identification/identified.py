@@ -1,0 +1,60 @@
+"""What the decision of how many modes a record holds comes to, and the rules it keeps to."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from workbench.identification.refinement import Refined
+from workbench.records.record import Record
+from workbench.structure.modes import SampledModes, mac
+
+# Chance that a record of nothing but noise yields a mode.
+FALSE_ALARM = 1e-3
+MOST_DAMPED = 0.3
+SAME_SHAPE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """The modes of a record, and what was taken for noise.
+
+    Attributes:
+        refined: the modes, with covariance.
+        evidence: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
+        limit: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
+        noise_modes: tried and refused, each with an evidence below the limit or no underdamped decay.
+        noise_evidence: (n_noise,) theirs.
+    """
+
+    refined: Refined
+    evidence: np.ndarray
+    limit: float
+    noise_modes: SampledModes = field(repr=False)
+    noise_evidence: np.ndarray = field(repr=False)
+
+    @property
+    def modes(self) -> SampledModes:
+        return self.refined.modes
+
+
+def no_modes(poles: np.ndarray, shapes: np.ndarray, bin_width: float) -> np.ndarray:
+    """Which poles are damped beyond what rings, or split another mode that has their shape and their band.
+
+    Args:
+        poles: (n_modes,).
+        shapes: (n_signals, n_modes) amplitudes over the noise, complex.
+        bin_width: rad/s that the length of the record can tell apart.
+    """
+    size = np.linalg.norm(shapes, axis=0)
+    band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
+    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
+    split = near & (mac(shapes, shapes) > SAME_SHAPE) & (size[:, None] < size)
+    return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
+
+
+def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
+    """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
+    omega = np.abs(poles)
+    order = np.argsort(omega)
+    shapes = np.ones((record.n_outputs, poles.size))
+    return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)

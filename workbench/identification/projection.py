@@ -1,0 +1,168 @@
+"""A record split into what given poles explain of it, amplitudes free, and what they leave.
+
+y_j = Φ c_j + r_j, Φ = [e^{-σt} cos ω_d t, e^{-σt} sin ω_d t] and, where asked for, a column of ones. All derivatives of
+Φ by the poles lie in the span of tΦ. In a long record the matrices ΦᵀΦ, ΦᵀtΦ, (tΦ)ᵀtΦ are sums of powers
+
+    S_k(w) = Σ_{i<N} i^k w^i,     w = μ_r μ_s and μ_r μ_s*,   μ = e^{λΔt},
+
+which doubling gives in log N steps, and a swing is left out where it has died away beyond the last digit.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+
+from workbench.records.record import Record
+
+# Samples by modes up to which Φ is factored at once, and the samples of a part beyond.
+LARGEST_FACTORED, PART = 2_000_000, 2048
+# e^-41 is below the last digit of 1.
+DIED_AWAY = 41.0
+# Round-off of squares that are found as the difference of sums over the record, as a share of these.
+SUMMED = 1e-14
+
+
+@dataclass(frozen=True, eq=False)
+class Projection:
+    """A record projected on the columns Φ of given poles."""
+
+    record: Record = field(repr=False)
+    poles: np.ndarray
+    squares: np.ndarray  # sum of those of what is left, (n_outputs,)
+    round_off: float  # of these squares, as a share of those of the record
+    coefficients: np.ndarray  # (n_columns, n_outputs)
+    gram: np.ndarray  # G = (tΦ)^T (I - Φ Φ^+) tΦ
+    slopes: np.ndarray  # (tΦ)^T residual, (2 n_modes, n_outputs)
+    spread: np.ndarray  # (Φ^T Φ)^-1
+    tilt: np.ndarray  # Φ^+ tΦ, (n_columns, 2 n_modes)
+
+    @cached_property
+    def residual(self) -> np.ndarray:
+        """What is left, (n_samples, n_outputs); of a long record made only where it is asked for."""
+        swings = _Swings(self.record, self.poles)
+        left = np.empty((self.record.n_samples, self.record.n_outputs))
+        for part, rows, phi, y in swings.parts():
+            np.subtract(y, phi @ self.coefficients[rows], out=left[part])
+        if len(self.coefficients) > 2 * self.poles.size:
+            left -= self.coefficients[-1]
+        return left
+
+    @property
+    def complex_amplitudes(self) -> np.ndarray:
+        """a_jr = α - iβ of α cos + β sin, (n_outputs, n_modes)."""
+        n = self.gram.shape[0] // 2
+        return (self.coefficients[:n] - 1j * self.coefficients[n : 2 * n]).T
+
+
+def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
+    """Least squares of every output on the swings of `poles`, and on a constant with `offset`.
+
+    Raises:
+        numpy.linalg.LinAlgError: two of them cannot be told apart.
+    """
+    if record.n_samples * poles.size > LARGEST_FACTORED:
+        return _project_by_parts(record, poles, offset)
+    # Complex powers cost one exponential a sample and mode; both real columns come from it.
+    tau = record.sample_time * np.arange(record.n_samples)
+    phi = _columns(np.exp(np.outer(tau, poles)))
+    t_phi = tau[:, None] * phi
+    columns = np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi
+    q, r = qr(columns, mode="economic", check_finite=False)
+    y = record.outputs.T
+    qy = q.T @ y
+    residual = y - q @ qy
+    q_t = q.T @ t_phi
+    rest = t_phi - q @ q_t
+    inverse = solve_triangular(r, np.eye(r.shape[0]))
+    squares, gram, slopes = (residual**2).sum(axis=0), rest.T @ rest, t_phi.T @ residual
+    fit = Projection(record, poles, squares, 0.0, inverse @ qy, gram, slopes, inverse @ inverse.T, inverse @ q_t)
+    fit.__dict__["residual"] = residual
+    return fit
+
+
+def power_sums(w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Σ_{i<n} i^k w^i for k = 0, 1, 2, each of the shape of w; |w| ≤ 1 or little more."""
+    sums = [np.zeros(w.shape, complex) for _ in range(3)]
+    power, length = np.ones(w.shape, complex), 0
+    # The sums over 2L samples are those over L, and the same again L samples later.
+    for bit in bin(n)[2:]:
+        s0, s1, s2 = sums
+        sums = [s0 + power * s0, s1 + power * (s1 + length * s0), s2 + power * (s2 + length * (2.0 * s1 + length * s0))]
+        power, length = power * power, 2 * length
+        if bit == "1":
+            sums = [total + float(length) ** k * power for k, total in enumerate(sums)]
+            power, length = power * w, length + 1
+    return sums[0], sums[1], sums[2]
+
+
+def _columns(swings: np.ndarray) -> np.ndarray:
+    return np.hstack([swings.real, swings.imag])
+
+
+def _grams(poles: np.ndarray, record: Record, offset: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """ΦᵀΦ with the constant, Φᵀ tΦ likewise, and (tΦ)ᵀ tΦ."""
+    mu, n, dt = np.exp(poles * record.sample_time), record.n_samples, record.sample_time
+    same, turned = power_sums(np.outer(mu, mu), n), power_sums(np.outer(mu, mu.conj()), n)
+    grams = []
+    for k, (q, p) in enumerate(zip(same, turned, strict=True)):
+        blocks = [[(p + q).real, (q - p).imag], [(q + p).imag, (p - q).real]]
+        grams.append(0.5 * dt**k * np.block(blocks))
+    if not offset:
+        return grams[0], grams[1], grams[2]
+    s0, s1, _ = power_sums(mu, n)
+    level, rising = np.r_[s0.real, s0.imag], dt * np.r_[s1.real, s1.imag]
+    whole = np.block([[grams[0], level[:, None]], [level[None], np.array([[float(n)]])]])
+    return whole, np.vstack([grams[1], rising]), grams[2]
+
+
+def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projection:
+    """The same from normal equations, where Φ would fill the memory, part after part of the record.
+
+    They square the condition number, which long records of many modes, told apart by their length, can afford.
+    """
+    whole, tilted, doubly = _grams(poles, record, offset)
+    seen, t_seen = np.zeros((2, 2 * poles.size, record.n_outputs))
+    swings = _Swings(record, poles)
+    for part, rows, phi, y in swings.parts():
+        along = phi.T @ y
+        seen[rows] += along
+        t_seen[rows] += part.start * record.sample_time * along + (swings.tau[: len(phi), None] * phi).T @ y
+    if offset:
+        seen = np.vstack([seen, record.outputs.sum(axis=1)])
+    power = np.einsum("jt,jt->j", record.outputs, record.outputs)
+    scale = 1.0 / np.sqrt(np.diag(whole))
+    factor = cho_factor(whole * np.outer(scale, scale))
+
+    def solve(right: np.ndarray) -> np.ndarray:
+        return scale[:, None] * cho_solve(factor, scale[:, None] * right)
+
+    coefficients, tilt = solve(seen), solve(tilted)
+    squares = np.maximum(power - (coefficients * seen).sum(axis=0), 0.0)
+    slopes = t_seen - tilted.T @ coefficients
+    gram, spread = doubly - tilted.T @ tilt, solve(np.eye(len(whole)))
+    return Projection(record, poles, squares, SUMMED, coefficients, gram, slopes, spread, tilt)
+
+
+class _Swings:
+    """The columns Φ of a record part by part, without the swings that have died away."""
+
+    def __init__(self, record: Record, poles: np.ndarray) -> None:
+        self.record, self.dt = record, record.sample_time
+        # The slowest to die away first: those alive in a part are then the first few.
+        self.order = np.argsort(-poles.real)
+        self.slow = poles[self.order]
+        self.lives = DIED_AWAY / np.maximum(-self.slow.real, 1e-300)
+        self.tau = self.dt * np.arange(min(PART, record.n_samples))
+        self.begin = np.exp(np.outer(self.tau, self.slow))
+
+    def parts(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
+        """Samples, rows of the swings alive, their columns of Φ, and the outputs, (n_part, n_outputs)."""
+        for first in range(0, self.record.n_samples, PART):
+            part = slice(first, min(first + PART, self.record.n_samples))
+            alive = int(np.searchsorted(-self.lives, -first * self.dt, side="right"))
+            rows = np.r_[self.order[:alive], self.order.size + self.order[:alive]]
+            swings = self.begin[: part.stop - first, :alive] * np.exp(first * self.dt * self.slow[:alive])
+            yield part, rows, _columns(swings), self.record.outputs[:, part].T
