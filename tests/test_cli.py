@@ -89,6 +89,20 @@ def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     assert "coupled LQR" in (tmp_path / "p.html").read_text() and (tmp_path / "p.page.json").is_file()
 
 
+def test_design_offers_what_can_be_had(rig, tmp_path):
+    found = tmp_path / "design.json"
+    nodes = run("design", rig, "--control", 5)
+    assert nodes.exit_code == 2 and "no actuator moves mode 5: all stand at its nodes" in nodes.output
+    rig.write_text(rig.read_text().replace("at = 4.0", "at = 4.3"))
+    few = run("design", rig, "--control", 5, "--damping", 0.1, "--errors", 0.02, "--json", found)
+    assert few.exit_code == 0 and "IMSC needs as many actuators as controlled modes, 5; there are 4" in few.output
+    told = json.loads(found.read_text())
+    assert [law["law"] for law in told["laws"]] == ["coupled LQR", "coupled poles"]
+    poles = np.array(told["laws"][1]["poles_real"]) + 1j * np.array(told["laws"][1]["poles_imag"])
+    assert ((np.abs(-poles.real / np.abs(poles) - 0.1) < 1e-6) & (poles.imag > 0)).sum() == 5
+    assert all(0 <= design["survived"] <= 1 for design in told["through_sensors"])
+
+
 def test_place_does_better_than_even_places(rig, tmp_path):
     found = tmp_path / "places.json"
     result = run("place", rig, "--control", 4, "--weight", 20, "--json", found)
@@ -123,7 +137,8 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
         (("identify", "nowhere.csv"), "no such file"),
         (("identify", "{rig}"), "names no format"),
         (("design", "nowhere.toml"), "no such file"),
-        (("design", "{rig}", "--control", 5), "5 controlled modes need as many actuators"),
+        (("design", "{rig}", "--damping", 1), "damping ratio wanted must lie between 0 and 1"),
+        (("design", "{rig}", "--errors", 0), "relative error of the models must be positive"),
         (("design", "{rig}", "--weight", -1), "positive"),
         (("design", "{rig}", "--control", -1), "-1 modes cannot be controlled of 9"),
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),

@@ -42,7 +42,10 @@ def _options(
     """Options of the command itself."""
 
 
+WIDE = 150  # columns of a table that goes to a file or a pipe
 console = Console(soft_wrap=True, highlight=False)
+if not console.is_terminal:
+    console.width = WIDE
 errors = Console(stderr=True, soft_wrap=True, highlight=False)
 
 
@@ -275,18 +278,25 @@ def design(
     rig: Annotated[Path, typer.Argument(help="TOML with [structure], [[input]] and [[output]], as a case has.")],
     control: Annotated[int | None, typer.Option(help="Modes to control, lowest first; as many as actuators.")] = None,
     weight: Annotated[float, typer.Option(help="Weight R of force against motion.")] = 1.0,
+    damping: Annotated[
+        float | None, typer.Option(help="Damping ratio that laws by poles give, beside the others.")
+    ] = None,
+    errors: Annotated[
+        float | None, typer.Option(help="Try each on a hundred models as wrong as this, 0.05 is 5 %.")
+    ] = None,
     impulse_at: Annotated[float | None, typer.Option(help="Place of a unit blow; the hammer's unless given.")] = None,
     final_time: Annotated[float | None, typer.Option(help="Time for the work, s; 20 periods of mode 1.")] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Design IMSC beside coupled control: cost, effort, spillover, and on the full plant which mode is unsettled.
 
-    Example: workbench design case.toml --control 3 --weight 20
+    With more modes than actuators only coupled control is to be had.
+
+    Example: workbench design case.toml --control 3 --weight 20 --damping 0.2 --errors 0.05
     """
     from workbench.design.closed_loop import impulse_state
-    from workbench.design.comparison import compare, through_sensors
-    from workbench.design.coupled import coupled_lqr
-    from workbench.design.imsc import imsc
+    from workbench.design.comparison import compare, laws_of, through_sensors
+    from workbench.design.robustness import survival_of, wrong_by
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -296,7 +306,8 @@ def design(
     modes, at = found.modes, _blow(found, impulse_at)
     state = impulse_state(modes, at)
     state[modes.n_modes + n :] = 0.0
-    laws = [imsc(modes, n, actuators, weight=weight), coupled_lqr(modes, n, actuators, weight=weight)]
+    wrong = None if errors is None else wrong_by(modes, errors)
+    laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
     end = final_time or 20 * TURN / modes.omega[modes.omega > 0][0]
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     shown = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "feeds", box=None, pad_edge=False)
@@ -305,20 +316,24 @@ def design(
         feeds = "" if row.most_fed is None else f"mode {row.most_fed + 1}"
         shown.add_row(row.law.name, *(f"{value:.5g}" for value in figures), feeds)
     console.print(f"{n} of {modes.n_modes} modes controlled, unit blow at x = {at:g}, R = {weight:g}", style="bold")
+    for why in refused:
+        console.print(f"  {why}", markup=False)
     console.print(shown)
     mass = None if found.structure is None else found.structure.mass_per_length
-    tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
+    places = [s.at for s in found.sensors]
+    tried = through_sensors(modes, laws, places, mass)
     console.print("displacement and velocity read at the sensors' places:", style="bold")
-    sensed = Table("design", "margin [1/s]", "worst residual mode", "by the path", box=None, pad_edge=False)
+    heads = ["design", "margin [1/s]", "residual mode behind it", "by the path"]
+    sensed = Table(*heads, *([] if errors is None else [f"stable, models {errors:.2g} off"]), box=None, pad_edge=False)
+    shares = []
     for controller, explained, why in tried:
         if controller is None or explained is None:
             console.print(f"  {why}", markup=False)
             continue
-        worst = explained.moved[0] if explained.moved else None
-        mode = f"mode {worst.mode + 1}: {worst.closed_pole.real:+.3g} 1/s" if worst else ""
-        path = f"sensor at {worst.paths[0].sensor_at:g} to {worst.paths[0].actuator}" if worst else ""
-        verdict = "" if explained.margin > 0 else " unstable"
-        sensed.add_row(controller.name, f"{explained.margin:.3g}{verdict}", mode, path)
+        shares.append(None if wrong is None else survival_of(wrong, controller))
+        survived = [] if shares[-1] is None else [f"{shares[-1]:.0%}"]
+        margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
+        sensed.add_row(controller.name, margin, *_behind(explained), *survived)
     console.print(sensed)
     _write_json(
         json_path,
@@ -341,12 +356,30 @@ def design(
                 for r in rows
             ],
             "through_sensors": [
-                {"design": c.name, "margin": e.margin, "poles_real": e.poles.real, "poles_imag": e.poles.imag}
-                for c, e, _ in tried
+                {
+                    "design": c.name,
+                    "margin": e.margin,
+                    "survived": share,
+                    "poles_real": e.poles.real,
+                    "poles_imag": e.poles.imag,
+                }
+                for (c, e, _), share in zip([t for t in tried if t[0] is not None], shares)
                 if c is not None and e is not None
             ],
         },
     )
+
+
+def _behind(explained) -> tuple[str, str]:
+    """The residual mode that a margin is owed to, and the path by which it is."""
+    worst = explained.culprit or (explained.moved[0] if explained.moved else None)
+    if worst is None:
+        return "", ""
+    if not explained.loop.stable and explained.culprit is None:
+        return "none: unstable without any" if explained.reduced_margin <= 0 else "no single one", ""
+    grows = explained.loop.stable or worst.closed_pole.real > 0
+    told = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"
+    return f"mode {worst.mode + 1}: {told}", f"sensor at {worst.paths[0].sensor_at:g} to {worst.paths[0].actuator}"
 
 
 @app.command()

@@ -100,11 +100,23 @@ def test_an_observer_in_the_loop_against_python_control():
     np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
 
 
+def test_a_residual_mode_is_named_that_stays_stable_and_unsettles_a_controlled_one():
+    modes = beam(5, 0.01)
+    controller = observed(modes, 3.3)
+    told = explain(modes, controller)
+    assert told.margin < 0 and told.reduced_margin > 0 and told.moved[0].closed_pole.real < 0
+    assert told.culprit.mode == 3 and stability_margin(close_with(modes.select([0, 1, 2, 4]), controller)) > 0
+    assert all(m.margin_without < 0 for m in told.moved if m is not told.culprit)
+
+
 def test_balas_one_sensor_settles_here_and_unsettles_there():
     modes = beam()
     good, bad = explain(modes, observed(modes, 10 / 6)), explain(modes, observed(modes, 50 / 6))
     assert good.margin > 0 and good.culprit is None
     assert bad.margin < 0 and bad.culprit.mode == 3
+    assert bad.reduced_margin == pytest.approx(
+        stability_margin(close_with(modes.select(range(3)), observed(modes, 50 / 6)))
+    )
     # without either spillover the same mode would stay
     assert stability_margin(close_with(modes.select(range(3)), observed(modes, 50 / 6))) > 0
 

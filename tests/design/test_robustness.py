@@ -13,7 +13,7 @@ from workbench.design.imsc import imsc
 from workbench.design.law import DesignError, Law
 from workbench.design.modal_filter import hermite_filter
 from workbench.design.reidentify import open_loop, updated
-from workbench.design.robustness import draw_modes, survive
+from workbench.design.robustness import draw_modes, survival_of, survive, wrong_by
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -46,6 +46,22 @@ def test_shape_errors_have_their_size_at_the_sensors():
     errors = np.array([m.phi(positions) for m in drawn]) - modes.phi(positions)
     largest = np.abs(modes.phi(positions)).max(axis=0)
     np.testing.assert_allclose(errors.std(axis=0) / largest, 0.01, rtol=0.12)
+
+
+def test_models_are_wrong_by_what_was_asked():
+    modes = beam(6)
+    wrong = wrong_by(modes, 0.02, count=600)
+    x = np.linspace(0.0, 10.0, 401)
+    missed = np.array([m.phi(x) for m in wrong]) - modes.phi(x)
+    size = np.sqrt(np.trapezoid(missed**2, x, axis=1).mean(axis=0))  # shapes of unit size: ∫ m φ² dx = 1
+    np.testing.assert_allclose(size, 0.02, rtol=0.08)
+    np.testing.assert_allclose(np.std([m.omega / modes.omega for m in wrong], axis=0), 0.02, rtol=0.12)
+    idle = Law(np.zeros((1, 2)), (0,), (PLACES[0],))
+    assert survival_of(wrong, idle) == 1.0
+    # a damping ratio that is its own standard error wide is negative in norm.cdf(-1) of the draws
+    assert survival_of(wrong_by(beam(1), 1.0, count=1200), idle) == pytest.approx(norm.cdf(1.0), abs=0.05)
+    with pytest.raises(DesignError, match="relative error of the models must be positive; got nan"):
+        wrong_by(modes, np.nan)
 
 
 def test_survival_is_the_share_of_positive_damping():

@@ -1,17 +1,20 @@
 """Several laws on the same structure after the same blow, on one yardstick."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from workbench.design.closed_loop import close_loop, respond
 from workbench.design.controller import Controller, filtered
+from workbench.design.coupled import coupled_lqr, coupled_poles
 from workbench.design.explain import Explanation, explain
-from workbench.design.law import DesignError, Law
+from workbench.design.imsc import imsc, imsc_poles
+from workbench.design.law import DesignError, Law, controlled_indices
 from workbench.design.modal_filter import displacement_filter
 from workbench.design.observers import luenberger
 from workbench.design.spillover import Spillover, effort, finite_spillover, quadratic_cost
+from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import ProfileLike
@@ -49,6 +52,29 @@ class Compared:
         """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
         residual = self.work.residual
         return residual[int(np.argmax(self.work.residual_work))] if residual else None
+
+
+def laws_of(
+    modes: Modes, controlled: int, actuators: Sequence[Actuator], *, weight: float, damping: float | None = None
+) -> tuple[list[Law], list[str]]:
+    """The laws to be had, IMSC and coupled LQR, and by poles of a damping ratio where one is given; why IMSC is not.
+
+    Raises:
+        DesignError: no law is to be had.
+    """
+    makers: list[Callable[[], Law]] = [lambda: imsc(modes, controlled, actuators, weight=weight)]
+    coupled: list[Callable[[], Law]] = [lambda: coupled_lqr(modes, controlled, actuators, weight=weight)]
+    if damping is not None:
+        if not 0 < damping < 1:
+            raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
+        omega = modes.omega[list(controlled_indices(modes, controlled))]
+        poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
+        makers.append(lambda: imsc_poles(modes, controlled, actuators, poles=poles))
+        coupled.append(lambda: coupled_poles(modes, controlled, actuators, poles=poles))
+    if controlled <= len(actuators):
+        return [make() for make in (*makers, *coupled)], []
+    why = f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
+    return [make() for make in coupled], [why]
 
 
 def compare(

@@ -47,12 +47,14 @@ class Moved:
         pole: open loop, upper half plane, rad/s.
         closed_pole: of the full closed loop.
         paths: the most destabilising first; their shifts add up to the movement.
+        margin_without: stability margin of the loop of all the other modes, 1/s.
     """
 
     mode: int
     pole: complex
     closed_pole: complex
     paths: tuple[Path, ...]
+    margin_without: float
 
     @property
     def shift(self) -> complex:
@@ -72,10 +74,12 @@ class Explanation:
     Attributes:
         loop: of all modes.
         moved: every residual mode, the least stable first.
+        reduced_margin: of the loop of the controlled modes alone, 1/s.
     """
 
     loop: ClosedLoop
     moved: tuple[Moved, ...]
+    reduced_margin: float
 
     @property
     def poles(self) -> np.ndarray:
@@ -89,8 +93,17 @@ class Explanation:
 
     @property
     def culprit(self) -> Moved | None:
-        """The residual mode that the controller unsettles, None where the loop is stable."""
-        return self.moved[0] if self.moved and self.moved[0].closed_pole.real > 0 else None
+        """The residual mode that unsettles the loop: one that grows, else the one without which the loop is stable.
+
+        A residual mode can stay stable itself and make a controlled one grow. None where the loop is stable, and where
+        no single mode is to blame, as when it fails on the reduced model already.
+        """
+        if self.loop.stable or not self.moved:
+            return None
+        if self.moved[0].closed_pole.real > 0:
+            return self.moved[0]
+        behind = max(self.moved, key=lambda m: m.margin_without)
+        return behind if behind.margin_without > 0 else None
 
 
 def stability_margin(loop: ClosedLoop) -> float:
@@ -114,9 +127,11 @@ def explain(modes: Modes, controller: Controller) -> Explanation:
         at = [_OneMode(modes, controller, r) for r in residual]
         far = np.abs(np.array([mode.closed_pole() for mode in at])[:, None] - upper[None, :])
         for i, k in zip(*linear_sum_assignment(far), strict=True):
-            moved.append(Moved(residual[i], at[i].pole, complex(upper[k]), at[i].paths(complex(upper[k]))))
+            closed = complex(upper[k])
+            moved.append(Moved(residual[i], at[i].pole, closed, at[i].paths(closed), at[i].margin_without))
     moved.sort(key=lambda m: -m.closed_pole.real)
-    return Explanation(loop, tuple(moved))
+    alone = close_with(modes.select(controller.law.controlled), controller)
+    return Explanation(loop, tuple(moved), stability_margin(alone))
 
 
 class _OneMode:
@@ -139,6 +154,10 @@ class _OneMode:
         answer = self._loop.feedback @ np.linalg.solve(s * np.eye(matrix.shape[0]) - matrix, self._enters)
         answer = answer + self._controller.direct
         return self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
+
+    @property
+    def margin_without(self) -> float:
+        return stability_margin(self._loop)
 
     def closed_pole(self) -> complex:
         """Where the mode goes: s = λ + Δ(s) by the secant method, else to first order."""

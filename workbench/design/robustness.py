@@ -108,6 +108,29 @@ def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
     return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.length, modes.essential)
 
 
+def wrong_by(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> list[Modes]:
+    """Structures unlike the model by a relative standard error, where no identification tells how unlike they may be.
+
+    Frequencies and damping ratios are off by it each; every shape has some of all others in it, in mean square this
+    share of its own size.
+
+    Raises:
+        DesignError: an error that is not positive.
+    """
+    if not 0 < error < np.inf:
+        raise DesignError(f"the relative error of the models must be positive; got {error:g}")
+    rng, n = np.random.default_rng(seed), modes.n_modes
+    centre = np.r_[modes.omega, modes.zeta]
+    drawn = centre * (1.0 + error * rng.standard_normal((count, 2 * n)))
+    mixing = error / np.sqrt(n) * rng.standard_normal((count, n, n))
+    return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
+
+
+def survival_of(possible: list[Modes], design: Controller | Law) -> float:
+    """Share of the structures on which a design is stable."""
+    return float(np.mean([close_with(modes, design).stable for modes in possible]))
+
+
 def survive(
     possible: list[Modes], designs: Mapping[str, Controller | Law], *, state: np.ndarray, final_time: float
 ) -> dict[str, Survival]:
