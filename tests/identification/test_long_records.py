@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from workbench.identification import order
 from workbench.identification.long_records import identify_long
@@ -83,3 +84,13 @@ def test_a_sensor_of_its_own_noise_and_unit(truth, record):
     found = identify_long([replace(record, outputs=outputs)], most_modes=99)
     assert found.modes.n_modes == truth.n_modes
     assert found.refined.noise_std[2] == pytest.approx(1e5, rel=0.05)
+
+
+def test_noise_that_is_not_white_holds_no_modes(truth, record):
+    white = np.random.default_rng(5).standard_normal(record.outputs.shape)
+    coloured = lfilter([3e-4], [1.0, -0.9], white, axis=1)
+    outputs = record.outputs + coloured
+    found = identify_long([replace(record, outputs=outputs)], most_modes=99)
+    away = np.abs(found.modes.omega[:, None] - truth.omega)
+    assert (away.min(axis=1) < 1e-4 * found.modes.omega).all()
+    assert found.modes.n_modes >= 6

@@ -88,3 +88,37 @@ def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[flo
     axes[1, 0].set_ylabel("about the identified curve")
     figure.legend(*axes[1, 0].get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return figure
+
+
+def size_and_errors(rows: Sequence[Mapping], errors: np.ndarray) -> Figure:
+    """What a record costs to identify by its length, and errors (2, n_modes) of ω and ζ of the longest over the bound.
+
+    Args:
+        rows: with samples, processor_seconds, seconds, found, count, as `identification_size`.
+        errors: in standard errors of the Cramér-Rao bound.
+    """
+    figure, (left, right) = new_figure(1, 2, width=10.5, height=4.2)
+    samples = np.array([row["samples"] for row in rows])
+    spent = np.array([row["processor_seconds"] for row in rows])
+    left.loglog(samples, spent, "o-", label="processor time, both cores together")
+    left.loglog(samples, spent[-1] * samples / samples[-1], "--", color=GREY, label="in proportion to the samples")
+    left.axhline(30.0, color=COLOURS[1], lw=1.2)
+    left.annotate("limit at full size: 30 s", (samples[0], 30.0), (0, 4), textcoords="offset points", color=COLOURS[1])
+    for row in rows:
+        text = f"{row['found']} of {row['count']}\nmodes"
+        at = (row["samples"], row["processor_seconds"])
+        left.annotate(text, at, (0, -28), textcoords="offset points", ha="center", fontsize=8.5)
+    left.set_xticks(samples, [f"{n:,}" for n in samples])
+    left.minorticks_off()
+    left.set_ylim(0.3 * spent.min(), 80.0)
+    left.set_xlabel(f"samples of {rows[-1]['sensors']} sensors")
+    left.set_ylabel("time to identify [s]")
+    left.legend(loc="lower right")
+    edges, x = np.linspace(-4.0, 4.0, 33), np.linspace(-4.0, 4.0, 201)
+    right.hist(errors.T, edges, density=True, label=("frequency", "damping"), color=COLOURS[:2], alpha=0.8)
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    right.plot(x, normal, color=GREY, lw=3, alpha=0.7, label="a method that attains the bound")
+    right.set_xlabel("error of a mode [standard errors of the bound]")
+    right.set_ylabel("density")
+    right.legend(loc="upper left")
+    return figure

@@ -37,6 +37,8 @@ BESIDE = 64  # cells from whose median the noise about a peak is taken
 LEAKED = 2.0  # a peak must be so many times what stronger ones may leak to its place
 LEAST_APART = 0.05
 STEPS, MOST_ROUNDS = 6, 60
+# A peak refused so often where it stands is noise; once may be for poles that were not settled.
+MOST_REFUSALS = 2
 
 
 def identify_long(records: Sequence[Record], *, most_modes: int, false_alarm: float = FALSE_ALARM) -> Identified | None:
@@ -71,6 +73,7 @@ class _Peeled:
         count = 1 + int(np.log(max(0.1 * np.pi * self.longest / SLOWEST, 1.0)) / np.log(RATIO))
         self.rates = SLOWEST / self.span * RATIO ** np.arange(count)
         self.signals = 2 * sum(r.n_outputs for r in records)
+        self.white = float(chi2.median(self.signals))
         cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, self.signals))
         # A mode is two amplitudes a signal and its pole, chosen among all cells.
@@ -79,6 +82,7 @@ class _Peeled:
         self.floor = 1e-11 * np.sqrt(np.mean([(r.outputs**2).mean() for r in records]))
         self.refused: list[tuple[complex, float]] = []
         self.weights = np.ones(records[0].n_outputs)
+        self.fine = np.zeros(1)
         self.settle(np.zeros(0, complex), 0)
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
@@ -94,13 +98,15 @@ class _Peeled:
 
     def peaks(self) -> np.ndarray:
         """Poles of the swings that stand out of what is left, strongest first."""
-        found = [self._peaks(rate) for rate in self.rates]
-        strength, poles = np.concatenate([s for s, _ in found]), np.concatenate([p for _, p in found])
+        strengths = [self._strengths(rate) for rate in self.rates]
+        self.fine = strengths[0]
+        found = [self._peaks(rate, each) for rate, each in zip(self.rates, strengths, strict=True)]
+        height, poles = np.concatenate([h for h, _ in found]), np.concatenate([p for _, p in found])
         taken, heights = np.zeros(0, complex), np.zeros(0)
-        for r in np.argsort(-strength):
+        for r in np.argsort(-height):
             leaked = np.sqrt(heights * self._overlap(taken, poles[r])).sum() ** 2
-            if strength[r] > LEAKED * leaked:
-                taken, heights = np.append(taken, poles[r]), np.append(heights, strength[r])
+            if height[r] > LEAKED * leaked and height[r] > self.enter * self._colour(poles[r]):
+                taken, heights = np.append(taken, poles[r]), np.append(heights, height[r])
         return taken
 
     def prune(self, thoroughly: bool = False) -> bool:
@@ -108,29 +114,41 @@ class _Peeled:
         if self.poles.size == 0:
             return False
         evidence = self.evidence()
-        shapes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in self.fits])
-        out = no_modes(self.poles, shapes, self.bin_width) | (evidence < self.limit)
+        limit = self.limit * np.array([self._colour(pole) for pole in self.poles])
+        out = no_modes(self.poles, self._shapes, self.bin_width) | (evidence < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > 0.5)
-                if near.size > 1:
+                if near.size > 1 and self._alone(r, near) < limit[r]:
                     evidence[r] = self._missed(r, near)
-                    out[r] = evidence[r] < self.limit
+                    out[r] = evidence[r] < limit[r]
         if out.any():
             self.refused += [(complex(pole), e) for pole, e in zip(self.poles[out], evidence[out], strict=True)]
             self.settle(self.poles[~out], 2)
         return bool(out.any())
 
+    @property
+    def _shapes(self) -> np.ndarray:
+        """Amplitudes over the noise, (n_signals, n_modes), of one record below the other."""
+        return np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in self.fits])
+
     def evidence(self) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
-        n = self.poles.size
-        pairs = np.arange(n)[:, None] + [0, n]
-        strength = np.zeros(n)
+        return np.array([self._strength(r, np.zeros((self.weights.size, 0))) for r in range(self.poles.size)])
+
+    def _strength(self, r: int, without: np.ndarray) -> float:
+        """χ² of the amplitudes of mode r, less what lies along some directions (n_outputs, n_directions)."""
+        strength, both = 0.0, [r, self.poles.size + r]
         for fit in self.fits:
-            a = fit.coefficients[pairs] * self.weights
-            spread = fit.spread[pairs[:, :, None], pairs[:, None, :]]
-            strength += (a * np.linalg.solve(spread, a)).sum(axis=(1, 2))
+            a = fit.coefficients[both] * self.weights
+            a = a - (a @ without) @ without.T
+            strength += float((a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)).sum())
         return strength
+
+    def _alone(self, r: int, near: np.ndarray) -> float:
+        """χ² of mode r in what its neighbours cannot stand for: combinations of the outputs that see none of them."""
+        shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
+        return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
 
     def report(self) -> Identified:
         refined = as_refined(
@@ -161,22 +179,28 @@ class _Peeled:
                 found += (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
         return found
 
-    def _peaks(self, rate: float) -> tuple[np.ndarray, np.ndarray]:
-        """Strengths and poles of one rate's local maxima that stand out of the noise about them."""
-        strengths = self._strengths(rate)
+    def _colour(self, pole: complex) -> float:
+        """Noise about a swing over white noise, where it is larger, as the last search saw it; 1 if white."""
+        step = np.pi / (self.fine.size * self.dt)
+        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), BESIDE)
+        beside = self.fine[max(at - half, 0) : at + half + 1]
+        return max(1.0, float(np.median(beside)) / self.white)
+
+    def _peaks(self, rate: float, strengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Strengths and poles of one rate's local maxima that stand out of white noise."""
         step = 2.0 * np.pi / (self._size(rate)[1] * self.dt)
         omega = step * np.arange(strengths.size)
         inside = (omega > max(rate / MOST_DAMPED, 1.5 * self.bin_width)) & (omega < np.pi / self.dt - self.bin_width)
         highest = np.r_[False, (strengths[1:-1] > strengths[:-2]) & (strengths[1:-1] >= strengths[2:]), False]
-        limit = self.enter * _about(strengths, self.signals)
-        at = np.flatnonzero(inside & highest & (strengths > LEAST_APART * limit))
+        at = np.flatnonzero(inside & highest & (strengths > LEAST_APART * self.enter))
         poles = -rate + 1j * omega[at]
+        refused = np.zeros(at.size, int)
         for pole, _ in self.refused:
-            poles[np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))] = np.nan
-        at, poles = at[~np.isnan(poles)], poles[~np.isnan(poles)]
+            refused += np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))
+        at, poles = at[refused < MOST_REFUSALS], poles[refused < MOST_REFUSALS]
         apart = self._apart(poles)
         full = strengths[at] / np.maximum(apart, LEAST_APART)
-        good = (apart > LEAST_APART) & (full > limit[at])
+        good = (apart > LEAST_APART) & (full > self.enter)
         return full[good], poles[good]
 
     def _apart(self, swings: np.ndarray) -> np.ndarray:
@@ -211,7 +235,7 @@ class _Peeled:
 
         Seen along the shapes of these modes alone: no other combination of the outputs tells of them.
         """
-        shapes = np.hstack([fit.complex_amplitudes[:, near] * self.weights[:, None] for fit in self.fits])
+        shapes = np.hstack(np.split(self._shapes[:, near], len(self.fits)))
         directions = np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
         seen, channels = [], self.records[0].output_channels[: directions.shape[1]]
         for record, fit in zip(self.records, self.fits, strict=True):
@@ -230,13 +254,3 @@ def _nothing(record: Record) -> Projection:
     level, none = record.outputs.mean(axis=1), np.zeros((0, 0))
     power = ((record.outputs - level[:, None]) ** 2).sum(axis=1)
     return Projection(record, np.zeros(0, complex), power, 0.0, level[None], none, none, none, none)
-
-
-def _about(strengths: np.ndarray, signals: int) -> np.ndarray:
-    """Noise about every cell over white noise, where it is larger: medians of cells, 1 if white."""
-    whole = strengths[: strengths.size // BESIDE * BESIDE].reshape(-1, BESIDE)
-    if len(whole) == 0:
-        return np.ones(strengths.size)
-    medians = np.median(whole, axis=1) / chi2.median(signals)
-    at = np.minimum(np.arange(strengths.size) // BESIDE, len(medians) - 1)
-    return np.maximum(1.0, medians[at])

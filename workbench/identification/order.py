@@ -27,7 +27,7 @@ from workbench.records.record import Record
 from workbench.structure.modes import frozen
 
 # Values in all from which modes are taken in many at a time.
-LONG = 200_000
+LONG = 100_000
 MOST_MODES = 40
 # Tries that fall below the limit in a row before the record counts as told.
 MOST_REFUSALS = 2
