@@ -77,8 +77,16 @@ ROWS = {
     "Silverbox": lambda r: 1e3 * r["rmse"]["multisines"]["after"],
     "the same on the arrow": lambda r: 1e3 * r["rmse"]["arrow"]["after"],
     "a flexible arm": lambda r: 1e3 * r["mass"]["kg"],
+    "two hundred cases": lambda r: _share(r, "single"),
+    "the same, two effects": lambda r: _share(r, "pair"),
+    "the same, nothing hidden": lambda r: min(_share(r, "none"), _share(r, "unknown")),
     "median share": lambda r: _largest(r, "median share"),
 }
+
+
+def _share(results: dict, family: str) -> float:
+    right, of = results["shares"][family]
+    return right / of
 
 
 def _largest(results: dict, *words: str) -> float:
