@@ -48,8 +48,10 @@ def no_modes(poles: np.ndarray, shapes: np.ndarray, bin_width: float) -> np.ndar
     size = np.linalg.norm(shapes, axis=0)
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-    split = near & (mac(shapes, shapes) > SAME_SHAPE) & (size[:, None] < size)
-    return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
+    damped = -poles.real > MOST_DAMPED * np.abs(poles)
+    # One damped beyond what rings has every band; it is split itself.
+    split = near & (mac(shapes, shapes) > SAME_SHAPE) & (size[:, None] < size) & ~damped
+    return split.any(axis=1) | damped
 
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:

@@ -35,10 +35,11 @@ LIFE = 8.0
 AT_ONCE = 16  # outputs transformed together
 BESIDE = 64  # cells from whose median the noise about a peak is taken
 LEAKED = 2.0  # a peak must be so many times what stronger ones may leak to its place
-LEAST_APART = 0.05
+LEAST_APART, OVERLAPS = 0.05, 0.5
 STEPS, MOST_ROUNDS = 6, 60
-# A peak refused so often where it stands is noise; once may be for poles that were not settled.
-MOST_REFUSALS = 2
+# A peak refused so often where it stood is noise; once may be for poles that were not settled. Rounds that leave no
+# more modes than before: where noise is not white, or modes shift as they decay, there may be no end of them.
+MOST_REFUSALS, MOST_FRUITLESS = 2, 3
 
 
 def identify_long(records: Sequence[Record], *, most_modes: int, false_alarm: float = FALSE_ALARM) -> Identified | None:
@@ -49,12 +50,14 @@ def identify_long(records: Sequence[Record], *, most_modes: int, false_alarm: fl
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
     """
-    peeled = _Peeled(records, false_alarm)
+    peeled, fruitless = _Peeled(records, false_alarm), 0
     for _ in range(MOST_ROUNDS):
-        peaks = peeled.peaks()[: most_modes - peeled.poles.size]
+        before = peeled.poles.size
+        peaks = peeled.peaks()[: most_modes - before] if fruitless < MOST_FRUITLESS else np.zeros(0)
         if peaks.size:
-            peeled.settle(np.append(peeled.poles, peaks), STEPS)
+            peeled.take_in(peaks)
             peeled.prune()
+            fruitless = 0 if peeled.poles.size > before else fruitless + 1
         else:
             peeled.settle(peeled.poles, MOST_STEPS)
             if not peeled.prune(thoroughly=True):
@@ -80,10 +83,16 @@ class _Peeled:
         self.limit = float(chi2.isf(false_alarm / cells, self.signals + 2))
         # Sums over so many samples are no more exact than this.
         self.floor = 1e-11 * np.sqrt(np.mean([(r.outputs**2).mean() for r in records]))
+        # Swings as they stood out, of the modes and of what was refused.
+        self.origins = np.zeros(0, complex)
         self.refused: list[tuple[complex, float]] = []
         self.weights = np.ones(records[0].n_outputs)
         self.fine = np.zeros(1)
         self.settle(np.zeros(0, complex), 0)
+
+    def take_in(self, peaks: np.ndarray) -> None:
+        self.origins = np.append(self.origins, peaks)
+        self.settle(np.append(self.poles, peaks), STEPS)
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
         """All poles fitted together, outputs weighted by what was left of them before."""
@@ -118,12 +127,17 @@ class _Peeled:
         out = no_modes(self.poles, self._shapes, self.bin_width) | (evidence < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
-                near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > 0.5)
+                near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > OVERLAPS)
                 if near.size > 1 and self._alone(r, near) < limit[r]:
                     evidence[r] = self._missed(r, near)
                     out[r] = evidence[r] < limit[r]
+        for r in map(int, np.flatnonzero(out)):
+            # Of two that overlap the weaker goes first: the other may then stand.
+            rivals = out & (evidence < evidence[r]) & (self._overlap(self.poles, self.poles[r]) > OVERLAPS)
+            out[r] = not rivals.any()
         if out.any():
-            self.refused += [(complex(pole), e) for pole, e in zip(self.poles[out], evidence[out], strict=True)]
+            self.refused += [(complex(pole), e) for pole, e in zip(self.origins[out], evidence[out], strict=True)]
+            self.origins = self.origins[~out]
             self.settle(self.poles[~out], 2)
         return bool(out.any())
 
