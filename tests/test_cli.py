@@ -4,11 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 from workbench.cli import app
 from workbench.identification.synthesis import free_decay, struck
 from workbench.records.files import write_record
+from workbench.records.record import Channel, Record
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 
@@ -73,6 +75,29 @@ def test_identify_finds_the_modes_and_their_number(tmp_path):
     exact = (np.arange(1, 5) * np.pi / 10) ** 2 / (2 * np.pi)
     assert len(modes["frequencies_hz"]) == 4
     assert (np.abs(modes["frequencies_hz"] - exact) < 5 * np.array(modes["frequencies_std_hz"])).all()
+
+
+def test_identify_reads_records_with_inputs_and_ambient_ones(tmp_path):
+    rng, dt, n = np.random.default_rng(2), 0.02, 6000
+    pole = -0.3 + 9.0j
+    force = rng.standard_normal(n)
+    swing = (
+        lfilter([0.0, (np.exp(pole * dt) - 1.0) / pole], [1.0, -np.exp(pole * dt)], force.astype(complex)).imag / 9.0
+    )
+    outputs = swing + 0.02 * swing.std() * rng.standard_normal(n)
+    record = Record(dt, outputs[None], (Channel("tip"),), force[None], (Channel("shaker", "force"),))
+    path, found = write_record(record, tmp_path / "driven.npz"), tmp_path / "found.json"
+    result = run("identify", path, "--inputs", "shaker", "--json", found)
+    assert result.exit_code == 0, result.output
+    driven = json.loads(found.read_text())
+    assert abs(driven["frequencies_hz"][0] * 2 * np.pi - abs(pole)) < 4 * driven["frequencies_std_hz"][0] * 2 * np.pi
+    assert np.array(driven["state_space"]["A"]).shape == (2, 2) and driven["inputs"] == ["shaker"]
+    assert run("identify", path, "--ambient").exit_code == 2
+    alone = write_record(Record(dt, outputs[None], (Channel("tip"),)), tmp_path / "ambient.npz")
+    result = run("identify", alone, "--ambient", "--modes", 1, "--json", found)
+    assert result.exit_code == 0 and "20 blocks" in result.output, result.output
+    ambient = json.loads(found.read_text())
+    assert abs(ambient["frequencies_hz"][0] * 2 * np.pi - abs(pole)) < 4 * ambient["frequencies_std_hz"][0] * 2 * np.pi
 
 
 def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
@@ -256,6 +281,6 @@ def test_identify_cuts_a_record_to_its_decay_and_says_what_it_did(tmp_path):
     result = run("identify", path, "--outputs", "y1,y2", "--json", found)
     assert result.exit_code == 0 and "free decay from 200 s on" in result.output, result.output
     told = json.loads(found.read_text())
-    assert told["start"] == 200.0 and len(told["frequencies_hz"]) == len(told["remarks"]) == 2
+    assert told["start"] == [200.0] and len(told["frequencies_hz"]) == len(told["remarks"]) == 2
     later = run("identify", path, "--outputs", "y1,y2", "--start", 250, "--modes", 2)
     assert later.exit_code == 0 and "900 samples at 2 Hz from 250 s on" in later.output

@@ -39,6 +39,8 @@ _HOMES = {
     "identification.ibrahim": ("stacked_delays", "two_delays"),
     "identification.refinement": ("Refined", "amplitudes", "bound", "refine"),
     "identification.order": ("Identified", "identify"),
+    "identification.ring_down": ("RingDown", "ring_down"),
+    "identification.proportional": ("ProportionalFit", "proportional_fit"),
     "identification.driven": ("Driven", "identify_driven"),
     "identification.frequency_fit": ("TransferModes", "coherence_noise", "identify_transfer"),
     "identification.aliases": ("Aliases", "aliases"),

@@ -178,98 +178,44 @@ def _run(found, data: Path | None, scheduler: str | None) -> bool:
 @app.command()
 @_guarded
 def identify(
-    record: Annotated[Path, typer.Argument(help="A ring-down: .csv, .txt, .npz, .mat, .h5, .uff.")],
+    records: Annotated[list[Path], typer.Argument(help="Of the same sensors: .csv, .txt, .npz, .mat, .h5, .uff.")],
     modes: Annotated[int | None, typer.Option(help="How many modes; those above the noise unless given.")] = None,
     sample_rate_hz: Annotated[float | None, typer.Option(help="Where the file tells no time.")] = None,
     start: Annotated[
         float | None, typer.Option(help="Time from which it decays freely, s; found unless given.")
     ] = None,
-    inputs: Annotated[str, typer.Option(help="Names of channels that are inputs, with commas between.")] = "",
+    inputs: Annotated[str, typer.Option(help="Names of measured inputs, with commas between: driven by them.")] = "",
+    ambient: Annotated[bool, typer.Option("--ambient", help="Driven by unknown broadband forces all along.")] = False,
     outputs: Annotated[str, typer.Option(help="Names of the outputs to read, with commas between; else all.")] = "",
     json_path: JsonPath = None,
 ) -> None:
-    """Find the modes of a ring-down, each figure with its standard error.
+    """Find the modes of ring-downs, or of driven records, each figure with its standard error.
 
     Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """
     from workbench.records.files import read_record
-    from workbench.study.ring_down import ring_down
+    from workbench.study.modes_told import HEADINGS, told_of
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
-    read = read_record(record, sample_rate_hz=sample_rate_hz, inputs=_names(inputs))
+    read = [read_record(path, sample_rate_hz=sample_rate_hz, inputs=_names(inputs)) for path in records]
     if outputs:
-        read = read.only(_names(outputs))
-    told = ring_down(read, start=start, n_modes=modes)
-    found, read = told.refined, told.record
+        read = [record.only(_names(outputs)) for record in read]
+    told = told_of(read, start=start, n_modes=modes, ambient=ambient)
     shown = Table(box=None, pad_edge=False)
-    for heading in ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity"):
+    for heading in HEADINGS:
         shown.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
-    straight = found.modes.phase_collinearity
-    for r in range(found.modes.n_modes):
-        f, f_std = _to_its_error(found.modes.frequencies_hz[r], found.omega_std[r] / TURN)
-        zeta, zeta_std = _to_its_error(100 * found.modes.zeta[r], 100 * found.zeta_std[r])
-        shown.add_row(str(r + 1), f, f_std, zeta, zeta_std, f"{straight[r]:.4f}")
-    counted = f"{read.n_outputs} sensor{'s' * (read.n_outputs > 1)}, {read.n_samples} samples"
-    console.print(f"{counted} at {read.sample_rate_hz:.6g} Hz from {read.start_time:.6g} s on", style="bold")
+    for row in told.rows:
+        shown.add_row(*row)
+    console.print(told.heading, style="bold", markup=False)
     console.print(shown)
-    for r, remark in enumerate(told.remarks):
-        if remark:
-            console.print(f"  mode {r + 1}: {remark}")
-    for note in told.notes:
-        console.print(f"  {note}", markup=False)
-    stretches = told.by_amplitude
-    amplitudes = {}
-    for r in [r for r, depends in enumerate(stretches.depends) if depends]:
-        seen = [w for w, omega in enumerate(stretches.omega[:, r]) if math.isfinite(omega)]
-        at = [(stretches.amplitude[w, r], stretches.omega[w, r] / TURN, stretches.zeta[w, r]) for w in seen]
-        shown_at = "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for size, f, zeta in at)
-        console.print(f"  mode {r + 1} depends on amplitude: {shown_at}")
-        amplitudes[str(r + 1)] = {
-            "amplitude": stretches.amplitude[seen, r],
-            "frequencies_hz": stretches.omega[seen, r] / TURN,
-            "frequencies_std_hz": stretches.omega_std[seen, r] / TURN,
-            "damping_ratios": stretches.zeta[seen, r],
-            "damping_std": stretches.zeta_std[seen, r],
-        }
-    if told.noise_modes.n_modes:
-        refused = ", ".join(f"{f:.4g}" for f in told.noise_modes.frequencies_hz)
-        console.print(f"  tried and refused, as noise or parts of a mode found: {refused} Hz")
-    if not found.converged:
-        console.print("  the refinement did not settle: ask for other --modes, or a later --start")
-    _write_json(
-        json_path,
-        {
-            "sensors": read.output_names,
-            "positions": [channel.at for channel in read.output_channels],
-            "start": read.start_time,
-            "frequencies_hz": found.modes.frequencies_hz,
-            "frequencies_std_hz": found.omega_std / TURN,
-            "damping_ratios": found.modes.zeta,
-            "damping_std": found.zeta_std,
-            "shapes_real": found.modes.shapes.real,
-            "shapes_imag": found.modes.shapes.imag,
-            "phase_collinearity": straight,
-            "remarks": told.remarks,
-            "depends_on_amplitude": amplitudes,
-            "noise_modes_hz": told.noise_modes.frequencies_hz,
-            "noise_std": found.noise_std,
-            "notes": told.notes,
-            "converged": found.converged,
-        },
-    )
+    for line in told.lines:
+        console.print(f"  {line}", markup=False)
+    _write_json(json_path, told.content)
 
 
 def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-def _to_its_error(value: float, error: float) -> tuple[str, str]:
-    """A figure and its standard error, both to the second digit of the error."""
-    if not (math.isfinite(error) and error > 1e-9 * abs(value)):
-        return f"{value:.10g}", f"{error:.1g}"
-    digits = max(0, 1 - math.floor(math.log10(error)))
-    return f"{value:.{digits}f}", f"{error:.{digits}f}"
 
 
 @app.command()

@@ -4,11 +4,13 @@ Stretches double in length as the motion dies away. In each, the modes still the
 linear structure all stretches agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
+from workbench.identification.coloured import in_its_noise
 from workbench.identification.refinement import Refined, refine
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
@@ -26,6 +28,7 @@ class AmplitudeDependence:
     """Each mode by amplitude; nan where a stretch does not tell of it.
 
     Attributes:
+        record: (n_stretches,) which record each is of, from 0.
         start: (n_stretches,) of each, s.
         amplitude: (n_stretches, n_modes) root mean square over a stretch of the mode's envelope, largest output.
         omega: (n_stretches, n_modes) rad/s.
@@ -36,6 +39,7 @@ class AmplitudeDependence:
             fewer than two stretches tell.
     """
 
+    record: np.ndarray
     start: np.ndarray
     amplitude: np.ndarray
     omega: np.ndarray
@@ -50,23 +54,37 @@ class AmplitudeDependence:
         return np.any(self.probability < SURE / self.probability.size, axis=0)
 
 
-def amplitude_dependence(record: Record, refined: Refined, *, stretches: int = STRETCHES) -> AmplitudeDependence:
-    """Frequency and damping of each mode of a free decay, stretch by stretch.
+def amplitude_dependence(
+    records: Record | Sequence[Record], refined: Refined, *, stretches: int = STRETCHES
+) -> AmplitudeDependence:
+    """Frequency and damping of each mode of free decays, stretch by stretch.
 
     Args:
-        record: the free decay that `refined` was found in.
-        refined: its modes.
-        stretches: how many, each twice as long as the one before.
+        records: the free decays that `refined` was found in.
+        refined: their modes.
+        stretches: how many of each record, each twice as long as the one before.
 
     Raises:
         ValueError: fewer than two stretches.
     """
     if stretches < 2:
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
-    n, modes = refined.modes.n_modes, refined.modes
+    records = [records] if isinstance(records, Record) else records
+    told = [_stretches(r, refined, np.abs(a), stretches) for r, a in zip(records, refined.amplitudes, strict=True)]
+    start = np.concatenate([each[0] for each in told])
+    amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in told]))
+    alike = np.stack([_alike(omega, omega_std), _alike(zeta, zeta_std)])
+    which = np.repeat(np.arange(len(records)), stretches)
+    return AmplitudeDependence(
+        frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(alike)
+    )
+
+
+def _stretches(record: Record, refined: Refined, size: np.ndarray, stretches: int) -> tuple[np.ndarray, np.ndarray]:
+    """Starts (n_stretches,), and (5, n_stretches, n_modes) of amplitude, ω and its error, ζ and its error."""
+    modes = refined.modes
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
-    figures = np.full((5, stretches, n), np.nan)
-    size = np.abs(refined.amplitudes[0])
+    figures = np.full((5, stretches, modes.n_modes), np.nan)
     for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
         span, decay = (last - first) * record.sample_time, -modes.poles.real
         begun = size * np.exp(-decay * first * record.sample_time)
@@ -77,7 +95,8 @@ def amplitude_dependence(record: Record, refined: Refined, *, stretches: int = S
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
         try:
-            found = refine(_samples(record, first, last), modes.select(list(there)), offset=True)
+            stretch = _samples(record, first, last)
+            found = in_its_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
         except np.linalg.LinAlgError:
             continue
         if not found.converged:
@@ -88,10 +107,7 @@ def amplitude_dependence(record: Record, refined: Refined, *, stretches: int = S
         told = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
         figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))
         figures[1:, w, there] = np.stack(told)[:, sure]
-    amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in figures)
-    alike = np.stack([_alike(omega, omega_std), _alike(zeta, zeta_std)])
-    start = record.start_time + record.sample_time * edges[:-1]
-    return AmplitudeDependence(frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(alike))
+    return record.start_time + record.sample_time * edges[:-1], figures
 
 
 def _samples(record: Record, first: int, last: int) -> Record:

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.ailments import check_fit
+from workbench.identification.coloured import in_its_noise
 from workbench.identification.ibrahim import check_alike
 from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
 from workbench.identification.long_records import identify_long
@@ -144,7 +145,7 @@ class Told:
 
     def report(self, records: Sequence[Record]) -> Identified:
         start = unshaped(self.poles, records[0])
-        refined = refine(records, start, offset=True)
+        refined = in_its_noise(refine(records, start, offset=True), records)
         evidence = self._evidence()[np.argsort(np.abs(self.poles))]
         refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
         noise = np.array([pole for pole, _ in refused], complex)

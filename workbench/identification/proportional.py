@@ -1,5 +1,6 @@
 """Is the damping proportional? The constants g1 and g2 of (3.32), and whether they explain what was measured."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,24 +28,30 @@ class ProportionalFit:
     probability: float
 
 
-def proportional_fit(refined: Refined) -> ProportionalFit:
+def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)) -> ProportionalFit:
     """Weighted least squares of ζ_r = (g1 ω_r + g2 / ω_r) / 2 (3.32), weights from the covariance of ζ.
+
+    Args:
+        refined: modes with the errors of their damping.
+        only: the modes to fit, from 0; all unless given.
 
     Raises:
         ValueError: fewer than two modes.
     """
-    modes = refined.modes
+    modes = refined.modes.select(only)
     n = modes.n_modes
     if n < 2:
         raise ValueError(f"g1 and g2 take at least two modes; there are {n}: identify more")
     columns = 0.5 * np.column_stack([modes.omega, 1.0 / modes.omega])
-    root = np.linalg.cholesky(refined.covariance[n:, n:])
+    which = refined.modes.n_modes + np.arange(refined.modes.n_modes)[only]
+    covariance = refined.covariance[np.ix_(which, which)]
+    root = np.linalg.cholesky(covariance)
     a, b = np.linalg.solve(root, columns), np.linalg.solve(root, modes.zeta)
     g = np.linalg.lstsq(a, b, rcond=None)[0]
     misfit = float(((b - a @ g) ** 2).sum())
     return ProportionalFit(
         damping=ProportionalDamping(float(g[0]), float(g[1])),
         standard_errors=frozen(np.sqrt(np.diag(np.linalg.inv(a.T @ a)))),
-        left_over=frozen((modes.zeta - columns @ g) / refined.zeta_std),
+        left_over=frozen((modes.zeta - columns @ g) / np.sqrt(np.diag(covariance))),
         probability=float(chi2.sf(misfit, n - 2)) if n > 2 else 1.0,
     )

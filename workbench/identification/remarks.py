@@ -1,5 +1,7 @@
 """What a mode found in a record may be instead: a drift, a hum, an overtone."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from workbench.identification.refinement import Refined
@@ -12,7 +14,7 @@ OVERTONE_AT_MOST = 0.03
 WITHIN = 2e-3
 
 
-def remarks(refined: Refined, record: Record) -> tuple[str, ...]:
+def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, ...]:
     """One for each mode, empty where nothing speaks against it.
 
     Slower than the record is long: a drift. A damping ratio not three standard errors above zero: a hum, if it goes on
@@ -20,8 +22,9 @@ def remarks(refined: Refined, record: Record) -> tuple[str, ...]:
     perhaps only the distortion of that one (a mode may stand there too: those of a hinged beam do).
     """
     modes, found = refined.modes, []
-    size = np.abs(refined.amplitudes[0] / refined.noise_std[:, None]).max(axis=0)
-    span = record.n_samples * record.sample_time
+    size = np.abs(np.stack(refined.amplitudes) / refined.noise_std[:, None]).max(axis=(0, 1))
+    records = [records] if isinstance(records, Record) else records
+    span = max(record.n_samples * record.sample_time for record in records)
     for r in range(modes.n_modes):
         f, zeta, doubt = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]
         base, times = _base(modes.frequencies_hz, size, r)

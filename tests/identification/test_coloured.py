@@ -1,0 +1,71 @@
+"""Standard errors in noise that is not white, against the scatter of simulated draws."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from workbench.identification.coloured import in_its_noise, noise_near
+from workbench.identification.refinement import refine
+from workbench.identification.synthesis import free_decay
+from workbench.structure.modes import SampledModes
+
+MODES = SampledModes([8.0, 30.0, 31.0], [0.01, 0.02, 0.012], [[1.0, 0.5, 0.7], [0.3, -0.8, 0.4]], [0.0, 1.0])
+CLEAN = free_decay(MODES, sample_time=0.02, n_samples=1200)
+REFERENCE = np.abs(MODES.shapes).argmax(axis=0)
+DRAWS = 60
+
+
+def shares_inside(denominator):
+    """Share of nominal 95 % intervals that hold the truth, for white noise and as corrected: (2,) each of ω and ζ,
+    and of shapes."""
+    rng, inside = np.random.default_rng(0), [[], []]
+    each = np.arange(3)
+    others = np.arange(2) != REFERENCE[:, None]
+    shapes = (MODES.shapes / MODES.shapes[REFERENCE, each]).real
+    for _ in range(DRAWS):
+        noise = lfilter([1.0], denominator, rng.standard_normal((2, 1400)), axis=1)[:, 200:]
+        record = replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std())
+        white = refine(record, MODES, offset=True)
+        for found, kept in zip((white, in_its_noise(white, record)), inside, strict=True):
+            (low, high), (low_zeta, high_zeta) = found.interval()
+            own = (found.modes.shapes / found.modes.shapes[REFERENCE, each]).real
+            kept.append(
+                [
+                    np.mean(
+                        [(low < MODES.omega) & (MODES.omega < high), (low_zeta < MODES.zeta) & (MODES.zeta < high_zeta)]
+                    ),
+                    np.mean((np.abs(own - shapes) < 1.96 * found.shape_std).T[others]),
+                ]
+            )
+    return np.mean(inside, axis=1)
+
+
+@pytest.mark.parametrize(
+    "denominator", [[1.0, -0.95], [1.0, -2 * 0.97 * np.cos(0.62), 0.97**2]], ids=["falling", "a hump at two modes"]
+)
+def test_intervals_hold_in_coloured_noise(denominator):
+    white, corrected = shares_inside(denominator)
+    assert (np.abs(corrected - 0.95) < 0.07).all()
+    assert np.abs(white - 0.95).max() > 0.05
+
+
+def test_white_noise_keeps_the_bound():
+    kept = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        record = replace(CLEAN, outputs=CLEAN.outputs + 0.02 * rng.standard_normal((2, 1200)))
+        found = refine(record, MODES, offset=True)
+        kept.append(in_its_noise(found, [record]) is found)
+    assert all(kept)
+
+
+def test_the_spectrum_near_a_mode():
+    """A random walk's successor, y_k = 0.9 y_k-1 + e_k: S(ω) ∝ 1 / |1 - 0.9 e^{-iωΔt}|²."""
+    noise = lfilter([1.0], [1.0, -0.9], np.random.default_rng(3).standard_normal((60_000, 2)), axis=0)
+    omega = np.array([0.5, 3.0, 20.0, 100.0])
+    factors = noise_near(-0.1 + 1j * omega, noise / noise.std(axis=0), 0.02)
+    exact = (1 - 0.9**2) / np.abs(1 - 0.9 * np.exp(-0.02j * omega)) ** 2
+    # mean of 15 bins and two outputs, or of more
+    assert np.abs(factors.mean(axis=0) / exact - 1).max() < 0.4

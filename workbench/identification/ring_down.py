@@ -1,0 +1,272 @@
+"""Records as a user has them to the modes in them, in one call."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+
+from workbench.identification.ailments import ailments, check_fit
+from workbench.identification.amplitude import AmplitudeDependence, amplitude_dependence
+from workbench.identification.coloured import in_its_noise
+from workbench.identification.decay import decay_start
+from workbench.identification.drift import HIGHEST_DEGREE, without_drift
+from workbench.identification.ibrahim import check_alike, stacked_delays
+from workbench.identification.identified import Identified, unshaped
+from workbench.identification.order import identify
+from workbench.identification.projection import project
+from workbench.identification.proportional import ProportionalFit, proportional_fit
+from workbench.identification.refinement import Refined, refine
+from workbench.identification.remarks import SURE, remarks
+from workbench.identification.stabilisation import real_modes, stabilise
+from workbench.records.record import Record
+from workbench.structure.modes import SampledModes
+
+MOST_MODES = 20
+DRIFT_ROUNDS = 3
+# Energy of the second half over that of the first, either way; such a record must know its phase after a third of it.
+AS_STRONG, REMEMBERED = 0.5, 0.5
+# Correlation of noise, times the root of its samples, is 1.
+FORGETFUL = 3.0
+# Share of the energy about the modes, and of all, that they may leave; and how far it may then stand out of what they
+# leave beside, or of its own median. White noise does not.
+LEFT_OVER, MOST_LEFT, STANDS_OUT = 0.1, 0.25, 5.0
+# Bins about a mode, and beside.
+BAND, BESIDE = 6, 60
+
+
+@dataclass(frozen=True, eq=False)
+class RingDown:
+    """What records hold.
+
+    Attributes:
+        records: what was read: each from the start of its free decay on, without drift.
+        refined: their modes.
+        remarks: one a mode, empty where nothing speaks against it.
+        noise_modes: tried and taken for noise.
+        noise_evidence: (n_noise,) theirs, below `limit`.
+        limit: evidence from which on a mode counts.
+        by_amplitude: the modes stretch by stretch of the decay.
+        proportional: g1 and g2 of the modes without remark; None where they are fewer than two.
+        notes: what was done to the records, and what is left over.
+    """
+
+    records: tuple[Record, ...] = field(repr=False)
+    refined: Refined
+    remarks: tuple[str, ...]
+    noise_modes: SampledModes = field(repr=False)
+    noise_evidence: np.ndarray = field(repr=False)
+    limit: float
+    by_amplitude: AmplitudeDependence
+    proportional: ProportionalFit | None
+    notes: tuple[str, ...]
+
+    @property
+    def modes(self) -> SampledModes:
+        return self.refined.modes
+
+
+def ring_down(
+    records: Record | Sequence[Record], *, start: float | None = None, n_modes: int | None = None
+) -> RingDown:
+    """The modes of records that become free decay.
+
+    Each is cut where free decay begins and no sample is cut off any more, and a drift is taken out. Unless their number
+    is given, the modes are those that rise above the noise of all records together.
+
+    Args:
+        records: of the same sensors at one rate, of any length before the decay.
+        start: where the decay is free, s, in every record; found in each unless given.
+        n_modes: as many as are to be found.
+
+    Raises:
+        ValueError: records that differ in sensors or rate; a sensor ails; too few samples; nothing that decays freely.
+    """
+    records = [records] if isinstance(records, Record) else list(records)
+    check_alike(records)
+    cut, notes = [], []
+    for record in records:
+        begins, told = (start, []) if start is not None else _start(record)
+        cut.append(record.between(begins))
+        notes += told if len(records) == 1 else [f"{record.name}: {note}" for note in told]
+        check_fit(cut[-1])
+        _check_undriven(cut[-1])
+    try:
+        found, cut, more = _without_drift(cut, n_modes)
+    except np.linalg.LinAlgError:
+        found, more = _by_stabilisation(cut), ["the order could not be told by likelihood: by stabilisation instead"]
+    _check_decays(cut, found.refined)
+    left = [project(record, found.modes.poles, True).residual.T for record in cut]
+    doubts = remarks(found.refined, cut)
+    sure = [r for r, doubt in enumerate(doubts) if not doubt]
+    return RingDown(
+        tuple(cut),
+        found.refined,
+        doubts,
+        found.noise_modes,
+        found.noise_evidence,
+        found.limit,
+        amplitude_dependence(cut, found.refined),
+        proportional_fit(found.refined, sure) if len(sure) > 1 else None,
+        (*notes, *more, *_goes_on(found.refined, cut), *_unexplained(cut, left, found.refined), *_left_over(cut, left)),
+    )
+
+
+def _start(record: Record) -> tuple[float, list[str]]:
+    """Where free decay begins and nothing is clipped any more, and what to say of it."""
+    start, notes = decay_start(record), []
+    if start > record.start_time:
+        notes.append(f"free decay from {start:.6g} s on; --start sets another time")
+    clipped = [a for a in ailments(record.between(start)) if a.until is not None]
+    behind = max((a.until or start for a in clipped), default=start) + record.sample_time
+    if clipped and behind - start < 0.5 * (record.time[-1] - start):
+        notes.append(f"output {clipped[0].outputs[0]!r} is cut off at an end of its range: read from {behind:.6g} s on")
+        start = behind
+    return start, notes
+
+
+def _without_drift(records: list[Record], n_modes: int | None) -> tuple[Identified, list[Record], list[str]]:
+    """Modes and drifts in turn, as each hides in the other, until neither changes."""
+    cleared, size, poles = records, np.zeros((len(records), records[0].n_outputs)), np.zeros(0, complex)
+    span = max(record.n_samples * record.sample_time for record in records)
+    for _ in range(DRIFT_ROUNDS):
+        found = _identified(cleared, n_modes)
+        before, poles = poles, found.modes.poles
+        poles = poles[np.abs(poles) * span > 2.0 * np.pi]
+        drifts = [without_drift(record, poles) for record in records]
+        drifting = any(drift.size.any() for drift in drifts)
+        if not drifting or (poles.size == before.size and size.any()):
+            break
+        cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
+    in_noise = size / found.refined.noise_std
+    if not (in_noise >= 1.0).any():
+        return found, cleared if size.any() else records, []
+    i, j = np.unravel_index(int(np.argmax(in_noise)), size.shape)
+    name = records[0].output_names[j]
+    return found, cleared, [f"a drift of {size[i, j]:.3g} was taken out of output {name!r}"]
+
+
+def _identified(records: list[Record], n_modes: int | None) -> Identified:
+    if n_modes is None:
+        return identify(records)
+    if n_modes < 1:
+        raise ValueError(f"at least one mode must be asked for; got {n_modes}")
+    return _as_identified(stacked_delays(records, n_modes=n_modes), records)
+
+
+def _by_stabilisation(records: list[Record]) -> Identified:
+    highest = max(2, min(MOST_MODES, min(record.n_samples for record in records) // 8))
+    start = real_modes(stabilise(records, orders=range(2, highest + 1))).modes
+    if start.n_modes == 0:
+        name = records[0].name
+        raise ValueError(f"record {name!r} holds no mode that stays from order to order: is it a free decay?")
+    return _as_identified(start, records)
+
+
+def _as_identified(start: SampledModes, records: list[Record]) -> Identified:
+    """Modes that were asked for: no evidence, none refused."""
+    refined, none = in_its_noise(refine(records, start, offset=True), records), np.zeros(0)
+    return Identified(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
+
+
+def _check_undriven(record: Record) -> None:
+    """Refuse a record that is as strong at its end as at its beginning and has forgotten its phase meanwhile.
+
+    A free decay that hardly decays repeats itself after any time; what random forces drive forgets. Of
+    records of twenty decay times three in four are told, of a hundred nine in ten.
+    """
+    # Drifts may be strong at both ends, and swing not at all.
+    n = record.n_samples
+    slow = np.linalg.qr(legvander(np.linspace(-1.0, 1.0, n), HIGHEST_DEGREE))[0]
+    about = record.outputs - (record.outputs @ slow) @ slow.T
+    about = about / np.maximum(about.std(axis=1, keepdims=True), 1e-300)
+    energy = [float((part**2).sum()) for part in np.array_split(about, 2, axis=1)]
+    power = (np.abs(np.fft.rfft(about, 2 * n, axis=1)) ** 2).sum(axis=0)
+    correlation = np.fft.irfft(power)[1:n] / (n - np.arange(1, n)) / len(about)
+    soon, late = (
+        float(np.sqrt((part**2).mean())) for part in (correlation[: n // 20 + 1], correlation[n // 3 : n // 2])
+    )
+    # Noise forgets at once, and holds no mode; that is said elsewhere.
+    swings = soon > FORGETFUL / np.sqrt(n)
+    if swings and AS_STRONG < energy[1] / max(energy[0], 1e-300) < 1.0 / AS_STRONG and late < REMEMBERED * soon:
+        raise ValueError(
+            f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and has"
+            f" forgotten its phase. {WAY_OUT}"
+        )
+
+
+WAY_OUT = (
+    "Cut it to where nothing drives it; or, driven all along, give its inputs (--inputs, identify_driven) or say that"
+    " they are unknown (--ambient, identify_ambient)"
+)
+
+
+def _check_decays(records: list[Record], refined: Refined) -> None:
+    """Refuse records whose strongest mode grows."""
+    strongest = int(np.argmax(_energy(refined, records)))
+    zeta = refined.modes.zeta[strongest]
+    if zeta < -SURE * refined.zeta_std[strongest]:
+        raise ValueError(
+            f"record {records[0].name!r} grows: its strongest mode, {refined.modes.frequencies_hz[strongest]:.4g} Hz,"
+            f" has a damping ratio of {zeta:.2g}. It is driven, or unstable; cut it to where it decays"
+        )
+
+
+def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined) -> tuple[str, ...]:
+    """What to say where modes leave much about their own frequencies: what forces drive swings there on and on.
+
+    White noise of sensors leaves there no more than beside, and no more in all than its median.
+    """
+    for record, residual in zip(records, left, strict=True):
+        scaled = ((part / refined.noise_std[:, None]) for part in (residual, record.outputs))
+        power, motion = ((np.abs(np.fft.rfft(part, axis=1)[:, 1:]) ** 2).sum(axis=0) for part in scaled)
+        bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
+        away = np.abs(np.arange(1, power.size + 1)[:, None] - refined.modes.poles.imag / bin_width)
+        narrow = np.maximum(BAND, np.abs(refined.modes.poles.real) / bin_width)
+        inside = (away < narrow).any(axis=1)
+        beside = ((away > 2.0 * narrow) & (away < BESIDE + narrow)).any(axis=1) & ~inside
+        share, whole = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
+        level = np.median(power[beside]) if beside.any() else 0.0
+        about = share > LEFT_OVER and power[inside].mean() > STANDS_OUT * level
+        if about or (whole > MOST_LEFT and power.mean() > STANDS_OUT * np.median(power)):
+            return (
+                f"in record {record.name!r} the modes leave {100 * np.sqrt(share):.0f} % of the motion about their own"
+                f" frequencies, {100 * np.sqrt(whole):.0f} % of all: it is driven, or depends strongly on amplitude."
+                f" {WAY_OUT}",
+            )
+    return ()
+
+
+def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
+    """Of each mode in all records, (n_modes,), each output in units of its noise."""
+    found = np.zeros(refined.modes.n_modes)
+    for record, amplitudes in zip(records, refined.amplitudes, strict=True):
+        decay = np.exp(2.0 * record.sample_time * np.outer(refined.modes.poles.real, np.arange(record.n_samples)))
+        found += (np.abs(amplitudes / refined.noise_std[:, None]) ** 2).sum(axis=0) * decay.sum(axis=1)
+    return found
+
+
+def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
+    """What to say where most of the motion does not decay."""
+    span = max(record.n_samples * record.sample_time for record in records)
+    lasting = refined.modes.zeta * refined.modes.omega * span < 0.1
+    energy = _energy(refined, records)
+    share = float(energy[lasting].sum() / energy.sum())
+    if share < 0.5:
+        return ()
+    return (
+        f"{100 * share:.0f} % of the motion does not decay within the record: tones that drive it? Then leave these"
+        " modes out, or cut it to where they end",
+    )
+
+
+def _left_over(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:
+    """What to say of what the modes leave, where it is not noise."""
+    about = sum(float(((r.outputs - r.outputs.mean(axis=1, keepdims=True)) ** 2).sum()) for r in records)
+    squares = sum(float((residual**2).sum()) for residual in left)
+    following = sum(float((residual[:, 1:] * residual[:, :-1]).sum()) for residual in left)
+    size = sum(residual.size for residual in left)
+    if squares < 1e-12 * about or abs(following) < SURE * squares / np.sqrt(size):
+        return ()
+    share = 100 * np.sqrt(squares / about)
+    return (f"what the modes leave, {share:.2g} % of the motion, is not white: errors by its spectrum about each mode",)

@@ -1,0 +1,195 @@
+"""Modes found in records, told in lines, a table and JSON: what `workbench identify` says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.identification.ailments import check_fit
+from workbench.identification.ambient import AmbientModes, identify_ambient
+from workbench.identification.driven import Driven, identify_driven
+from workbench.identification.proportional import ProportionalFit
+from workbench.identification.ring_down import RingDown, ring_down
+from workbench.records.record import Record
+from workbench.structure.modes import SampledModes
+
+TURN = 2.0 * math.pi
+HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
+UNLIKELY, MOST_MODES = 0.01, 40
+
+
+@dataclass(frozen=True)
+class ModesTold:
+    """What is to be said.
+
+    Attributes:
+        heading: of what records.
+        rows: one a mode, under `HEADINGS`; figures to the second digit of their standard errors.
+        lines: all else.
+        content: for JSON.
+    """
+
+    heading: str
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[str, ...]
+    content: dict
+
+
+def told_of(
+    records: Sequence[Record], *, start: float | None = None, n_modes: int | None = None, ambient: bool = False
+) -> ModesTold:
+    """The modes of records: driven where inputs move, by unknown forces with `ambient`, else free decays.
+
+    Args:
+        records: of the same sensors at one rate.
+        start: read from then on, s.
+        n_modes: as many as are to be found; in driven records, at most.
+        ambient: whether unknown broadband forces drive the record all along.
+
+    Raises:
+        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`; ambient records that are two or have inputs.
+    """
+    if not ambient and not any(record.inputs.any() for record in records):
+        return of_ring_down(ring_down(records, start=start, n_modes=n_modes))
+    if start is not None:
+        records = [record.between(start) for record in records]
+    for record in records:
+        check_fit(record)
+    if not ambient:
+        most = MOST_MODES if n_modes is None else n_modes
+        return of_driven(identify_driven(records, most_modes=most), records)
+    if len(records) > 1 or records[0].n_inputs:
+        raise ValueError(
+            f"ambient forces are unknown and act all along one record; got {len(records)} records with"
+            f" {records[0].n_inputs} inputs: give one record, no inputs"
+        )
+    return of_ambient(identify_ambient(records[0], n_modes=n_modes), records[0])
+
+
+def of_ring_down(told: RingDown) -> ModesTold:
+    """Free decays."""
+    found = told.refined
+    lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(told.remarks) if remark]
+    lines += [*told.notes, *_proportional(told.proportional)]
+    said, by_amplitude = _by_amplitude(told)
+    lines += said
+    if told.noise_modes.n_modes:
+        refused = ", ".join(f"{f:.4g}" for f in told.noise_modes.frequencies_hz)
+        lines.append(f"tried and refused, as noise or parts of a mode found: {refused} Hz")
+    if not found.converged:
+        lines.append("the refinement did not settle: ask for other --modes, or a later --start")
+    damping = told.proportional
+    content = {
+        **_content(told.records, found),
+        "start": [record.start_time for record in told.records],
+        "remarks": told.remarks,
+        "depends_on_amplitude": by_amplitude,
+        "proportional_damping": None if damping is None else {
+            "g1": damping.damping.g1,
+            "g2": damping.damping.g2,
+            "standard_errors": damping.standard_errors,
+            "left_over": damping.left_over,
+            "probability": damping.probability,
+        },
+        "noise_modes_hz": told.noise_modes.frequencies_hz,
+        "noise_std": found.noise_std,
+        "notes": told.notes,
+        "converged": found.converged,
+    }  # fmt: skip
+    return _told(told.records, found, lines, content)
+
+
+def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
+    """Records with their inputs."""
+    lines = [] if found.converged else ["the search did not settle: ask for other --modes"]
+    a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
+    content = {
+        **_content(records, found),
+        "inputs": found.state_space.input_labels,
+        "state_space": {"A": a, "B": b, "C": c, "D": d},
+        "noise_std": found.noise_std,
+        "converged": found.converged,
+    }
+    return _told(records, found, lines, content)
+
+
+def of_ambient(found: AmbientModes, record: Record) -> ModesTold:
+    """A record under unknown broadband forces."""
+    lines = [f"standard errors from {found.n_blocks} blocks of the record, each left out in turn"]
+    return _told([record], found, lines, _content([record], found))
+
+
+def _told(records: Sequence[Record], found, lines: Sequence[str], content: dict) -> ModesTold:
+    first = records[0]
+    samples = sum(record.n_samples for record in records)
+    of = f" in {len(records)} records" if len(records) > 1 else ""
+    sensors = f"{first.n_outputs} sensor{'s' * (first.n_outputs > 1)}"
+    since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
+    heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
+    return ModesTold(heading, tuple(_rows(found.modes, found.omega_std, found.zeta_std)), tuple(lines), content)
+
+
+def _rows(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray):
+    straight = modes.phase_collinearity
+    for r in range(modes.n_modes):
+        frequency = _to_its_error(modes.frequencies_hz[r], omega_std[r] / TURN)
+        damping = _to_its_error(100 * modes.zeta[r], 100 * zeta_std[r])
+        yield str(r + 1), *frequency, *damping, f"{straight[r]:.4f}"
+
+
+def _content(records: Sequence[Record], found) -> dict:
+    modes = found.modes
+    return {
+        "sensors": records[0].output_names,
+        "positions": [channel.at for channel in records[0].output_channels],
+        "frequencies_hz": modes.frequencies_hz,
+        "frequencies_std_hz": found.omega_std / TURN,
+        "damping_ratios": modes.zeta,
+        "damping_std": found.zeta_std,
+        "shapes_real": modes.shapes.real,
+        "shapes_imag": modes.shapes.imag,
+        "phase_collinearity": modes.phase_collinearity,
+    }
+
+
+def _proportional(fit: ProportionalFit | None) -> list[str]:
+    if fit is None or fit.left_over.size < 3:
+        return []
+    if fit.probability < UNLIKELY:
+        worst = int(np.abs(fit.left_over).argmax())
+        return [
+            f"damping is not proportional: g1 and g2 miss it by up to {abs(fit.left_over[worst]):.2g} standard errors"
+        ]
+    (g1, g1_std), (g2, g2_std) = (
+        _to_its_error(value, error)
+        for value, error in zip((fit.damping.g1, fit.damping.g2), fit.standard_errors, strict=True)
+    )
+    return [f"damping may be proportional: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
+
+
+def _by_amplitude(told: RingDown) -> tuple[list[str], dict]:
+    """The modes that depend on amplitude, stretch by stretch."""
+    stretches, lines, content = told.by_amplitude, [], {}
+    for r in np.flatnonzero(stretches.depends):
+        seen = np.flatnonzero(np.isfinite(stretches.omega[:, r]))
+        at = [(stretches.amplitude[w, r], stretches.omega[w, r] / TURN, stretches.zeta[w, r]) for w in seen]
+        shown = "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for size, f, zeta in at)
+        lines.append(f"mode {r + 1} depends on amplitude: {shown}")
+        content[str(r + 1)] = {
+            "record": stretches.record[seen],
+            "amplitude": stretches.amplitude[seen, r],
+            "frequencies_hz": stretches.omega[seen, r] / TURN,
+            "frequencies_std_hz": stretches.omega_std[seen, r] / TURN,
+            "damping_ratios": stretches.zeta[seen, r],
+            "damping_std": stretches.zeta_std[seen, r],
+        }
+    return lines, content
+
+
+def _to_its_error(value: float, error: float) -> tuple[str, str]:
+    """A figure and its standard error, both to the second digit of the error."""
+    if not (math.isfinite(error) and error > 1e-9 * abs(value)):
+        return f"{value:.10g}", f"{error:.1g}"
+    digits = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"
