@@ -36,6 +36,11 @@ def test_many_cases_run_are_kept_and_stand_in_a_table(tmp_path, monkeypatch):
     assert len((tmp_path / "spilled.csv").read_text().splitlines()) == 1 + len(printed.splitlines())
 
 
+def test_an_effect_of_ones_own_is_named(tmp_path, monkeypatch):
+    code, printed = run_example(2, tmp_path, monkeypatch)
+    assert printed.strip() == re.search(r"print\(verdict.*?\)  # (.*)", code).group(1)
+
+
 def test_every_public_name_is_there():
     for name in workbench.__all__:
         assert getattr(workbench, name) is not None
