@@ -22,8 +22,9 @@ test-slow: $(BIN)/workbench  ## the longer trials
 figures: $(BIN)/workbench  ## every study that makes its own data, with its figures and results
 	$(BIN)/workbench study --all
 
-bench: $(BIN)/workbench  ## speeds, as ratios
+bench: $(BIN)/workbench  ## speeds, as ratios, in ten minutes; the bench to play on is `workbench bench`
 	$(BIN)/workbench study design_scaling
+	$(BIN)/workbench study many_cases
 
 docs: $(BIN)/workbench  ## README.md and a page a room, workbench/*/README.md: every example, number and name in them checked
 	$(BIN)/python -m pytest -q tests/test_readme.py

@@ -160,6 +160,7 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
     ("arguments", "words"),
     [
         (("identify", "nowhere.csv"), "no such file"),
+        (("identify", "\x1b[31mred\n.csv"), "\\x1b[31mred .csv: there is no such file"),
         (("identify", "{rig}"), "names no format"),
         (("design", "nowhere.toml"), "no such file"),
         (("design", "{rig}", "--damping", 1), "damping ratio wanted must lie between 0 and 1"),

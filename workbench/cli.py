@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
@@ -55,7 +56,9 @@ def _guarded(command: Callable) -> Callable:
     @wraps(command)
     def guarded(*args, **kwargs):
         try:
-            return command(*args, **kwargs)
+            with warnings.catch_warnings():
+                warnings.showwarning = _warned
+                return command(*args, **kwargs)
         except typer.Exit:
             raise
         except (ValueError, OSError, MemoryError) as error:
@@ -72,7 +75,18 @@ def _guarded(command: Callable) -> Callable:
 
 
 def _tell(fault: str) -> None:
-    errors.print(f"workbench: {' '.join(fault.split())}", style="red", markup=False)
+    errors.print(f"workbench: {_legible(fault)}", style="red", markup=False)
+
+
+def _legible(text: str) -> str:
+    """In one line, and without the signs by which a name of a file could steer the terminal."""
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in " ".join(text.split()))
+
+
+def _warned(message, category, *where) -> None:
+    """A warning in one line; those of arithmetic are for developers, its results are checked where they are used."""
+    if not issubclass(category, RuntimeWarning):
+        errors.print(f"workbench: {_legible(str(message))}", style="yellow", markup=False)
 
 
 def _progress() -> Progress:

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from workbench.study.cases import StudyError
+from workbench.study.page import write_page
 from workbench.study.report import story_about, story_in
 
 VERDICT = {
@@ -60,6 +61,12 @@ def test_a_design_shows_what_it_spills(tmp_path):
     assert [box[3] for box in bars["boxes"]] == [0.25, 0.5]
 
 
+def test_whole_numbers_of_a_design_make_a_page(tmp_path):
+    law = {"law": "a", "cost": 1, "effort": 1, "peak_force": 1, "work": [1, 2], "poles_real": [-1], "poles_imag": [1]}
+    page = write_page(tmp_path / "p.html", story_in(written(tmp_path, {"laws": [law]})))
+    assert "W_R" in page.read_text(encoding="utf-8")
+
+
 def test_results_of_a_study_and_any_rows_become_tables(tmp_path):
     story = story_in(written(tmp_path, STUDIED))
     assert story.tables[0] == ("front", ("x", "y", "z"), [["1", "<b>", ""], ["2", "", "1, 2"]])
@@ -74,6 +81,7 @@ def test_results_of_a_study_and_any_rows_become_tables(tmp_path):
         ("{", "cannot be read as JSON"),
         ("[" * 100_000, "cannot be read as JSON"),
         ('{"a": NaN}', "NaN is no number of JSON"),
+        ('{"a": 1e400}', "1e400 is no number of JSON"),
         ("3", "holds a int"),
         ("{}", "no rows of named figures"),
         ('{"format": "page 9"}', "has the format 'page 9'"),

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.linalg import expm
@@ -33,10 +34,10 @@ class ClosedLoop:
     matrix: np.ndarray
     feedback: np.ndarray
 
-    @property
+    @cached_property
     def poles(self) -> np.ndarray:
         """Closed-loop poles (n_states,), rad/s."""
-        return np.linalg.eigvals(self.matrix)
+        return frozen(np.linalg.eigvals(self.matrix), complex)
 
     @property
     def stable(self) -> bool:

@@ -102,7 +102,7 @@ def compare(
                 effort=effort(modes, law, state),
                 peak_force=float(np.abs(respond(loop, state, time).forces).max()),
                 work=finite_spillover(loop, state, final_time),
-                poles=np.linalg.eigvals(loop.matrix),
+                poles=loop.poles,
             )
         )
     return tuple(rows)

@@ -19,6 +19,8 @@ from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
 SECANT_STEPS = 40
+TWIN = 1e-12
+SUSPECTS = 12  # residual modes, the most moved, whose absence is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,14 +49,12 @@ class Moved:
         pole: open loop, upper half plane, rad/s.
         closed_pole: of the full closed loop.
         paths: the most destabilising first; their shifts add up to the movement.
-        margin_without: stability margin of the loop of all the other modes, 1/s.
     """
 
     mode: int
     pole: complex
     closed_pole: complex
     paths: tuple[Path, ...]
-    margin_without: float
 
     @property
     def shift(self) -> complex:
@@ -75,11 +75,15 @@ class Explanation:
         loop: of all modes.
         moved: every residual mode, the least stable first.
         reduced_margin: of the loop of the controlled modes alone, 1/s.
+        culprit: the residual mode that unsettles the loop: one that grows, else the one without which the loop is
+            stable (a residual mode can stay stable itself and make a controlled one grow). None where the loop is
+            stable, and where no single mode is to blame, as when the reduced model fails already.
     """
 
     loop: ClosedLoop
     moved: tuple[Moved, ...]
     reduced_margin: float
+    culprit: Moved | None
 
     @property
     def poles(self) -> np.ndarray:
@@ -90,20 +94,6 @@ class Explanation:
     def margin(self) -> float:
         """Distance of the rightmost pole from the axis, 1/s; negative where the loop is unstable."""
         return stability_margin(self.loop)
-
-    @property
-    def culprit(self) -> Moved | None:
-        """The residual mode that unsettles the loop: one that grows, else the one without which the loop is stable.
-
-        A residual mode can stay stable itself and make a controlled one grow. None where the loop is stable, and where
-        no single mode is to blame, as when it fails on the reduced model already.
-        """
-        if self.loop.stable or not self.moved:
-            return None
-        if self.moved[0].closed_pole.real > 0:
-            return self.moved[0]
-        behind = max(self.moved, key=lambda m: m.margin_without)
-        return behind if behind.margin_without > 0 else None
 
 
 def stability_margin(loop: ClosedLoop) -> float:
@@ -124,40 +114,74 @@ def explain(modes: Modes, controller: Controller) -> Explanation:
     upper = poles[poles.imag > 0]
     moved = []
     if residual:
-        at = [_OneMode(modes, controller, r) for r in residual]
+        rest = _Rest(modes, controller)
+        at = [_OneMode(rest, r) for r in residual]
         far = np.abs(np.array([mode.closed_pole() for mode in at])[:, None] - upper[None, :])
         for i, k in zip(*linear_sum_assignment(far), strict=True):
             closed = complex(upper[k])
-            moved.append(Moved(residual[i], at[i].pole, closed, at[i].paths(closed), at[i].margin_without))
+            moved.append(Moved(residual[i], at[i].pole, closed, at[i].paths(closed)))
     moved.sort(key=lambda m: -m.closed_pole.real)
     alone = close_with(modes.select(controller.law.controlled), controller)
-    return Explanation(loop, tuple(moved), stability_margin(alone))
+    return Explanation(loop, tuple(moved), stability_margin(alone), _behind(modes, controller, loop, moved))
+
+
+def _behind(modes: Modes, controller: Controller, loop: ClosedLoop, moved: list[Moved]) -> Moved | None:
+    """The residual mode that unsettles a loop: one that grows, else one without which the loop is stable."""
+    if loop.stable or not moved:
+        return None
+    if moved[0].closed_pole.real > 0:
+        return moved[0]
+
+    def margin_without(one: Moved) -> float:
+        return stability_margin(
+            close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller)
+        )
+
+    suspects = sorted(moved, key=lambda m: -abs(m.shift))[:SUSPECTS]
+    margins = [margin_without(one) for one in suspects]
+    best = int(np.argmax(margins))
+    return suspects[best] if margins[best] > 0 else None
+
+
+class _Rest:
+    """A loop from which one mode at a time is taken out: T = (I - C G)⁻¹ C, C the controller and G all other modes."""
+
+    def __init__(self, modes: Modes, controller: Controller) -> None:
+        self.modes, self.controller, self._apart = modes, controller, modes.proportional
+        self.pushed = input_matrix(modes, controller.law.actuators)
+        self.seen = reading(modes, controller.sensors)
+
+    def forces(self, r: int, s: complex) -> np.ndarray:
+        """T(s) (n_actuators, n_channels) without mode r."""
+        n, c = self.modes.n_modes, self.controller
+        others = np.arange(n) != r
+        seen = self.seen[:, :n][:, others] + s * self.seen[:, n:][:, others]
+        pushed = self.pushed[others]
+        if self._apart:
+            stiff = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
+            # an undamped twin of the mode answers without bound at their pole: a hair beside it
+            plant = (seen / np.where(stiff == 0, TWIN * abs(s) ** 2, stiff)) @ pushed
+        else:
+            stiff = np.diag(s**2 + self.modes.omega[others] ** 2) + s * self.modes.damping[np.ix_(others, others)]
+            plant = seen @ np.linalg.solve(stiff, pushed)
+        own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
+        return np.linalg.solve(np.eye(len(own)) - own @ plant, own)
 
 
 class _OneMode:
-    """One residual mode, and the forces T(s) (n_actuators, n_channels) with which all the rest answers readings."""
+    """One residual mode in the loop of all the rest."""
 
-    def __init__(self, modes: Modes, controller: Controller, r: int) -> None:
-        rest = [i for i in range(modes.n_modes) if i != r]
-        own = modes.select(rest)
-        self._controller, self._loop = controller, close_with(own, controller)
-        b = input_matrix(own, controller.law.actuators) @ controller.direct
-        self._enters = np.vstack([np.zeros_like(b), b, controller.reads])
-        self._pushed = input_matrix(modes, controller.law.actuators)[r]
-        self._seen = reading(modes.select([r]), controller.sensors)
+    def __init__(self, rest: _Rest, r: int) -> None:
+        modes = rest.modes
+        self._rest, self._r = rest, r
+        self._pushed, self._seen = rest.pushed[r], rest.seen[:, [r, modes.n_modes + r]]
         c, omega = modes.damping[r, r], modes.omega[r]
         self.pole = complex(-0.5 * c + 1j * np.sqrt(max(omega**2 - 0.25 * c**2, 0.0)))
 
     def _terms(self, s: complex) -> np.ndarray:
         """Shares (n_actuators, n_channels) of the movement that s would be."""
-        matrix = self._loop.matrix
-        answer = self._loop.feedback @ np.linalg.solve(s * np.eye(matrix.shape[0]) - matrix, self._enters)
-        answer = answer + self._controller.direct
+        answer = self._rest.forces(self._r, s)
         return self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
-
-    @property
-    def margin_without(self) -> float:
-        return stability_margin(self._loop)
 
     def closed_pole(self) -> complex:
         """Where the mode goes: s = λ + Δ(s) by the secant method, else to first order."""
@@ -173,10 +197,10 @@ class _OneMode:
 
     def paths(self, closed: complex) -> tuple[Path, ...]:
         exact, first = self._terms(closed), self._terms(self.pole)
-        at = np.array([sensor.at for sensor in self._controller.sensors])
+        at = np.array([sensor.at for sensor in self._rest.controller.sensors])
         found = [
             Path(actuator.name, place, complex(exact[j, at == place].sum()), complex(first[j, at == place].sum()))
-            for j, actuator in enumerate(self._controller.law.actuators)
-            for place in self._controller.places
+            for j, actuator in enumerate(self._rest.controller.law.actuators)
+            for place in self._rest.controller.places
         ]
         return tuple(sorted(found, key=lambda path: -path.shift.real))

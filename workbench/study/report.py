@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -75,7 +76,7 @@ def story_in(path: Path) -> Story:
     if path.stat().st_size > MOST_BYTES:
         raise StudyError(f"{path} holds {path.stat().st_size} bytes; a report reads at most {MOST_BYTES}")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse)
+        content = json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise StudyError(f"{path} cannot be read as JSON: {error}") from error
     if isinstance(content, list):
@@ -96,8 +97,13 @@ def story_in(path: Path) -> Story:
     return Story(made_by=f"workbench report {path.name}", **story)
 
 
-def _refuse(word: str):
+def _refuse(word: str) -> NoReturn:
     raise ValueError(f"{word} is no number of JSON")
+
+
+def _finite(digits: str) -> float:
+    value = float(digits)
+    return value if np.isfinite(value) else _refuse(digits)
 
 
 def _tables(content: Mapping) -> list[tuple]:
@@ -163,9 +169,9 @@ def _designed(content: dict) -> dict:
     """A comparison of control laws."""
     laws = content["laws"]
     controlled = set(content.get("controlled", ()))
-    works = {law["law"]: np.array([w for r, w in enumerate(law["work"]) if r not in controlled]) for law in laws}
+    works = {law["law"]: np.array([w for r, w in enumerate(law["work"]) if r not in controlled], float) for law in laws}
     poles = {law["law"]: np.array(law["poles_real"], float) + 1j * np.array(law["poles_imag"], float) for law in laws}
-    rows = [[law["law"], law["cost"], law["effort"], law["peak_force"], works[law["law"]].sum()] for law in laws]
+    rows = [[law["law"], law["cost"], law["effort"], law["peak_force"], float(works[law["law"]].sum())] for law in laws]
     return {
         "blocks": [
             block(plot_two_works(works, first=len(controlled)), "Work that each law puts into each mode."),
