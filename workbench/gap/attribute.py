@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from workbench.gap.decide import decide, decide_on_pairs, decide_on_random, figures, pairs_of, unexplained, with_nominal
+from workbench.gap.beside_nominal import decide_beside_nominal, decide_with_figures_freed
+from workbench.gap.decide import decide, decide_on_pairs, decide_on_random, pairs_of
 from workbench.gap.disturbance import RandomForceFit
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
-from workbench.gap.finish import finished, ranked
-from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.fit import Fit, cost_of
 from workbench.gap.prediction import FitData
 from workbench.gap.search import Search, one_more
 from workbench.records.record import Record
@@ -70,7 +70,7 @@ def attribute(
         workers: threads.
         settle: seconds at the start of each record that are simulated but not counted.
         free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
-            a little off; otherwise they are freed only where no set explains the records without.
+            a little off; otherwise they are freed where no effect alone explains the records without.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     if not (noise > 0).all():
@@ -109,18 +109,16 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     search = Search(base, data, quick, first, catalogue, report, pool, nominal)
     report("looking for the missing force", 0.02)
     evidence = Evidence.of(base, data)
-    if free_nominal:
-        start = fit(search.rig, (figures(search),), search.data, iterations=15)
-        evidence = Evidence.of(apply_all(search.rig, start.effects), data)
-    singles = one_more(search, start.effects if free_nominal else (), evidence, 0.05, 0.45, finalists=8)
-    found = decide(search, start, singles) or decide_on_random(search, start, singles[0])
-    if found is None and free_nominal:
-        best, rivals = ranked(search, search.side_by_side(finished, singles[:3]))
-        found = unexplained(start, best, rivals)
-    if found is None:
-        found = decide_on_pairs(search, start, singles, pairs_of(search, singles))
-        if found.outcome != "explained":
-            found = with_nominal(search, start) or found
+    if free_nominal and not search.explains(start):
+        found, singles = decide_with_figures_freed(search, start)
+    else:
+        singles = one_more(search, (), evidence, 0.05, 0.45, finalists=8)
+        found = (
+            decide(search, start, singles)
+            or decide_on_random(search, start, singles[0])
+            or decide_beside_nominal(search, start, singles)
+            or decide_on_pairs(search, start, singles, pairs_of(search, singles))
+        )
     outcome, best, random, rivals = found
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))

@@ -9,7 +9,6 @@ import numpy as np
 from workbench.gap.disturbance import RandomForceFit, fit_random_force, model_filter
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
-from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, ranked, relocated, simplest
 from workbench.gap.fit import Fit, fit
@@ -138,28 +137,6 @@ def _exchanged(search: Search, pairs: list[Fit]) -> list[Fit]:
         kept = best.effects[:i] + best.effects[i + 1 :]
         pairs = pairs + _joined(search, kept, 0.9, 0.94, finalists=4)
     return sorted(pairs, key=lambda f: f.cost)
-
-
-def with_nominal(search: Search, start: Fit) -> Decision | None:
-    """What holds with the nominal figures freed, alone or with one effect; None if that explains nothing either.
-
-    The nominal figures are trusted first, because freed they can bend to much; they are freed where no set explains
-    the records without.
-    """
-    freed = fit(search.rig, (figures(search),), search.data, iterations=8)
-    if search.explains(freed):
-        return Decision("explained", freed)
-    if freed.cost > 0.7 * start.cost:
-        return None
-    evidence = Evidence.of(apply_all(search.rig, freed.effects), search.data, 20)
-    joined = one_more(search, freed.effects, evidence, 0.95, 0.99, finalists=2)
-    ended = fit(search.rig, joined[0].effects, search.data.stepped(8), iterations=6)
-    return Decision("explained", ended) if search.explains(ended) else None
-
-
-def figures(search: Search) -> Effect:
-    """The nominal figures as they were handed in."""
-    return Effect(NOMINAL_FIGURES, None, {p.name: 1.0 for p in NOMINAL_FIGURES.parameters(search.rig, None)})
 
 
 def unexplained(start: Fit, best: Fit, rivals) -> Decision:

@@ -10,6 +10,7 @@ from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.search import Search
 
+IDLE = 0.5  # of the noise power: what an effect may take away and still be none
 FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
@@ -68,6 +69,10 @@ def simplest(search: Search, candidate: Fit) -> Fit:
 
 
 def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]]:
+    for effect in candidate.effects if len(candidate.effects) > 1 else ():
+        rest = tuple(other for other in candidate.effects if other is not effect)
+        if cost_of(search.rig, rest, search.data) < 1.0 + IDLE:
+            yield rest
     yield from fewer(candidate.effects)
     for i, effect in enumerate(candidate.effects):
         for simpler in simpler_forms(effect, search.rig):

@@ -60,8 +60,8 @@ def _finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.n
 class _Problem:
     """The residual as a function of the free coordinates of all parameters of all effects."""
 
-    def __init__(self, rig: Rig, effects: Sequence[Effect], data: FitData):
-        self.rig, self.data, self.effects = rig, data, tuple(effects)
+    def __init__(self, rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()):
+        self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
         self.parameters: list[tuple[int, Parameter]] = []
         base = rig
         for i, effect in enumerate(self.effects):
@@ -84,7 +84,7 @@ class _Problem:
         return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
 
     def residual(self, free: np.ndarray) -> np.ndarray | None:
-        residual = _finite_residual(self.rig, self.at(free), self.data)
+        residual = _finite_residual(self.rig, (*self.at(free), *self.held), self.data)
         if residual is None or not self.believed:
             return residual
         return np.r_[residual, (free[self.believed] - self.centre) / self.prior_std]
@@ -105,17 +105,39 @@ class _Problem:
         return np.array(columns).T
 
 
-def fit(rig: Rig, effects: Sequence[Effect], data: FitData, *, iterations: int = 25, tolerance: float = 1e-5) -> Fit:
+def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> tuple[np.ndarray, np.ndarray]:
+    """How the residual moves with each parameter of believed effects, (n_values, n_parameters), in units of its belief.
+
+    The second is the residual that their values leave.
+    """
+    problem = _Problem(rig, effects, data)
+    residual = problem.residual(problem.start)
+    if residual is None:
+        raise ValueError("the rig cannot be simulated with these effects")
+    jacobian = problem.jacobian(problem.start, residual)[: data.n_values]
+    return jacobian * problem.prior_std, residual[: data.n_values]
+
+
+def fit(
+    rig: Rig,
+    effects: Sequence[Effect],
+    data: FitData,
+    *,
+    held: Sequence[Effect] = (),
+    iterations: int = 25,
+    tolerance: float = 1e-5,
+) -> Fit:
     """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
 
     Args:
         rig: nominal.
         effects: with start values.
         data: fit records.
+        held: effects that are there too, and stay as they are.
         iterations: at most.
         tolerance: relative decrease of the cost at which to stop.
     """
-    problem = _Problem(rig, effects, data)
+    problem = _Problem(rig, effects, data, held)
     free = problem.start.copy()
     residual = problem.residual(free)
     if residual is None:

@@ -27,6 +27,8 @@ class FitData:
             rest that the simulation assumes to the motion it really had.
         whitener: filter of a random force on the structure, through which every residual is seen; None where there is
             none.
+        given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
+            believed figures that are fitted along with every candidate to first order; None where none are.
     """
 
     records: tuple[Record, ...]
@@ -34,6 +36,7 @@ class FitData:
     substeps: int = 4
     lead: int = 0
     whitener: ForceFilter | None = None
+    given_way: tuple[np.ndarray, np.ndarray] | None = None
     _memory: OrderedDict = field(default_factory=OrderedDict, repr=False, init=False)
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 
@@ -53,6 +56,17 @@ class FitData:
     def through(self, whitener: ForceFilter) -> "FitData":
         """The same yardstick beside a random force."""
         return replace(self, whitener=whitener)
+
+    def giving_way(self, sensitivity: np.ndarray) -> "FitData":
+        """The same yardstick with residuals as small as believed figures make them, to first order.
+
+        Their squares sum to min over δ of |r + S δ|² + |δ|²: that of r times the root of I - S (Sᵀ S + I)⁻¹ Sᵀ.
+
+        Args:
+            sensitivity: (n_values, n_figures) S, in units of the belief in each figure.
+        """
+        directions, sizes, _ = np.linalg.svd(sensitivity, full_matrices=False)
+        return replace(self, given_way=(directions, 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)))
 
     @cached_property
     def counted(self) -> tuple[Record, ...]:
@@ -89,9 +103,14 @@ class FitData:
         """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
         both = zip(self.counted, self.predictions(rig), strict=True)
         left = [record.outputs - prediction for record, prediction in both]
-        if self.whitener is not None:
-            return np.concatenate([whiten(self.whitener, r).ravel() for r in left])
-        return np.concatenate([(r / self.noise[:, None]).ravel() for r in left])
+        if self.whitener is None:
+            residual = np.concatenate([(r / self.noise[:, None]).ravel() for r in left])
+        else:
+            residual = np.concatenate([whiten(self.whitener, r).ravel() for r in left])
+        if self.given_way is not None:
+            directions, shares = self.given_way
+            residual -= directions @ (shares * (directions.T @ residual))
+        return residual
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""

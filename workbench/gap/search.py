@@ -9,7 +9,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
-from workbench.gap.fit import HOPELESS, Fit, cost_of, fit
+from workbench.gap.fit import HOPELESS, Fit, cost_of, fit, sensitivity
 from workbench.gap.missing_force import ForceFilter
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
@@ -36,6 +36,7 @@ class Search:
         report: told (what, share done).
         pool: threads.
         nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
+        held: effects that every candidate stands beside, as they are.
     """
 
     rig: Rig
@@ -46,6 +47,7 @@ class Search:
     report: Callable[[str, float], None]
     pool: ThreadPoolExecutor
     nominal: np.ndarray
+    held: tuple[Effect, ...] = ()
 
     def explains(self, candidate: Fit) -> bool:
         """Whether what is left is noise, in every record, up to the error of integration."""
@@ -73,6 +75,15 @@ class Search:
         quick, first = self.quick.through(whitener), self.first.through(whitener)
         return replace(self, data=self.data.through(whitener), quick=quick, first=first)
 
+    def beside(self, figures: Effect) -> "Search":
+        """The same search beside believed figures, which give way to every candidate to first order."""
+
+        def giving_way(data: FitData) -> FitData:
+            return data.giving_way(sensitivity(self.rig, (figures,), data)[0])
+
+        data, quick, first = self.pool.map(giving_way, (self.data, self.quick, self.first))
+        return replace(self, data=data, quick=quick, first=first, held=(figures,))
+
     def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
         """`function(search, candidate)` of each, in their order."""
         return list(self.pool.map(lambda candidate: function(self, candidate), candidates))
@@ -81,7 +92,7 @@ class Search:
 def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begin, end, *, finalists: int) -> list[Fit]:
     """Fits of the given effects with one more, for every kind and target; the best `finalists` on all records."""
     rig = apply_all(search.rig, given)
-    left = search.data.by_channel(search.data.residual(rig))
+    left = search.data.by_channel(search.data.residual(apply_all(rig, search.held)))
     tasks = [
         (kind, target)
         for kind in search.catalogue
@@ -104,10 +115,10 @@ def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begi
     chosen = spread_over_kinds(quick_fits, 3)
     close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
     chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
-    full = list(search.pool.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), chosen))
+    full = list(search.pool.map(lambda f: _on_all(search, f, 5), chosen))
     full.sort(key=lambda f: f.cost)
     running = [f for i, f in enumerate(full) if i < 3 or f.cost < 2.0 * full[0].cost]
-    full[: len(running)] = search.pool.map(lambda f: fit(search.rig, f.effects, search.data), running)
+    full[: len(running)] = search.pool.map(lambda f: _on_all(search, f, 25), running)
     search.report("all records", end)
     return sorted(full, key=lambda f: f.cost)
 
@@ -149,7 +160,7 @@ def _repeats(kind: Kind, target, given: Sequence[Effect]) -> bool:
 def _started(search: Search, rig: Rig, evidence: Evidence, kind: Kind, target) -> list[tuple[float, Effect]]:
     """The best start of a kind on the most telling record, coarsely stepped, and the best elsewhere, with costs."""
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
-    costs = [cost_of(rig, (effect,), search.first) for effect in starts]
+    costs = [cost_of(rig, (effect, *search.held), search.first) for effect in starts]
     order = [i for i in np.argsort(costs) if costs[i] < HOPELESS]
     # a lone start is of an effect that is linear in its number: its cost says nothing yet
     chosen = order[:1] + [i for i in order[1:] if _elsewhere(starts[i], starts[order[0]], rig.modes.length)][:1]
@@ -175,12 +186,17 @@ def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[lis
 
 def _alone(search: Search, rig: Rig, started: list[tuple[float, Effect]]) -> list[tuple[float, Effect]]:
     """The starts improved a little with the effects found before held fixed: the best, and a rival near it."""
-    fits = [fit(rig, (effect,), search.quick, iterations=3) for _, effect in started]
+    fits = [fit(rig, (effect,), search.quick, held=search.held, iterations=3) for _, effect in started]
     fits.sort(key=lambda f: f.cost)
     return [(f.cost, f.effects[0]) for f in fits if f.cost < CLOSE * fits[0].cost]
 
 
 def _quick_fit(search: Search, given: tuple[Effect, ...], started: list[tuple[float, Effect]]) -> Fit:
     """The best of a kind's starts, improved a little on the quick records, jointly with the given effects."""
-    fits = [fit(search.rig, (*given, effect), search.quick, iterations=4 if given else 7) for _, effect in started]
+    most = 4 if given else 7
+    fits = [fit(search.rig, (*given, e), search.quick, held=search.held, iterations=most) for _, e in started]
     return min(fits, key=lambda f: f.cost)
+
+
+def _on_all(search: Search, candidate: Fit, iterations: int) -> Fit:
+    return fit(search.rig, candidate.effects, search.data, held=search.held, iterations=iterations)

@@ -78,6 +78,8 @@ class Verdict:
             text = f"{words} {verb} for the gap, part of which nothing can predict."
         elif self.outcome == "explained":
             text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
+            freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES and e not in self._told]
+            text += f", with nominal figures a little off ({_off_by(freed[0])})" if freed else ""
             near = [label for label, probability in self.alternatives if probability > 0.01]
             text += f"; {' and '.join(near)} cannot be excluded." if near else "."
         else:
@@ -176,7 +178,9 @@ def _described(effect: Effect, nominal: Rig) -> str:
         if name != "at"
     ]
     text = effect.kind.words
-    if effect.kind.name == "truncated_modes":
+    if effect.kind is NOMINAL_FIGURES:
+        text += f" ({_off_by(effect)})"
+    elif effect.kind.name == "truncated_modes":
         text += f" ({effect.target} are needed, {nominal.modes.n_modes} are kept)"
     elif numbers:
         text += f" ({', '.join(n.strip() for n in numbers)})"
@@ -189,6 +193,15 @@ def _described(effect: Effect, nominal: Rig) -> str:
     elif "at" in effect.values:
         text += f" at x = {_with_deviation(effect.values['at'], effect.deviations.get('at', 0.0))}"
     return text
+
+
+def _off_by(figures: Effect) -> str:
+    """How far the nominal figures are off: frequencies -0.5 to 0.6 %, damping ratios -10 to 13 %."""
+    ranges = []
+    for words, name in (("frequencies", "frequency"), ("damping ratios", "damping")):
+        percent = [100.0 * (value - 1.0) for figure, value in figures.values.items() if figure.startswith(name)]
+        ranges.append(f"{words} {min(percent):.2g} to {max(percent):.2g} %")
+    return ", ".join(ranges)
 
 
 def _with_deviation(value: float, deviation: float) -> str:
