@@ -109,16 +109,48 @@ def size_and_errors(rows: Sequence[Mapping], errors: np.ndarray) -> Figure:
         at = (row["samples"], row["processor_seconds"])
         left.annotate(text, at, (0, -28), textcoords="offset points", ha="center", fontsize=8.5)
     left.set_xticks(samples, [f"{n:,}" for n in samples])
+    left.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
     left.minorticks_off()
-    left.set_ylim(0.3 * spent.min(), 80.0)
+    left.set_xlim(0.7 * samples.min(), 1.4 * samples.max())
+    left.set_ylim(0.25 * spent.min(), 60.0)
     left.set_xlabel(f"samples of {rows[-1]['sensors']} sensors")
     left.set_ylabel("time to identify [s]")
     left.legend(loc="lower right")
-    edges, x = np.linspace(-4.0, 4.0, 33), np.linspace(-4.0, 4.0, 201)
+    edges, x = np.linspace(-4.0, 4.0, 17), np.linspace(-4.0, 4.0, 201)
     right.hist(errors.T, edges, density=True, label=("frequency", "damping"), color=COLOURS[:2], alpha=0.8)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     right.plot(x, normal, color=GREY, lw=3, alpha=0.7, label="a method that attains the bound")
     right.set_xlabel("error of a mode [standard errors of the bound]")
     right.set_ylabel("density")
     right.legend(loc="upper left")
+    return figure
+
+
+def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mapping]) -> Figure:
+    """Errors of every figure by the kind of record, beside those of a method that attains the bound.
+
+    Args:
+        errors: by kind (n_draws, n_figures), in standard errors of the bound.
+        summary: by kind, with over_bound, inside, wrong, records, as `identification_records`.
+    """
+    figure, ax = new_figure(1, 1, width=10.5, height=5.4)
+    rng, x = np.random.default_rng(0), np.linspace(-4.0, 4.0, 201)
+    bell = 0.36 * np.exp(-0.5 * x**2)
+    for row, (kind, apart) in enumerate(errors.items()):
+        told, spread = summary[kind], np.ravel(apart)
+        ax.fill_between(x, row - bell, row + bell, color=GREY, alpha=0.25, lw=0)
+        at = row + rng.uniform(-0.3, 0.3, spread.size) * np.exp(-0.5 * spread**2)
+        ax.plot(spread, at, "o", ms=3, color=COLOURS[0], alpha=0.6, mew=0)
+        text = f"{told['over_bound']:.2f} of the least\n{100 * told['inside']:.0f} % inside"
+        ax.text(4.1, row, text, va="center", fontsize=8.5)
+    ax.set_yticks(range(len(errors)), list(errors))
+    ax.set_ylim(len(errors) - 0.5, -0.5)
+    ax.set_xlim(-4.0, 5.6)
+    ax.set_xticks(range(-4, 5, 2))
+    ax.set_xlabel("error of a frequency or damping ratio [least standard error possible]")
+    handles = [
+        Line2D([], [], marker="o", lw=0, color=COLOURS[0], ms=4, label="a figure of one record"),
+        Line2D([], [], color=GREY, alpha=0.4, lw=8, label="what a method that attains the bound would show"),
+    ]
+    figure.legend(handles=handles, loc="outside upper left", ncols=2)
     return figure

@@ -37,20 +37,20 @@ class Identified:
         return self.refined.modes
 
 
-def no_modes(poles: np.ndarray, shapes: np.ndarray, bin_width: float) -> np.ndarray:
-    """Which poles are damped beyond what rings, or split another mode that has their shape and their band.
+def no_modes(poles: np.ndarray, shapes: np.ndarray, strength: np.ndarray, bin_width: float) -> np.ndarray:
+    """Which poles are damped beyond what rings, or split a stronger mode that has their shape and their band.
 
     Args:
         poles: (n_modes,).
         shapes: (n_signals, n_modes) amplitudes over the noise, complex.
+        strength: (n_modes,) of two alike the weaker splits the other.
         bin_width: rad/s that the length of the record can tell apart.
     """
-    size = np.linalg.norm(shapes, axis=0)
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     damped = -poles.real > MOST_DAMPED * np.abs(poles)
     # One damped beyond what rings has every band; it is split itself.
-    split = near & (mac(shapes, shapes) > SAME_SHAPE) & (size[:, None] < size) & ~damped
+    split = near & (mac(shapes, shapes) > SAME_SHAPE) & (strength[:, None] < strength) & ~damped
     return split.any(axis=1) | damped
 
 

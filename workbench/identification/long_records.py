@@ -22,6 +22,7 @@ from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
+from workbench.identification.coloured import in_its_noise
 from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
 from workbench.identification.projection import Projection
 from workbench.identification.refinement import MOST_STEPS, as_refined, noise_level, search
@@ -33,7 +34,9 @@ SLOWEST, RATIO = 0.7, 4.0
 # A swing is looked at while it lives, so many times as long as it takes to fall to 1/e.
 LIFE = 8.0
 AT_ONCE = 16  # outputs transformed together
-BESIDE = 64  # cells from whose median the noise about a peak is taken
+# Cells on either side from which the noise about a peak is taken, by what half of them and nine in ten stay below: what
+# is left about a mode that shifts as it decays is not smooth.
+BESIDE, SHARES = 64, (0.5, 0.9)
 LEAKED = 2.0  # a peak must be so many times what stronger ones may leak to its place
 LEAST_APART, OVERLAPS = 0.05, 0.5
 STEPS, MOST_ROUNDS = 6, 60
@@ -76,7 +79,7 @@ class _Peeled:
         count = 1 + int(np.log(max(0.1 * np.pi * self.longest / SLOWEST, 1.0)) / np.log(RATIO))
         self.rates = SLOWEST / self.span * RATIO ** np.arange(count)
         self.signals = 2 * sum(r.n_outputs for r in records)
-        self.white = float(chi2.median(self.signals))
+        self.white = chi2.ppf(SHARES, self.signals)
         cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, self.signals))
         # A mode is two amplitudes a signal and its pole, chosen among all cells.
@@ -98,7 +101,9 @@ class _Peeled:
         """All poles fitted together, outputs weighted by what was left of them before."""
         self.converged, self.steps = True, 0
         if poles.size:
-            poles, fits, self.converged, self.steps = search(self.records, poles, self.weights, True, most_steps)
+            poles, fits, self.converged, self.steps = search(
+                self.records, poles, self.weights, True, most_steps, many=True
+            )
         else:
             fits = [_nothing(record) for record in self.records]
         self.poles, self.fits = poles, fits
@@ -124,7 +129,7 @@ class _Peeled:
             return False
         evidence = self.evidence()
         limit = self.limit * np.array([self._colour(pole) for pole in self.poles])
-        out = no_modes(self.poles, self._shapes, self.bin_width) | (evidence < limit)
+        out = no_modes(self.poles, self._shapes, evidence, self.bin_width) | (evidence < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > OVERLAPS)
@@ -165,13 +170,13 @@ class _Peeled:
         return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
 
     def report(self) -> Identified:
-        refined = as_refined(
-            self.records, self.poles, self.fits, self.noise, converged=self.converged, steps=self.steps
-        )
+        found = self.records, self.poles, self.fits, self.noise
+        refined = as_refined(*found, converged=self.converged, steps=self.steps)
         evidence = self.evidence()[np.argsort(np.abs(self.poles))]
         refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
         noise = unshaped(np.array([pole for pole, _ in refused], complex), self.records[0])
-        return Identified(refined, frozen(evidence), self.limit, noise, frozen([strength for _, strength in refused]))
+        refined, tried = in_its_noise(refined, self.records), frozen([strength for _, strength in refused])
+        return Identified(refined, frozen(evidence), self.limit, noise, tried)
 
     def _size(self, rate: float) -> tuple[int, int]:
         """Samples over which a swing lives, and the length of the transform that tells frequencies finely enough."""
@@ -198,7 +203,7 @@ class _Peeled:
         step = np.pi / (self.fine.size * self.dt)
         at, half = round(pole.imag / step), max(int(abs(pole.real) / step), BESIDE)
         beside = self.fine[max(at - half, 0) : at + half + 1]
-        return max(1.0, float(np.median(beside)) / self.white)
+        return max(1.0, float((np.quantile(beside, SHARES) / self.white).max()))
 
     def _peaks(self, rate: float, strengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Strengths and poles of one rate's local maxima that stand out of white noise."""

@@ -141,7 +141,7 @@ class Told:
         """Which poles are damped beyond what rings, or split another mode that has their shape and their band."""
         fits = [project(record, poles, self.offset) for record in self.records]
         shapes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
-        return no_modes(poles, shapes, self.grids[0].bin_width)
+        return no_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width)
 
     def report(self, records: Sequence[Record]) -> Identified:
         start = unshaped(self.poles, records[0])

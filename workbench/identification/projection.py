@@ -18,7 +18,7 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from workbench.records.record import Record
 
 # Samples by modes up to which Φ is factored at once, and the samples of a part beyond.
-LARGEST_FACTORED, PART = 2_000_000, 2048
+LARGEST_FACTORED, PART = 300_000, 2048
 # e^-41 is below the last digit of 1.
 DIED_AWAY = 41.0
 # Round-off of squares that are found as the difference of sums over the record, as a share of these.

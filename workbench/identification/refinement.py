@@ -171,8 +171,12 @@ def _normal(fits: Sequence[Projection], weights: np.ndarray) -> tuple[np.ndarray
     return h, g
 
 
-def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_steps: int = MOST_STEPS):
-    """Levenberg-Marquardt over (σ, ω_d): poles, projections, whether it settled, steps taken."""
+def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_steps: int = MOST_STEPS, many=False):
+    """Levenberg-Marquardt over (σ, ω_d): poles, projections, whether it settled, steps taken.
+
+    Where a pole would leave what is allowed the step is made shorter; or, of `many`, that pole stays for this step and
+    keeps no other from moving.
+    """
     n = poles.size
     fits = [project(record, poles, offset) for record in records]
     cost = _cost(fits, weights)
@@ -190,6 +194,8 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
             except np.linalg.LinAlgError:
                 damping = max(8.0 * damping, 1e-9)
                 continue
+            if many:
+                move[np.tile(_beyond(poles - move[:n] + 1j * move[n:], records), 2)] = 0.0
             trial = poles - move[:n] + 1j * move[n:]
             gain = float(move @ g)
             small = gain <= max(SETTLED * cost / free, ROUND_OFF**2 * signal, 1e-4 * blur)
@@ -206,13 +212,17 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
     return poles, fits, False, most_steps
 
 
+def _beyond(poles: np.ndarray, records) -> np.ndarray:
+    """Which modes no longer swing, pass half the sample rate, grow by more than e^20 over a record, or decay faster
+    than e^-1 a sample."""
+    dt, longest = records[0].sample_time, max(r.n_samples * r.sample_time for r in records)
+    turn = poles.imag * dt
+    return (turn <= 0) | (turn >= np.pi) | (poles.real * longest >= 20.0) | (-poles.real * dt > 1.0)
+
+
 def _tried(records, poles: np.ndarray, offset: bool) -> list[Projection] | None:
-    """Projections; None where a mode no longer swings, passes half the sample rate, grows by more than e^20 over a
-    record, decays faster than e^-1 a sample, or cannot be told from another."""
-    longest = max(r.n_samples * r.sample_time for r in records)
-    gone = -poles.real * records[0].sample_time > 1.0
-    beyond = (poles.imag <= 0) | (poles.imag * records[0].sample_time >= np.pi)
-    if beyond.any() or (poles.real * longest >= 20.0).any() or gone.any():
+    """Projections; None where a mode is beyond what a search allows or cannot be told from another."""
+    if _beyond(poles, records).any():
         return None
     try:
         return [project(record, poles, offset) for record in records]
