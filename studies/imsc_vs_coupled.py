@@ -36,8 +36,8 @@ FIGURES = {
     "cost": "cost",
     "effort": "effort",
     "spilled": "spillover W_R",
-    "survived_share": f"share of models, {ERRORS:.0%} wrong,\non which it is stable",
-    "design_time": "time to design,\nover the first's",
+    "survived_share": f"stable on, of models\n{ERRORS:.0%} wrong",
+    "design_time": "time to design,\nin the first's",
 }
 
 

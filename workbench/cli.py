@@ -83,7 +83,7 @@ def _legible(text: str) -> str:
     return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in " ".join(text.split()))
 
 
-def _warned(message, category, *where) -> None:
+def _warned(message, category, filename, lineno, file=None, line=None) -> None:
     """A warning in one line; those of arithmetic are for developers, its results are checked where they are used."""
     if not issubclass(category, RuntimeWarning):
         errors.print(f"workbench: {_legible(str(message))}", style="yellow", markup=False)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import NullFormatter
 
 from workbench.design.closed_loop import Response
@@ -134,19 +133,18 @@ def plot_designs(rows: Sequence[dict], figures: dict[str, str], title: str) -> F
         figures: heading of each by its key; a key that ends in "share" is drawn from 0 to 1, the others on a log scale.
     """
     laws, states = (list(dict.fromkeys(row[key] for row in rows)) for key in ("law", "state"))
-    figure, axes = new_figure(1, len(figures), width=12, height=1.0 + 0.75 * len(laws), sharey=True)
+    figure, axes = new_figure(1, len(figures), width=12, height=1.4 + 0.75 * len(laws), sharey=True)
     for ax, (key, heading) in zip(axes, figures.items(), strict=True):
-        there = [row[key] for row in rows if row[key] is not None and np.isfinite(row[key])]
-        for row in rows:
-            if row[key] is None or np.isnan(row[key]):
-                continue
-            i = states.index(row["state"])
-            at = laws.index(row["law"]) + 0.16 * (i - 0.5 * (len(states) - 1))
-            shown = row[key] if np.isfinite(row[key]) else 6.0 * max(there)
-            mark = "oDs^"[i % 4] if np.isfinite(row[key]) else ">"
-            ax.plot(shown, at, mark, color=COLOURS[i], markersize=7, clip_on=False)
-            if not np.isfinite(row[key]):
-                ax.annotate("unstable ", (shown, at), ha="right", va="center", fontsize=8, color=COLOURS[i])
+        most = max(row[key] for row in rows if row[key] is not None and np.isfinite(row[key]))
+        for i, state in enumerate(states):
+            own = [row for row in rows if row["state"] == state and row[key] is not None]
+            at = np.array([laws.index(row["law"]) + 0.16 * (i - 0.5 * (len(states) - 1)) for row in own])
+            values = np.array([row[key] for row in own], float)
+            endless = np.isinf(values)
+            values[endless] = 6.0 * most
+            ax.plot(values, at, "o^sv"[i % 4], color=COLOURS[i], markersize=7, label=state)
+            for x, y in zip(values[endless], at[endless]):
+                ax.annotate("unstable  ", (x, y), ha="right", va="center", fontsize=8, color=COLOURS[i])
         if key.endswith("share"):
             ax.set(xlim=(-0.05, 1.05))
         else:
@@ -158,12 +156,8 @@ def plot_designs(rows: Sequence[dict], figures: dict[str, str], title: str) -> F
     axes[0].set_yticks(range(len(laws)), laws)
     axes[0].set_ylim(len(laws) - 0.5, -0.5)
     axes[0].grid(axis="y", visible=False)
-    handles = [
-        Line2D([], [], linestyle="", marker="oDs^"[i % 4], color=COLOURS[i], label=name)
-        for i, name in enumerate(states)
-    ]
     figure.suptitle(title, x=0.01, ha="left", fontsize=12)
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(states))
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(states))
     return figure
 
 
