@@ -13,13 +13,13 @@ $(BIN)/workbench: pyproject.toml
 study: $(BIN)/workbench  ## the main job: a beam from measured response to controlled structure
 	$(BIN)/workbench study beam
 
-test: $(BIN)/workbench  ## the default test run
-	$(BIN)/python -m pytest -q -n auto --dist loadfile
+test: $(BIN)/workbench  ## the default test run; it says what it skips and why
+	$(BIN)/python -m pytest -q -rs -n auto --dist loadfile
 
 test-slow: $(BIN)/workbench  ## the longer trials
 	$(BIN)/python -m pytest -q -m slow
 
-figures: $(BIN)/workbench  ## every study that makes its own data, with its figures and results
+figures: $(BIN)/workbench  ## every study that makes its own data, with its figures and results: hours
 	$(BIN)/workbench study --all
 
 bench: $(BIN)/workbench  ## speeds, as ratios, in ten minutes; the bench to play on is `workbench bench`
