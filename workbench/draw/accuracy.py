@@ -105,13 +105,12 @@ def size_and_errors(rows: Sequence[Mapping], errors: np.ndarray) -> Figure:
     left.axhline(30.0, color=COLOURS[1], lw=1.2)
     left.annotate("limit at full size: 30 s", (samples[0], 30.0), (0, 4), textcoords="offset points", color=COLOURS[1])
     for row in rows:
-        text = f"{row['found']} of {row['count']}\nmodes"
-        at = (row["samples"], row["processor_seconds"])
-        left.annotate(text, at, (0, -28), textcoords="offset points", ha="center", fontsize=8.5)
+        text, at = f"{row['found']} of {row['count']} modes", (row["samples"], row["processor_seconds"])
+        left.annotate(text, at, (-4, 7), textcoords="offset points", ha="right", fontsize=8.5)
     left.set_xticks(samples, [f"{n:,}" for n in samples])
     left.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
     left.minorticks_off()
-    left.set_xlim(0.7 * samples.min(), 1.4 * samples.max())
+    left.set_xlim(0.5 * samples.min(), 1.4 * samples.max())
     left.set_ylim(0.25 * spent.min(), 60.0)
     left.set_xlabel(f"samples of {rows[-1]['sensors']} sensors")
     left.set_ylabel("time to identify [s]")
@@ -130,22 +129,22 @@ def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mappi
     """Errors of every figure by the kind of record, beside those of a method that attains the bound.
 
     Args:
-        errors: by kind (n_draws, n_figures), in standard errors of the bound.
-        summary: by kind, with over_bound, inside, wrong, records, as `identification_records`.
+        errors: by kind (n_figures,), in standard errors of the bound.
+        summary: by kind, with over_bound and inside, as `identification_records`.
     """
     figure, ax = new_figure(1, 1, width=10.5, height=5.4)
     rng, x = np.random.default_rng(0), np.linspace(-4.0, 4.0, 201)
     bell = 0.36 * np.exp(-0.5 * x**2)
     for row, (kind, apart) in enumerate(errors.items()):
-        told, spread = summary[kind], np.ravel(apart)
+        told, spread = summary[kind], np.clip(apart, -4.0, 4.0)
         ax.fill_between(x, row - bell, row + bell, color=GREY, alpha=0.25, lw=0)
         at = row + rng.uniform(-0.3, 0.3, spread.size) * np.exp(-0.5 * spread**2)
         ax.plot(spread, at, "o", ms=3, color=COLOURS[0], alpha=0.6, mew=0)
-        text = f"{told['over_bound']:.2f} of the least\n{100 * told['inside']:.0f} % inside"
-        ax.text(4.1, row, text, va="center", fontsize=8.5)
+        text = f"{told['over_bound']:.2f} times the least\n{100 * told['inside']:.0f} % in their intervals"
+        ax.text(4.15, row, text, va="center", fontsize=8.5)
     ax.set_yticks(range(len(errors)), list(errors))
     ax.set_ylim(len(errors) - 0.5, -0.5)
-    ax.set_xlim(-4.0, 5.6)
+    ax.set_xlim(-4.0, 6.2)
     ax.set_xticks(range(-4, 5, 2))
     ax.set_xlabel("error of a frequency or damping ratio [least standard error possible]")
     handles = [

@@ -38,7 +38,7 @@ AT_ONCE = 16  # outputs transformed together
 # is left about a mode that shifts as it decays is not smooth.
 BESIDE, SHARES = 64, (0.5, 0.9)
 LEAKED = 2.0  # a peak must be so many times what stronger ones may leak to its place
-LEAST_APART, OVERLAPS = 0.05, 0.5
+LEAST_APART, OVERLAPS, LIKE = 0.05, 0.5, 1e-10
 STEPS, MOST_ROUNDS = 6, 60
 # A peak refused so often where it stood is noise; once may be for poles that were not settled. Rounds that leave no
 # more modes than before: where noise is not white, or modes shift as they decay, there may be no end of them.
@@ -233,7 +233,8 @@ class _Peeled:
             near = self.poles[(self.poles.imag > w[0].imag - wide) & (self.poles.imag < w[-1].imag + wide)]
             if near.size:
                 both = self._products(near, w)
-                factor = cho_factor(self._products(near, near))
+                gram = self._products(near, near)
+                factor = cho_factor(gram + LIKE * np.diag(np.diag(gram)))
                 shared = (both.conj() * cho_solve(factor, both)).sum(axis=0).real
                 apart[some] = 1.0 - shared / np.diag(self._products(w[:1], w[:1])).real
         return apart
