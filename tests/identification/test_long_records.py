@@ -94,3 +94,11 @@ def test_noise_that_is_not_white_holds_no_modes(truth, record):
     away = np.abs(found.modes.omega[:, None] - truth.omega)
     assert (away.min(axis=1) < 1e-4 * found.modes.omega).all()
     assert found.modes.n_modes >= 6
+
+
+def test_a_mode_at_half_the_sample_rate_keeps_no_other_from_being_fitted():
+    truth = modes([0.1, 0.1003, 0.2, 0.3, 0.49995], [0.002, 0.002, 0.004, 0.001, 0.01], 6)
+    record = free_decay(truth, sample_time=1.0, n_samples=5000, noise_std=0.01, seed=1)
+    found, limit = identify_long([record], most_modes=99).modes, bound(truth, record, noise_std=0.01)
+    assert found.n_modes == 5
+    assert (np.abs(found.omega - truth.omega)[:4] < 4 * limit.omega_std[:4]).all()

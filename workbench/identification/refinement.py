@@ -175,7 +175,7 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
     """Levenberg-Marquardt over (σ, ω_d): poles, projections, whether it settled, steps taken.
 
     Where a pole would leave what is allowed the step is made shorter; or, of `many`, that pole stays for this step and
-    keeps no other from moving.
+    keeps no other from moving, unless it comes back as the mirror image that samples cannot tell from it.
     """
     n = poles.size
     fits = [project(record, poles, offset) for record in records]
@@ -194,9 +194,11 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
             except np.linalg.LinAlgError:
                 damping = max(8.0 * damping, 1e-9)
                 continue
-            if many:
-                move[np.tile(_beyond(poles - move[:n] + 1j * move[n:], records), 2)] = 0.0
             trial = poles - move[:n] + 1j * move[n:]
+            if many:
+                trial = _folded(trial, records[0].sample_time)
+                held = _beyond(trial, records)
+                trial[held], move[np.tile(held, 2)] = poles[held], 0.0
             gain = float(move @ g)
             small = gain <= max(SETTLED * cost / free, ROUND_OFF**2 * signal, 1e-4 * blur)
             fits_there = _tried(records, trial, offset)
@@ -210,6 +212,12 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
         if small or damping > 1e6:
             return poles, fits, small, step
     return poles, fits, False, most_steps
+
+
+def _folded(poles: np.ndarray, sample_time: float) -> np.ndarray:
+    """The same poles within half the sample rate: real samples see no difference."""
+    turn = np.abs(poles.imag) * sample_time
+    return poles.real + 1j * np.minimum(turn, 2.0 * np.pi - turn) / sample_time
 
 
 def _beyond(poles: np.ndarray, records) -> np.ndarray:
