@@ -70,7 +70,7 @@ def attribute(
         workers: threads.
         settle: seconds at the start of each record that are simulated but not counted.
         free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
-            a little off; otherwise they are freed where no effect alone explains the records without.
+            a little off; otherwise they are freed where no set explains the records without.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     if not (noise > 0).all():
@@ -113,12 +113,11 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
         found, singles = decide_with_figures_freed(search, start)
     else:
         singles = one_more(search, (), evidence, 0.05, 0.45, finalists=8)
-        found = (
-            decide(search, start, singles)
-            or decide_on_random(search, start, singles[0])
-            or decide_beside_nominal(search, start, singles)
-            or decide_on_pairs(search, start, singles, pairs_of(search, singles))
-        )
+        found = decide(search, start, singles) or decide_on_random(search, start, singles[0])
+        if found is None:
+            found = decide_on_pairs(search, start, singles, pairs_of(search, singles))
+            if found.outcome != "explained":
+                found = decide_beside_nominal(search, start, singles) or found
     outcome, best, random, rivals = found
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))

@@ -6,7 +6,7 @@ from workbench.gap.decide import NEAR, Decision, unexplained
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.evidence import Evidence
-from workbench.gap.finish import finished, ranked, simplest
+from workbench.gap.finish import ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.search import Search, one_more, spread_over_kinds
 from workbench.rig.rig import Rig
@@ -22,7 +22,7 @@ def figures(rig: Rig) -> Effect:
 def decide_beside_nominal(search: Search, start: Fit, singles: Sequence[Fit]) -> Decision | None:
     """What holds with the nominal figures freed, alone or beside one effect; None where nothing does.
 
-    Freed figures bend to much, so the effect is also joined by a second one instead: the fewer numbers win.
+    Freed figures bend to much, so they are trusted as they are until no set of effects explains the records.
 
     Args:
         start: what is there with no effect.
@@ -36,10 +36,6 @@ def decide_beside_nominal(search: Search, start: Fit, singles: Sequence[Fit]) ->
             holding = [f for f in each_beside(search, alone) if search.explains(f)]
     if not holding:
         return None
-    given = min(holding, key=lambda f: (len(f.effects), f.cost)).effects[:-1] or singles[0].effects
-    evidence = Evidence.of(apply_all(search.rig, given), search.data, 20)
-    pairs = one_more(search, given, evidence, 0.6, 0.9, finalists=3)[:2]
-    holding += [f for f in search.side_by_side(finished, pairs) if search.explains(f)]
     best, rivals = ranked(search, search.side_by_side(simplest, holding))
     return Decision("explained", best, rivals=rivals)
 
