@@ -208,7 +208,7 @@ def test_a_damaged_case_is_what_it_tells_or_refused(whole, tmp_path, count=120, 
         folder = tmp_path / f"case-{i}"
         shutil.copytree(whole, folder)
         kind = damage(folder, rng)
-        start = clock.monotonic()
+        start = clock.process_time()
         try:
             case = read_case(folder)
         except CaseError as error:
@@ -217,7 +217,7 @@ def test_a_damaged_case_is_what_it_tells_or_refused(whole, tmp_path, count=120, 
             assert folder.name in text and len(text) < 1000 and text.isprintable(), (i, kind, text[:500])
         else:
             check_told(case, folder)
-        assert clock.monotonic() - start < LONGEST, (i, kind)
+        assert clock.process_time() - start < LONGEST, (i, kind)
         shutil.rmtree(folder)
     assert count / 4 < refused < count
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < MOST
