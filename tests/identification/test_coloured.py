@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.identification.coloured import in_its_noise, noise_near
+from workbench.identification.order import identify
 from workbench.identification.refinement import refine
 from workbench.identification.synthesis import free_decay
 from workbench.structure.modes import SampledModes
@@ -69,3 +70,11 @@ def test_the_spectrum_near_a_mode():
     exact = (1 - 0.9**2) / np.abs(1 - 0.9 * np.exp(-0.02j * omega)) ** 2
     # mean of 15 bins and two outputs, or of more
     assert np.abs(factors.mean(axis=0) / exact - 1).max() < 0.4
+
+
+def test_noise_that_is_not_white_is_no_mode():
+    """Noise that falls by 32 dB along its spectrum."""
+    for seed in range(4):
+        noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(seed).standard_normal((2, 1400)), axis=1)[:, 200:]
+        found = identify(replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std()))
+        assert found.modes.n_modes == 3 and np.abs(found.modes.omega / MODES.omega - 1.0).max() < 0.002

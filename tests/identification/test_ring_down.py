@@ -112,12 +112,28 @@ def test_records_together_each_from_its_own_start():
     assert (told.refined.omega_std < ring_down(first).refined.omega_std).all()
 
 
-def test_short_driven_record_is_remarked():
-    n, pole, force = 1000, np.exp((-0.24 + 8.0j) * 0.02), np.random.default_rng(1).standard_normal(1000)
-    swing = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force * np.linspace(2.0, 1.0, n))
-    outputs = swing + 0.02 * swing.std() * RNG.standard_normal(n)
+def test_swept_record_is_remarked():
+    """A sweep lets mode after mode ring, and goes on."""
+    time, pole = 0.02 * np.arange(1000), np.exp((-0.24 + 12.0j) * 0.02)
+    force = np.sin(2 * np.pi * (0.5 + 0.5 * time) * time)
+    swing = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
+    outputs = swing + 0.01 * swing.std() * RNG.standard_normal(1000)
     told = ring_down(Record(0.02, outputs[None], (Channel("a"),)), start=0.0)
-    assert any("it is driven, or depends strongly on amplitude" in note for note in told.notes)
+    assert any("of the motion, is not white" in note for note in told.notes)
+
+
+def test_short_random_response_is_refused_or_remarked():
+    n, pole = 1000, np.exp((-0.24 + 8.0j) * 0.02)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        swing = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.standard_normal((2, n)), axis=1)
+        record = Record(0.02, swing + 0.02 * swing.std() * rng.standard_normal((2, n)), (Channel("a"), Channel("b")))
+        try:
+            told = ring_down(record, start=0.0)
+        except ValueError as error:
+            assert "no free decay" in str(error) or "is it a free decay" in str(error) or "grows" in str(error)
+        else:
+            assert any("it is driven, or depends strongly on amplitude" in note for note in told.notes), told.notes
 
 
 def test_a_tone_is_remarked():

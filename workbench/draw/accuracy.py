@@ -140,7 +140,8 @@ def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mappi
         ax.fill_between(x, row - bell, row + bell, color=GREY, alpha=0.25, lw=0)
         at = row + rng.uniform(-0.3, 0.3, spread.size) * np.exp(-0.5 * spread**2)
         ax.plot(spread, at, "o", ms=3, color=COLOURS[0], alpha=0.6, mew=0)
-        text = f"{told['over_bound']:.2f} times the least\n{100 * told['inside']:.0f} % in their intervals"
+        least = "the least" if told["bound"] == "Cramér-Rao" else "its own error"
+        text = f"{told['over_bound']:.2f} times {least}\n{100 * told['inside']:.0f} % in their intervals"
         ax.text(4.15, row, text, va="center", fontsize=8.5)
     ax.set_yticks(range(len(errors)), list(errors))
     ax.set_ylim(len(errors) - 0.5, -0.5)

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from workbench.identification.ibrahim import normalised_shapes, stacked_delays
+from workbench.identification.identified import MOST_DAMPED
 from workbench.identification.refinement import Refined, refine
 from workbench.identification.stabilisation import real_modes, stabilise
 from workbench.identification.synthesis import time_derivatives
@@ -128,7 +129,8 @@ def identify_ambient(
         found = _over_references(refined, record)
         covariance = _jackknife(without, found)
         std = np.sqrt(np.diag(covariance)[: found.n_modes])
-        unsure = (std > LEAST_SURE * found.omega) | (found.zeta <= 0) | _split(refined, found, std)
+        unsure = (std > LEAST_SURE * found.omega) | (found.zeta <= 0) | (found.zeta > MOST_DAMPED)
+        unsure |= _split(refined, found, std)
         if n_modes is not None or found.n_modes == 1 or not unsure.any():
             return AmbientModes(found, frozen(covariance), BLOCKS, decays)
         worst = int(np.argmax(np.where(unsure, std / found.omega, 0.0)))

@@ -1,4 +1,7 @@
-"""Standard errors where the noise is not white: what is left near a mode's frequency sets them, not all that is left.
+"""Noise that is not white: filtered until it is, to count modes, and listened to near each mode, to say their errors.
+
+What is left of an output is taken for e_k of y_k = Σ_i a_i y_k-i + e_k (Yule & Walker), and the record filtered by what
+makes it e_k. Free decay stays free decay of the same poles.
 
 A mode listens to noise within its own band only. Where output j has noise of spectrum S_j, a least squares fit made for
 white noise s_j² has the covariance H^-1 (Σ_j J_j^T S_j J_j) H^-1 (White, Econometrica 48, 1980), and each column of J
@@ -13,6 +16,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
 
 from workbench.identification.projection import Projection, project
 from workbench.identification.refinement import Refined
@@ -22,6 +27,10 @@ from workbench.structure.modes import frozen
 
 # Chance that white noise is taken for coloured, and the least number of bins over which a spectrum is averaged.
 FALSE_ALARM, LEAST_BINS = 1e-3, 6
+# Samples before that foretell one of noise, and those it takes to learn the weight of each.
+ORDER, SAMPLES_EACH = 12, 40
+# What is left of records without noise, over their size.
+ROUNDING = 1e-9
 
 
 def in_its_noise(refined: Refined, records: Record | Sequence[Record], *, offset: bool = True) -> Refined:
@@ -49,6 +58,37 @@ def in_its_noise(refined: Refined, records: Record | Sequence[Record], *, offset
         covariance=frozen(refined.covariance * np.outer(wider, wider)),
         shape_covariance=frozen(_shapes(refined, fits[loudest], records[loudest], near_pole, factors[loudest])),
     )
+
+
+def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = True) -> list[Record] | None:
+    """The records behind filters, one an output, that make white what `poles` leave; None where it may be white.
+
+    Args:
+        records: free decays, of the same outputs.
+        poles: (n_modes,) of their modes, rad/s.
+        offset: whether each output may also hold a constant.
+    """
+    left = [project(record, poles, offset).residual.T for record in records]
+    powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in left]
+    order = min(ORDER, sum(each.shape[1] for each in left) // SAMPLES_EACH)
+    squares = sum((each**2).sum(axis=1) for each in left)
+    whole = sum((record.outputs**2).sum(axis=1) for record in records)
+    rounding = (squares < ROUNDING**2 * whole).any()
+    if order == 0 or rounding or all(_white(power, poles.size).all() for power in powers):
+        return None
+    filters = []
+    for row in zip(*left, strict=True):
+        lags = [sum(float(each[k:] @ each[: each.size - k]) for each in row) for k in range(order + 1)]
+        filters.append(np.r_[1.0, -solve_toeplitz(lags[:-1], lags[1:])] if lags[0] > 0 else np.r_[1.0, np.zeros(order)])
+    return [
+        replace(
+            record,
+            outputs=np.array([lfilter(b, [1.0], row)[order:] for b, row in zip(filters, record.outputs, strict=True)]),
+            inputs=record.inputs[:, order:],
+            start_time=record.start_time + order * record.sample_time,
+        )
+        for record in records
+    ]
 
 
 def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> np.ndarray:

@@ -19,8 +19,9 @@ MOST_SIGNALS, MOST_SAMPLES = 8, 40_000
 # Means fewer than these cannot teach the rule and be told by it.
 SHORTEST = (4 + LEVEL_MEMORY) * ORDER
 COARSER = 4
-# Squared, of a sample not foretold over the level: alone, and where the motion also rises by so much in energy.
-BREAK, BREAK_RISING, RISE = 100.0, 25.0, 4.0
+# Squared, of a sample not foretold over the level: alone, where the motion also rises by so much in energy, and soon
+# after another break, for a force that dies away.
+BREAK, BREAK_RISING, RISE, BREAK_BESIDE, NEAR = 100.0, 25.0, 4.0, 16.0, 8
 # A break that leaves less of the record's energy behind it is not what the decay began with.
 LEAST_LEFT = 0.01
 
@@ -52,7 +53,8 @@ def decay_start(record: Record) -> float:
         means = oaconvolve(signals, window[None], mode="valid", axes=1)
         means = means[:, (means.shape[1] - 1) % step :: step]
         first = n - window.size - step * (means.shape[1] - 1)
-        broken = first + step * np.flatnonzero(_breaks(means, rounding * (window**2).sum()))
+        ratio, breaks = _breaks(means, rounding * (window**2).sum())
+        broken = first + step * np.flatnonzero(_dying_away(ratio, breaks) if step == 1 else breaks)
         broken = broken[matters[broken]]
         # A break known already from more samples is seen by every window that holds it.
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
@@ -79,8 +81,8 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
     return scaled, float(np.mean(np.square(steps)) / 12.0)
 
 
-def _breaks(y: np.ndarray, rounding: float) -> np.ndarray:
-    """Samples (n_samples,) that those after them do not foretell."""
+def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
+    """By how much samples (n_samples,) stand out of what those after them foretell, and which break the rule."""
     m, n = y.shape
     forget, forget_level = np.exp(-BLOCK / (MEMORY * ORDER)), np.exp(-BLOCK / (LEVEL_MEMORY * ORDER))
     energy = np.r_[np.cumsum((y**2).sum(axis=0)[::-1])[::-1], 0.0]
@@ -104,4 +106,13 @@ def _breaks(y: np.ndarray, rounding: float) -> np.ndarray:
     after = np.arange(1, n + 1)
     width = np.minimum(after, np.minimum(ORDER, n - after))
     rises = energy[after] - energy[after + width] > RISE * (energy[after - width] - energy[after])
-    return (ratio > BREAK) | ((ratio > BREAK_RISING) & rises)
+    return ratio, (ratio > BREAK) | ((ratio > BREAK_RISING) & rises)
+
+
+def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
+    """Breaks and the lesser ones that follow them closely."""
+    broken, last = broken.copy(), -NEAR - 1
+    for t in np.flatnonzero(ratio > BREAK_BESIDE).tolist():
+        if broken[t] or t - last <= NEAR:
+            broken[t], last = True, t
+    return broken

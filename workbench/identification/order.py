@@ -18,7 +18,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.ailments import check_fit
-from workbench.identification.coloured import in_its_noise
+from workbench.identification.coloured import in_its_noise, whitened
 from workbench.identification.ibrahim import check_alike
 from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
 from workbench.identification.long_records import identify_long
@@ -30,6 +30,8 @@ from workbench.structure.modes import frozen
 # Values in all from which modes are taken in many at a time.
 LONG = 100_000
 MOST_MODES = 40
+# Noise that is not white is learnt from what the modes leave, and they from it in turn.
+WHITENED, MOST_GROWTH = 2, 0.5
 # Tries that fall below the limit in a row before the record counts as told.
 MOST_REFUSALS = 2
 # A record whose noise is not white, or whose modes shift as they decay, may take modes in and put them out for ever.
@@ -50,7 +52,7 @@ def identify(
     """The modes that a free decay holds, as many as there are, each with its standard error.
 
     Args:
-        records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
+        records: free decay in noise, of the same sensors at one rate; each output may hold a constant.
         most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
         false_alarm: chance that noise alone is taken for a mode.
 
@@ -66,12 +68,23 @@ def identify(
     if sum(r.outputs.size for r in records) > LONG:
         found = identify_long(records, most_modes=min(most_modes or 10 * MOST_MODES, fit_in), false_alarm=false_alarm)
         return found if found is not None else _refuse(records)
+    most_modes = min(most_modes or MOST_MODES, fit_in)
+    told = _told(records, most_modes, false_alarm)
+    for _ in range(WHITENED):
+        white = whitened(records, told.ringing)
+        if white is None:
+            break
+        told = _told(white, most_modes, false_alarm)
+    return told.report(records) if told.poles.size else _refuse(records)
+
+
+def _told(records: Sequence[Record], most_modes: int, false_alarm: float) -> "Told":
     longest = max(record.n_samples for record in records)
     told = Told(records, [_Grid(record, longest) for record in records], false_alarm)
     for _ in range(MOST_ROUNDS):
-        if not (told.grow(min(most_modes or MOST_MODES, fit_in)) and told.prune()):
+        if not (told.grow(most_modes) and told.prune()):
             break
-    return told.report(records) if told.poles.size else _refuse(records)
+    return told
 
 
 def _refuse(records: Sequence[Record]) -> NoReturn:
@@ -95,6 +108,12 @@ class Told:
         self.poles = np.zeros(0, complex)
         self.refused: list[tuple[complex, float]] = []
         self.weights, self.fits = self._settled(self.poles)[1:]
+
+    @property
+    def ringing(self) -> np.ndarray:
+        """The poles that swing within a record and hardly grow; what else came in may be noise that is not white."""
+        span = max(record.n_samples * record.sample_time for record in self.records)
+        return self.poles[(self.poles.real * span < MOST_GROWTH) & (np.abs(self.poles) * span > 2.0 * np.pi)]
 
     def grow(self, most_modes: int) -> bool:
         """Take in modes until what is left is noise; whether any came in."""
@@ -144,8 +163,8 @@ class Told:
         return no_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width)
 
     def report(self, records: Sequence[Record]) -> Identified:
-        start = unshaped(self.poles, records[0])
-        refined = in_its_noise(refine(records, start, offset=True), records)
+        # Filters cost the first samples, the strongest: modes are counted behind them, and read without.
+        refined = in_its_noise(refine(records, unshaped(self.poles, records[0]), offset=True), records)
         evidence = self._evidence()[np.argsort(np.abs(self.poles))]
         refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
         noise = np.array([pole for pole, _ in refused], complex)

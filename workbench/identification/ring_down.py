@@ -28,8 +28,8 @@ DRIFT_ROUNDS = 3
 AS_STRONG, REMEMBERED = 0.5, 0.5
 # Correlation of noise, times the root of its samples, is 1.
 FORGETFUL = 3.0
-# Share of the energy about the modes, and of all, that they may leave; and how far it may then stand out of what they
-# leave beside, or of its own median. White noise does not.
+# Share of the energy about the modes that they may leave standing out so far of what they leave beside; and of all, if
+# it is not white.
 LEFT_OVER, MOST_LEFT, STANDS_OUT = 0.1, 0.25, 5.0
 # Bins about a mode, and beside.
 BAND, BESIDE = 6, 60
@@ -97,6 +97,8 @@ def ring_down(
         found, more = _by_stabilisation(cut), ["the order could not be told by likelihood: by stabilisation instead"]
     _check_decays(cut, found.refined)
     left = [project(record, found.modes.poles, True).residual.T for record in cut]
+    coloured = _left_over(cut, left)
+    doubtful = _unexplained(cut, left, found.refined, bool(coloured))
     doubts = remarks(found.refined, cut)
     sure = [r for r, doubt in enumerate(doubts) if not doubt]
     return RingDown(
@@ -108,7 +110,7 @@ def ring_down(
         found.limit,
         amplitude_dependence(cut, found.refined),
         proportional_fit(found.refined, sure) if len(sure) > 1 else None,
-        (*notes, *more, *_goes_on(found.refined, cut), *_unexplained(cut, left, found.refined), *_left_over(cut, left)),
+        (*notes, *more, *_goes_on(found.refined, cut), *doubtful, *coloured),
     )
 
 
@@ -212,10 +214,10 @@ def _check_decays(records: list[Record], refined: Refined) -> None:
         )
 
 
-def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined) -> tuple[str, ...]:
+def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined, coloured: bool) -> tuple[str, ...]:
     """What to say where modes leave much about their own frequencies: what forces drive swings there on and on.
 
-    White noise of sensors leaves there no more than beside, and no more in all than its median.
+    Noise of sensors leaves there no more than beside.
     """
     for record, residual in zip(records, left, strict=True):
         scaled = ((part / refined.noise_std[:, None]) for part in (residual, record.outputs))
@@ -228,7 +230,7 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
         share, whole = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
         level = np.median(power[beside]) if beside.any() else 0.0
         about = share > LEFT_OVER and power[inside].mean() > STANDS_OUT * level
-        if about or (whole > MOST_LEFT and power.mean() > STANDS_OUT * np.median(power)):
+        if about or (whole > MOST_LEFT and coloured):
             return (
                 f"in record {record.name!r} the modes leave {100 * np.sqrt(share):.0f} % of the motion about their own"
                 f" frequencies, {100 * np.sqrt(whole):.0f} % of all: it is driven, or depends strongly on amplitude."
