@@ -56,7 +56,7 @@ def identify_long(records: Sequence[Record], *, most_modes: int, false_alarm: fl
     peeled, fruitless = _Peeled(records, false_alarm), 0
     for _ in range(MOST_ROUNDS):
         before = peeled.poles.size
-        peaks = peeled.peaks()[: most_modes - before] if fruitless < MOST_FRUITLESS else np.zeros(0)
+        peaks = peeled.peaks()[: max(most_modes - before, 0)] if fruitless < MOST_FRUITLESS else np.zeros(0)
         if peaks.size:
             peeled.take_in(peaks)
             peeled.prune()

@@ -51,6 +51,8 @@ def identify(
 ) -> Identified:
     """The modes that a free decay holds, as many as there are, each with its standard error.
 
+    Records of more than 100,000 values in all are told many modes at a time, as in `long_records`.
+
     Args:
         records: free decay in noise, of the same sensors at one rate; each output may hold a constant.
         most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
