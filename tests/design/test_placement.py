@@ -168,6 +168,8 @@ def test_candidates_are_searched_whole(task):
     candidates = np.array([1.0, 2.2, 3.1, 4.4, 5.9, 7.3, 8.6])
     best, tried = scan(task, candidates=candidates)
     assert tried == 35 and set(best.positions) <= set(candidates)
+    with pytest.raises(DesignError, match="4 actuators at 300 places make"):
+        scan(task, candidates=np.linspace(0.1, 9.9, 300))
     with pytest.raises(DesignError, match="leave 3"):
         scan(task, candidates=[1.0, 2.0, 3.0])
 

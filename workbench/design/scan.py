@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import combinations, islice
+from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,7 @@ from workbench.design.limits import KEPT, Limits, conflict
 from workbench.design.placement_task import Placement, PlacementTask, batch_figures
 
 BATCH = 20_000
+MOST_TRIED = 5_000_000
 
 
 def scan(
@@ -33,7 +35,8 @@ def scan(
         candidates: (n_candidates,) places, instead of a grid, m.
 
     Raises:
-        DesignError: fewer places than actuators, or limits that none meets, with the one that conflicts.
+        DesignError: fewer places than actuators, more choices of them than can be tried, or limits that none meets,
+            with the one that conflicts.
     """
     limits = Limits(effort_limit, peak_limit, condition_limit, spacing, margin, tuple(forbidden))
     n, length = task.n_controlled, task.modes.length
@@ -46,6 +49,11 @@ def scan(
     grid = grid[np.any([(grid >= low - 1e-12) & (grid <= high + 1e-12) for low, high in stretches], axis=0)]
     if grid.size < n:
         raise DesignError(f"{n} actuators need as many places; the limits leave {grid.size}: allow more")
+    if comb(grid.size, n) > MOST_TRIED:
+        raise DesignError(
+            f"{n} actuators at {grid.size} places make {comb(grid.size, n):.2g} choices; at most {MOST_TRIED:.0e} are"
+            " tried: name fewer places, or let the actuators stand anywhere"
+        )
     shapes = task.shapes(grid)
     best, best_at, tried = np.inf, None, 0
     every = combinations(range(grid.size), n)
