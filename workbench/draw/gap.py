@@ -81,14 +81,14 @@ def plot_where(verdict: Verdict) -> Figure:
 
 def _plot_places(ax, verdict: Verdict) -> None:
     """How likely each place is for one missing force: a curve along the structure, or bars at named places."""
-    evidence = verdict.attribution.evidence
-    profile = evidence.profile - evidence.profile.max()
+    place = verdict.where.place
+    profile = place.profile - place.log_likelihood
     ax.set(title="where a missing force would stand", ylabel="log-likelihood, less its peak")
     if known_places(verdict.nominal) is not None:
-        ax.bar([place_name(verdict.nominal, at) for at in evidence.places], profile, color=COLOURS[3])
+        ax.bar([place_name(verdict.nominal, at) for at in place.places], profile, color=COLOURS[3])
         return
-    ax.plot(evidence.places, profile, color=COLOURS[3])
-    ax.axvline(verdict.where.at, color=GREY, linestyle=":")
+    ax.plot(place.places, profile, color=COLOURS[3])
+    ax.axvline(place.at, color=GREY, linestyle=":")
     for effect in verdict.effects:
         if "at" in effect.values and effect.kind.path in ("structure", "environment"):
             ax.axvline(effect.values["at"], color=COLOURS[0])
@@ -98,10 +98,9 @@ def _plot_places(ax, verdict: Verdict) -> None:
 
 def plot_missing_force(verdict: Verdict) -> Figure:
     """The missing force at its likeliest place against displacement and velocity."""
-    place = verdict.attribution.evidence.at_peaks[0]
+    evidence = verdict.attribution.evidence
     chosen = [e for e in verdict.effects if "at" in e.values and e.kind.path == "structure"]
-    if chosen:
-        place = verdict.attribution.evidence.place(chosen[0].values["at"])
+    place = evidence.place(chosen[0].values["at"] if chosen else verdict.where.at)
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
     step = max(1, place.force.size // 4000)
     for ax, series, name in (

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.gap.coherence import linear_share
 from workbench.gap.effects.effect import Effect
 from workbench.gap.evidence import Evidence
+from workbench.gap.place import Placed, placed
 from workbench.gap.prediction import FitData
 
 MODE_SHARE = 0.05
@@ -32,7 +33,7 @@ class Where:
         record_gaps: (n_records,) gap as the case format defines it.
         input_levels: (n_records,) root mean square of the inputs.
         linear_share: of the gap's power, what one linear reply to the inputs explains.
-        at, at_std: the likeliest place of a missing force at a point and its standard deviation, m.
+        place: of a missing force at a point, whatever its law: `at` and `at_std`, m.
         point_share: share of the gap's log-likelihood that one force at that place accounts for.
     """
 
@@ -48,9 +49,16 @@ class Where:
     record_gaps: np.ndarray
     input_levels: np.ndarray
     linear_share: float
-    at: float
-    at_std: float
+    place: Placed
     point_share: float
+
+    @property
+    def at(self) -> float:
+        return self.place.at
+
+    @property
+    def at_std(self) -> float:
+        return self.place.at_std
 
 
 def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
@@ -67,8 +75,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
     between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
     mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - OCTAVES, 1)]
-    profile = evidence.profile
-    at, at_std, point_share = _place(evidence, profile)
+    place = placed(evidence)
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     return Where(
@@ -84,9 +91,8 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
         record_gaps=gaps,
         input_levels=levels,
         linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
-        at=at,
-        at_std=at_std,
-        point_share=point_share,
+        place=place,
+        point_share=_share(evidence, place),
     )
 
 
@@ -108,25 +114,14 @@ def _by_eighths(scaled: np.ndarray) -> np.ndarray:
     return power / max(power.sum(), 1e-300)
 
 
-def _place(evidence: Evidence, profile: np.ndarray) -> tuple[float, float, float]:
-    """Peak of the likelihood over places, its standard deviation from the curvature, and the share it accounts for."""
-    places, data = evidence.places, evidence.data
-    best = evidence.peaks[0]
-    weights = np.exp(np.maximum(profile - profile.max(), -700.0))
-    spread = float(np.sqrt(np.sum(weights * (places - best) ** 2) / weights.sum()))
-    i = int(np.clip(np.argmax(profile), 1, places.size - 2)) if places.size > 2 else 0
-    if places.size > 2:
-        bend = profile[i - 1] - 2.0 * profile[i] + profile[i + 1]
-        if bend < 0:
-            spread = float((places[1] - places[0]) / np.sqrt(-bend))
-    # the likelihood cannot tell more than the grid and the model of the force allow
-    spread = max(spread, 0.1 * float(np.diff(places).mean()) if places.size > 1 else 0.0)
+def _share(evidence: Evidence, place: Placed) -> float:
+    """Share of the gap's log-likelihood that one force at the place accounts for."""
+    data = evidence.data
     n_samples = sum(record.n_samples for record in data.counted)
     chi2 = sum(float(np.sum((r / data.noise[:, None]) ** 2)) for r in evidence.residuals)
     none = -0.5 * (chi2 + n_samples * np.sum(np.log(data.noise**2)))
     floor = -0.5 * n_samples * (data.noise.size + np.sum(np.log(data.noise**2)))
-    share = (profile.max() - none) / max(floor - none, 1e-300)
-    return float(best), spread, float(np.clip(share, 0.0, 1.0))
+    return float(np.clip((place.log_likelihood - none) / max(floor - none, 1e-300), 0.0, 1.0))
 
 
 def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> str:

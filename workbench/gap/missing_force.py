@@ -95,10 +95,56 @@ def force_filter(
     h = np.hstack([model.output, model.feedthrough @ patterns, np.zeros((model.output.shape[0], (stages - 1) * m))])
     q = np.zeros_like(a)
     q[-m:, -m:] = np.diag(variances)
-    covariance = steady_covariance(a, h, q, model.noise_variance)
-    s = h @ covariance @ h.T + np.diag(model.noise_variance)
+    return _steady(a, h, q, model.noise_variance, m)
+
+
+def wandering_force_filter(
+    modes: Modes, model: SampledModel, shape: np.ndarray, rms: float, correlation_time: float, sample_time: float
+) -> ForceFilter:
+    """The filter for one force that wanders within a sample too, as the forces of contact and friction do.
+
+    An Ornstein-Uhlenbeck process, integrated exactly by the exponential of Van Loan, IEEE Trans. Autom. Control 23
+    (1978) 395.
+
+    Args:
+        modes, model: of the rig, and its sampled form.
+        shape: (n_modes,) of the modes at the force.
+        rms: of the force, N.
+        correlation_time: s.
+        sample_time: s.
+    """
+    n = modes.n_modes
+    size = 2 * n + 1
+    a = np.zeros((size, size))
+    a[:n, n : 2 * n] = np.eye(n)
+    a[n : 2 * n, :n] = -np.diag(modes.omega**2)
+    a[n : 2 * n, n : 2 * n] = -modes.damping
+    a[n : 2 * n, -1] = shape
+    a[-1, -1] = -1.0 / correlation_time
+    # displacements as velocities, so that the matrix is no larger than the highest frequency
+    scale = np.r_[np.maximum(modes.omega, 0.1 * modes.omega[-1]), np.ones(n + 1)]
+    a = a * scale[:, None] / scale
+    pencil = np.zeros((2 * size, 2 * size))
+    pencil[:size, :size], pencil[size:, size:] = -a, a.T
+    pencil[size - 1, -1] = 2.0 * rms**2 / correlation_time
+    halvings = max(0, int(np.ceil(np.log2(2.0 * np.abs(a).sum(axis=1).max() * sample_time))))
+    short = expm(pencil * sample_time / 2**halvings)
+    transition = short[size:, size:].T
+    noise = transition @ short[:size, size:]
+    for _ in range(halvings):
+        noise = noise + transition @ noise @ transition.T
+        transition = transition @ transition
+    transition = transition / scale[:, None] * scale
+    noise = 0.5 * (noise + noise.T) / scale[:, None] / scale
+    h = np.hstack([model.output, model.feedthrough @ shape[:, None]])
+    return _steady(transition, h, noise, model.noise_variance, 1)
+
+
+def _steady(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray, n_forces: int) -> ForceFilter:
+    covariance = steady_covariance(a, h, q, noise_variance)
+    s = h @ covariance @ h.T + np.diag(noise_variance)
     gain = np.linalg.solve(s, h @ covariance @ a.T).T
-    return ForceFilter(a, h, covariance, gain, s, m)
+    return ForceFilter(a, h, covariance, gain, s, n_forces)
 
 
 def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:
@@ -147,17 +193,18 @@ def innovations(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     return out
 
 
+def log_likelihoods(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+    """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,)."""
+    factor = cho_factor(filter_.innovation, lower=True)
+    e = innovations(filter_, residual)
+    if not np.abs(e).max() < RUNAWAY:
+        return np.full(e.shape[1], -np.inf)
+    return -0.5 * np.sum(e * cho_solve(factor, e), axis=0) - np.log(np.diag(factor[0])).sum()
+
+
 def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
     """Gaussian log-likelihood of residual records under the filter, constants left out."""
-    factor = cho_factor(filter_.innovation, lower=True)
-    log_det = 2.0 * np.log(np.diag(factor[0])).sum()
-    total = 0.0
-    for residual in residuals:
-        e = innovations(filter_, residual)
-        if not np.abs(e).max() < RUNAWAY:
-            return -np.inf
-        total -= 0.5 * (np.sum(e * cho_solve(factor, e)) + e.shape[1] * log_det)
-    return total
+    return float(sum(log_likelihoods(filter_, residual).sum() for residual in residuals))
 
 
 def whiten(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
