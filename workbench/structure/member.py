@@ -17,6 +17,7 @@ from workbench.structure.supports import HELD, Attachment, End, PointDamper, Poi
 HIGHEST_DEGREE = 48
 MOST_FUNCTIONS = 2400
 THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
+NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or another stands there
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
@@ -57,7 +58,7 @@ class _Member:
             )
 
     def _nodes(self, breaks: tuple[float, ...]) -> np.ndarray:
-        slack = 1e-9 * self.length
+        slack = NO_SLIVER * self.length
         inside = sorted(b for b in breaks if slack < b < self.length - slack)
         nodes = [0.0]
         for b in [*inside, self.length]:
