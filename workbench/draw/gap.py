@@ -93,7 +93,8 @@ def _plot_places(ax, verdict: Verdict) -> None:
         if "at" in effect.values and effect.kind.path in ("structure", "environment"):
             ax.axvline(effect.values["at"], color=COLOURS[0])
     near = abs(np.sort(profile)[-min(3, profile.size)])
-    ax.set(xlabel="x [m]", ylim=(max(profile.min(), -50.0 * max(1.0, near)), None))
+    low = min(max(profile.min(), -50.0 * max(1.0, near)), -1.0)
+    ax.set(xlabel="x [m]", ylim=(low, -0.06 * low))
 
 
 def plot_missing_force(verdict: Verdict) -> Figure:
