@@ -8,7 +8,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from workbench.gap.beside_nominal import decide_beside_nominal, decide_with_figures_freed
-from workbench.gap.decide import decide, decide_on_pairs, decide_on_random, pairs_of
+from workbench.gap.decide import Decision, decide, decide_on_pairs, decide_on_random, pairs_of
 from workbench.gap.disturbance import RandomForceFit
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -109,6 +109,7 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     search = Search(base, data, quick, first, catalogue, report, pool, nominal)
     report("looking for the missing force", 0.02)
     evidence = Evidence.of(base, data)
+    found: Decision | None
     if free_nominal and not search.explains(start):
         found, singles = decide_with_figures_freed(search, start)
     else:
