@@ -29,7 +29,7 @@ from workbench.structure.member import Bar, Beam
 FALSE_ALARM = 0.01
 N_PLACES = 60
 TYPICAL_WIDTH = 0.1  # of the length, in the first look along the structure
-MOST_STARTS = 4
+MOST_STARTS, MOST_LOOKS = 4, 3
 FIRST_TERMS = 3
 
 
@@ -99,9 +99,11 @@ def find_loss(
         raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
     first = _from_anywhere(task.problem(*(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
     lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
-    if not lossy.explains:
+    for _ in range(MOST_LOOKS):
+        if lossy.explains:
+            break
         again = _from_anywhere(task.problem(*(basis(n) for n in lossy.n_terms)), lossy)
-        lossy = choose(task, basis, *terms, _near_the_last, near=again)
+        lossy = choose(task, basis, *terms, partial(_near_either, again), near=again)
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
     smooth = _smooth(task, basis, terms, lossy, limit)
@@ -134,6 +136,12 @@ def _near_the_last(problem: Problem, near: FittedStructure | None) -> FittedStru
     """The most likely structure with a loss near the one found before."""
     assert near is not None, "a search along the structure comes first"
     return problem.fit(near, near.loss)
+
+
+def _near_either(other: FittedStructure, problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The likelier of two searches, for a loss of few terms may end beside that of many."""
+    starts = [start for start in (near, other) if start is not None]
+    return min((problem.fit(start, start.loss) for start in starts), key=lambda fit: fit.chi2)
 
 
 def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
