@@ -426,6 +426,9 @@ def diagnose(
     case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
     json_path: JsonPath = None,
     page: Annotated[Path | None, typer.Option(help="Write the page here; default out/CASE.html.")] = None,
+    free_nominal: Annotated[
+        bool, typer.Option("--free-nominal", help="The nominal frequencies and damping are known to be a little off.")
+    ] = False,
 ) -> None:
     """Say where a simulation and a test disagree, which effect is missing, and how far the gap then shrinks.
 
@@ -433,6 +436,7 @@ def diagnose(
     """
     from workbench.gap.case import read_case
     from workbench.gap.diagnose import diagnose as run
+    from workbench.gap.effects.structural import known_places
     from workbench.study.verdict_page import verdict_page
     from workbench.study.whole_file import check_target, write_whole
 
@@ -445,6 +449,7 @@ def diagnose(
             found.fit,
             validation=found.validation,
             name=found.name,
+            free_nominal=free_nominal,
             report=lambda text, share: progress.update(task, description=text, completed=share),
         )
     console.print(verdict.sentence, style="bold", markup=False)
@@ -454,6 +459,8 @@ def diagnose(
         f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on level"
     )
     console.print(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
+    if where.path == "structure" and known_places(found.rig) is None:
+        console.print(f"  place      x = {where.at:.4g} ± {where.at_std:.1g} m, were it one force, of any law")
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
         console.print(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, floor {floor[name]:.4g}")
