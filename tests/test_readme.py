@@ -67,6 +67,8 @@ ROWS = {
     "closed-form Riccati gains": lambda r: _largest(r, "gains against control.lqr"),
     "a hundred random structures": lambda r: min(check["value"] for check in r["checks"]),
     "95 % intervals": lambda r: min(c["value"] for c in r["checks"] if c["name"].endswith("from below")),
+    "200 sensors": lambda r: _largest(r, "modes", "at full size"),
+    "the same, processor time": lambda r: _largest(r, "processor seconds"),
     "a fifth of the stiffness": lambda r: min(c["value"] for c in r["checks"] if "found and placed" in c["name"]),
     "worst mode of fifty": lambda r: _largest(r, "median worst mode over the best peer's"),
     "the same, time": lambda r: _largest(r, "time over SSI-cov's"),
