@@ -10,7 +10,7 @@ below that of the smooth explanation by more than noise would lower χ² anywher
 of a false alarm. No measurement of the undamaged structure is needed.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -140,17 +140,28 @@ def _near_the_last(problem: Problem, near: FittedStructure | None) -> FittedStru
 
 def _near_either(other: FittedStructure, problem: Problem, near: FittedStructure | None) -> FittedStructure:
     """The likelier of two searches, for a loss of few terms may end beside that of many."""
-    starts = [start for start in (near, other) if start is not None]
-    return min((problem.fit(start, start.loss) for start in starts), key=lambda fit: fit.chi2)
+    return _likeliest(problem, [(start, start.loss) for start in (near, other) if start is not None])
 
 
 def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
     """The most likely structure with a loss, from the likeliest places and from what was found before."""
     smooth = problem.fit()
     width = TYPICAL_WIDTH * problem.task.nominal.length
-    fits = [problem.fit(smooth, LocalLoss(0.1, place, width)) for place in _likely_places(problem, smooth)]
-    fits += [] if near is None else [problem.fit(near, near.loss)]
-    return min(fits, key=lambda fit: fit.chi2)
+    starts = [(smooth, LocalLoss(0.1, place, width)) for place in _likely_places(problem, smooth)]
+    return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
+
+
+def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLoss | None]]) -> FittedStructure:
+    """The most likely of what searches from several starts find; one that ends at no structure is passed over."""
+    found, reason = [], None
+    for near, loss in starts:
+        try:
+            found.append(problem.fit(near, loss))
+        except ValueError as error:
+            reason = error
+    if not found:
+        raise ValueError(str(reason))
+    return min(found, key=lambda fit: fit.chi2)
 
 
 def _likely_places(problem: Problem, smooth: FittedStructure) -> list[float]:
