@@ -220,6 +220,11 @@ def test_bad_structures_are_refused(change, words):
         Beam(**arguments)
 
 
+def test_more_segments_than_can_be_solved_are_refused():
+    with pytest.raises(ValueError, match="at most 600"):
+        uniform("hinged", "free", attachments=tuple(PointMass(x, 1e-3) for x in np.linspace(0, 10, 700))).modes(2)
+
+
 def test_positions_outside_are_refused():
     with pytest.raises(ValueError, match="outside"):
         uniform("hinged", "hinged").modes(2).phi(10.5)

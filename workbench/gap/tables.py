@@ -1,5 +1,6 @@
 """Values out of the tables of a case file, each checked as it is taken."""
 
+import re
 import tomllib
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -10,6 +11,8 @@ import numpy as np
 
 MOST_BYTES = 2**24
 MOST_ENTRIES = 1000
+
+_DEEP_KEY = re.compile(r"(?<![\w\"'-])(?:[\w\"'-]++[ \t]*+\.[ \t]*+){100}")
 
 _REPR = Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = 60
@@ -31,7 +34,10 @@ def table_of(path: Path) -> dict:
         size = path.stat().st_size
         if size > MOST_BYTES:
             raise CaseError(f"{path} has {size} bytes; a case file has at most {MOST_BYTES}")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if _DEEP_KEY.search(text):  # the reader's cost grows with the square of a key's parts
+            raise CaseError(f"{path} cannot be read as TOML: a key of it has a hundred parts or more")
+        return tomllib.loads(text)
     except CaseError:
         raise
     except RecursionError:

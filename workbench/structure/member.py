@@ -16,6 +16,7 @@ from workbench.structure.supports import HELD, Attachment, End, PointDamper, Poi
 
 HIGHEST_DEGREE = 48
 MOST_FUNCTIONS = 2400
+MANY_SEGMENTS, MOST_SEGMENTS = 200, 600  # so many carry a mode at a low degree; more would take minutes and gigabytes
 THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
 NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or another stands there
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
@@ -73,7 +74,13 @@ class _Member:
             # a node at an attachment keeps its kink out of the polynomials
             if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
                 nodes = np.sort(np.r_[nodes, part.at])
-        degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / self.length)) + 12 + extra
+        if nodes.size > MOST_SEGMENTS:
+            raise ValueError(
+                f"the profiles and attachments of the structure make {nodes.size - 1} segments; at most"
+                f" {MOST_SEGMENTS} are solved: give fewer points, or a smooth function"
+            )
+        spare = 12 if nodes.size < MANY_SEGMENTS else 6
+        degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / self.length)) + spare + extra
         pieces = int(np.ceil(degree / HIGHEST_DEGREE))
         if pieces > 1:
             nodes = np.unique(np.concatenate([np.linspace(a, b, pieces + 1) for a, b in zip(nodes, nodes[1:])]))
