@@ -103,6 +103,8 @@ def find_loss(
         if lossy.explains:
             break
         again = _from_anywhere(task.problem(*(basis(n) for n in lossy.n_terms)), lossy)
+        if lossy.chi2 - again.chi2 < 1.0:
+            break  # nowhere a better one: noise of one measurement in a hundred, or something else than a loss
         lossy = choose(task, basis, *terms, partial(_near_either, again), near=again)
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
@@ -145,30 +147,45 @@ def _near_either(other: FittedStructure, problem: Problem, near: FittedStructure
 
 def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
     """The most likely structure with a loss, from the likeliest places and from what was found before."""
-    smooth = problem.fit()
     width = TYPICAL_WIDTH * problem.task.nominal.length
-    starts = [(smooth, LocalLoss(0.1, place, width)) for place in _likely_places(problem, smooth)]
+    starts = [
+        (whole, LocalLoss(0.1, place, width))
+        for whole in _without_loss(problem)
+        for place in _likely_places(problem, whole)
+    ]
     return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
+
+
+def _without_loss(problem: Problem) -> list[FittedStructure]:
+    """Where to look from: the nominal structure, and the most likely, which may have bent itself to imitate a loss."""
+    found = []
+    for whole in (problem.nominal, problem.fit):
+        try:
+            found.append(whole())
+        except ValueError:
+            continue
+    return found
 
 
 def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLoss | None]]) -> FittedStructure:
     """The most likely of what searches from several starts find; one that ends at no structure is passed over."""
-    found, reason = [], None
+    found, reason = [], "no structure of so many terms was found to look for a loss in; use fewer terms"
     for near, loss in starts:
         try:
             found.append(problem.fit(near, loss))
         except ValueError as error:
-            reason = error
+            reason = str(error)
     if not found:
-        raise ValueError(str(reason))
+        raise ValueError(reason)
     return min(found, key=lambda fit: fit.chi2)
 
 
 def _likely_places(problem: Problem, smooth: FittedStructure) -> list[float]:
-    """Where a loss would lower χ² most, the local peaks of `scan`."""
+    """Where a loss would lower χ² most, the local peaks of `scan`; none where it would nowhere."""
     places, gain = scan(problem, smooth)
     peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True])
-    return [float(places[i]) for i in sorted(peaks, key=lambda i: -gain[i])[:MOST_STARTS]]
+    likely = sorted(peaks[gain[peaks] > 0.0], key=lambda i: -gain[i])
+    return [float(places[i]) for i in likely[:MOST_STARTS]]
 
 
 def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndarray]:

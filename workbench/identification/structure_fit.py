@@ -204,7 +204,7 @@ def choose(
     exhaust: bool = True,
 ) -> FittedStructure:
     """The fit of least criterion, from the fewest terms up as long as one or two more of either lower it; of all
-    numbers, with `exhaust`, where that leaves modes unexplained. Each is searched from the best so far, or `near`."""
+    numbers, with `exhaust`, where that leaves modes unexplained. Each is searched from the best so far, `near` with it."""
     basis = basis or partial(Basis.legendre, length=task.nominal.length)
     tried: dict[tuple[int, int], FittedStructure | None] = {}
     best: FittedStructure | None = None
@@ -214,8 +214,11 @@ def choose(
             for j in range(at[1], min(at[1] + ahead, len(stiffness_terms))):
                 if (i, j) in tried:
                     continue
+                from_near = best is None or (near is not None and near.criterion < best.criterion)
                 try:
-                    tried[i, j] = fit(task.problem(basis(mass_terms[i]), basis(stiffness_terms[j])), best or near)
+                    tried[i, j] = fit(
+                        task.problem(basis(mass_terms[i]), basis(stiffness_terms[j])), near if from_near else best
+                    )
                 except ValueError as error:
                     tried[i, j], reason = None, str(error)
         good = {pair: found for pair, found in tried.items() if found is not None}
@@ -382,6 +385,10 @@ class Problem:
             lambda z: at(z)[0], z, lambda z: at(z)[1], bounds=(low, high), x_scale="jac", **tolerances
         )
         return self.report(found.x)
+
+    def nominal(self) -> FittedStructure:
+        """The nominal structure, scaled to the known values and the measured frequencies."""
+        return self.report(self._start())
 
     def parts(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, LocalLoss | None]:
         """d, e and the loss of free parameters."""
