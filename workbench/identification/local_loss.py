@@ -28,9 +28,10 @@ from workbench.structure.member import Bar, Beam
 
 FALSE_ALARM = 0.01
 N_PLACES = 60
-TYPICAL_WIDTH = 0.1  # of the length, in the first look along the structure
-MOST_STARTS, MOST_LOOKS = 4, 3
-FIRST_TERMS = 3
+TYPICAL_WIDTH = 0.1  # of the length
+WIDTHS = (0.05, 0.1, 0.2, 0.4)  # of the length: a search finds a loss from half and from twice its width, not from any
+MOST_STARTS, MOST_LOOKS = 2, 4  # of each width; after the first
+FIRST_TERMS, FEWER_TERMS = 3, 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +100,16 @@ def find_loss(
         raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
     first = _from_anywhere(task.problem(*(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
     lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
+    fewer = 0
     for _ in range(MOST_LOOKS):
-        if lossy.explains:
+        if lossy.explains or fewer >= max(lossy.n_terms):
             break
-        again = _from_anywhere(task.problem(*(basis(n) for n in lossy.n_terms)), lossy)
-        if lossy.chi2 - again.chi2 < 1.0:
-            break  # nowhere a better one: noise of one measurement in a hundred, or something else than a loss
-        lossy = choose(task, basis, *terms, partial(_near_either, again), near=again)
+        at_least = (max(n - fewer, few[0]) for n, few in zip(lossy.n_terms, terms, strict=True))
+        again = _from_anywhere(task.problem(*(basis(n) for n in at_least)), lossy)
+        if again.criterion < lossy.criterion - 1.0:
+            lossy, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
+        else:
+            fewer += FEWER_TERMS  # many terms imitate a loss so well that few starts lead to it
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
     smooth = _smooth(task, basis, terms, lossy, limit)
@@ -147,12 +151,7 @@ def _near_either(other: FittedStructure, problem: Problem, near: FittedStructure
 
 def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
     """The most likely structure with a loss, from the likeliest places and from what was found before."""
-    width = TYPICAL_WIDTH * problem.task.nominal.length
-    starts = [
-        (whole, LocalLoss(0.1, place, width))
-        for whole in _without_loss(problem)
-        for place in _likely_places(problem, whole)
-    ]
+    starts = [(whole, loss) for whole in _without_loss(problem) for loss in _likely_losses(problem, whole)]
     return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
 
 
@@ -180,16 +179,21 @@ def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLo
     return min(found, key=lambda fit: fit.chi2)
 
 
-def _likely_places(problem: Problem, smooth: FittedStructure) -> list[float]:
-    """Where a loss would lower χ² most, the local peaks of `scan`; none where it would nowhere."""
-    places, gain = scan(problem, smooth)
-    peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True])
-    likely = sorted(peaks[gain[peaks] > 0.0], key=lambda i: -gain[i])
-    return [float(places[i]) for i in likely[:MOST_STARTS]]
+def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
+    """Those that would lower χ² most, of each width the local peaks of `scan`; none where none would."""
+    length = problem.task.nominal.length
+    places, all_gains = scan(problem, whole)
+    likely = []
+    for width, gain in zip(WIDTHS, all_gains, strict=True):
+        peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
+        best = sorted(peaks, key=lambda i: -gain[i])[:MOST_STARTS]
+        likely += [LocalLoss(0.1, float(places[i]), width * length) for i in best]
+    return likely
 
 
 def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
-    """Places along the structure and what a small loss there would lower χ² by, to first order, (n_places,) each."""
+    """Places along the structure (n_places,) and what a small loss of each of `WIDTHS` there would lower χ² by, to
+    first order, (n_widths, n_places)."""
     task, series = problem.task, problem.series
     length = task.nominal.length
     places = (np.arange(N_PLACES) + 0.5) / N_PLACES * length
@@ -197,7 +201,7 @@ def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndar
 
     def with_losses(x: np.ndarray) -> np.ndarray:
         own = series.stiffness.functions(x)
-        near = np.maximum(1.0 - np.abs(x[:, None] - places) / (0.5 * TYPICAL_WIDTH * length), 0.0)
+        near = np.maximum(1.0 - np.abs(x[:, None] - places) * N_PLACES / length, 0.0)
         return np.hstack([own, -(1.0 + own @ e)[:, None] * near])
 
     breaks = tuple(np.linspace(0.0, length, 11))
@@ -210,6 +214,10 @@ def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndar
     missed, slopes = trial.misses(np.r_[problem.free_of(d, e), np.zeros(N_PLACES)])
     # what the smooth series cannot make good
     own = np.linalg.qr(slopes[:, :-N_PLACES])[0]
-    losses = slopes[:, -N_PLACES:] - own @ (own.T @ slopes[:, -N_PLACES:])
-    along = -losses.T @ missed
-    return places, np.maximum(along, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300)
+    narrow = slopes[:, -N_PLACES:] - own @ (own.T @ slopes[:, -N_PLACES:])
+    apart = np.abs(places[:, None] - places) / length
+    gains = []
+    for width in WIDTHS:
+        losses = narrow @ (apart < 0.5 * width)
+        gains.append(np.maximum(-losses.T @ missed, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
+    return places, np.array(gains)

@@ -204,7 +204,7 @@ def choose(
     exhaust: bool = True,
 ) -> FittedStructure:
     """The fit of least criterion, from the fewest terms up as long as one or two more of either lower it; of all
-    numbers, with `exhaust`, where that leaves modes unexplained. Each is searched from the best so far, `near` with it."""
+    numbers, with `exhaust`, where that leaves modes unexplained. Each is searched from the best so far, `near` too."""
     basis = basis or partial(Basis.legendre, length=task.nominal.length)
     tried: dict[tuple[int, int], FittedStructure | None] = {}
     best: FittedStructure | None = None
