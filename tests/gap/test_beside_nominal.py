@@ -7,32 +7,19 @@ import pytest
 
 from workbench.gap.beside_nominal import figures
 from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.effect import apply_all
 from workbench.gap.fit import cost_of, fit, sensitivity
 from workbench.gap.prediction import FitData
-from workbench.records.record import Channel, Record
-from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 NOISE = 1e-5
 FREQUENCIES, DAMPING = np.array([1.004, 0.997, 1.006, 0.995]), np.array([1.1, 0.95, 1.08, 0.9])
 
 
-def nominal() -> Rig:
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
-    sensors = tuple(Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6)))
-    return Rig(beam.modes(4), (Actuator("F", 0.45),), sensors, structure=beam)
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(n_modes=4)
 
 
 def off(rig: Rig) -> Rig:
@@ -43,30 +30,25 @@ def off(rig: Rig) -> Rig:
     return replace(rig, modes=changed)
 
 
-def measured(real: Rig, name: str, level: float, seed: int) -> Record:
-    rng = np.random.default_rng(seed)
-    force = np.repeat(level * rng.normal(size=200), 5)[None]
-    outputs = simulate(real, force, sample_time=0.01, substeps=8).outputs
-    return Record(
-        sample_time=0.01,
-        outputs=outputs + NOISE * rng.normal(size=outputs.shape),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in real.sensors),
-        inputs=force,
-        input_channels=(Channel("F", "force", at=0.45),),
-        name=name,
-    )
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real, name, level, seed):
+        rng = np.random.default_rng(seed)
+        return record_of(real, np.repeat(level * rng.normal(size=200), 5)[None], rng, name=name, substeps=8)
+
+    return make
 
 
-def records(real: Rig) -> list[Record]:
-    return [measured(real, name, level, seed) for seed, (name, level) in enumerate((("low", 0.1), ("high", 1.0)))]
+@pytest.fixture(scope="module")
+def records(measured):
+    return lambda real: [measured(real, "low", 0.1, 0), measured(real, "high", 1.0, 1)]
 
 
-def test_residual_gives_way_to_figures_as_a_fit_of_them_would():
+def test_residual_gives_way_to_figures_as_a_fit_of_them_would(rig, records):
     """To first order the projected cost is what least squares over the figures, with their beliefs, leaves."""
-    rig = nominal()
     data = FitData(tuple(records(off(rig))), np.full(4, NOISE))
     freed = fit(rig, (figures(rig),), data).effects
-    jacobian, residual = sensitivity(rig, freed, data)
+    jacobian, residual = sensitivity(rig, freed, data), data.residual(apply_all(rig, freed))
     projected = data.giving_way(jacobian)
     k = jacobian.shape[1]
     stacked = np.linalg.lstsq(np.r_[jacobian, np.eye(k)], np.r_[residual, np.zeros(k)], rcond=None)[0]
@@ -78,8 +60,8 @@ def test_residual_gives_way_to_figures_as_a_fit_of_them_would():
     assert cost_of(rig, moved, data) > 20.0 > 2.0 > cost_of(rig, moved, projected)
 
 
-def test_figures_a_little_off_are_told_as_such():
-    verdict = diagnose(nominal(), records(off(nominal())), free_nominal=True)
+def test_figures_a_little_off_are_told_as_such(rig, records):
+    verdict = diagnose(rig, records(off(rig)), free_nominal=True)
     assert verdict.outcome == "explained" and [e.kind.name for e in verdict.effects] == ["nominal_figures"]
     found = verdict.nominal_figures
     np.testing.assert_allclose([found[f"frequency_{r}"] for r in (1, 2, 3)], FREQUENCIES[:3], atol=2e-4)
@@ -87,12 +69,12 @@ def test_figures_a_little_off_are_told_as_such():
     assert "frequencies -0.5 to 0.6 %" in verdict.sentence
 
 
-def test_friction_beside_figures_a_little_off():
+def test_friction_beside_figures_a_little_off(rig, measured, records):
     """Freed before it is known, the damping ratios would take the friction for theirs."""
     truth = CoulombFriction(1.37, 0.004, 1e-3)
-    real = off(replace(nominal(), elements=(truth,)))
+    real = off(replace(rig, elements=(truth,)))
     held_out = [measured(real, "held out", 0.6, 9)]
-    verdict = diagnose(nominal(), records(real), validation=held_out, free_nominal=True)
+    verdict = diagnose(rig, records(real), validation=held_out, free_nominal=True)
     named = {e.kind.name: e for e in verdict.effects}
     assert verdict.outcome == "explained" and set(named) == {"coulomb_friction", "nominal_figures"}
     friction = named["coulomb_friction"].values

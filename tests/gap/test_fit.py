@@ -13,50 +13,30 @@ from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import cost_of, fit
 from workbench.gap.prediction import FitData
 from workbench.gap.shrinkage import Shrinkage
-from workbench.records.record import Channel, Record
-from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
-from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 NOISE, DT = 1e-5, 0.01
 CUBIC, SPRING, LOSS = (kind_named(n) for n in ("cubic_spring", "ground_spring", "local_stiffness_loss"))
 
 
 @pytest.fixture(scope="module")
-def rig():
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
-    sensors = [Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
-    return Rig(beam.modes(6), (Actuator("F", 0.45),), sensors, structure=beam)
+def rig(hinged_rig):
+    return hinged_rig()
 
 
-def measured(rig, real):
-    rng = np.random.default_rng(3)
-    command = np.repeat(rng.normal(size=100), 10)[None]
-    clean = simulate(real, command, sample_time=DT, substeps=8).outputs
-    record = Record(
-        sample_time=DT,
-        outputs=clean + NOISE * rng.normal(size=clean.shape),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=command,
-        input_channels=(Channel("F", "force", at=0.45),),
-    )
-    return FitData((record,), np.full(4, NOISE))
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real):
+        rng = np.random.default_rng(3)
+        command = np.repeat(rng.normal(size=100), 10)[None]
+        return FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
+
+    return make
 
 
-def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(rig):
+def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(rig, measured):
     real = replace(rig, elements=(CubicSpring(0.2, 400.0),))
-    data = measured(rig, real)
+    data = measured(real)
     nominal = cost_of(rig, (), data)
     # where the beam moves half as much a spring must be sixteen times as hard
     found = fit(rig, (Effect(CUBIC, None, {"at": 0.1, "stiffness": 16 * 400.0}),), data, iterations=20)

@@ -8,51 +8,31 @@ import pytest
 from workbench.gap.evidence import Evidence
 from workbench.gap.locate import locate
 from workbench.gap.prediction import FitData
-from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction, PeriodicForce
-from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 DT, SAMPLES, NOISE = 0.01, 2000, 1e-5
 
 
 @pytest.fixture(scope="module")
-def rig():
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
-    sensors = [Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
-    return Rig(beam.modes(6), (Actuator("F", 0.45),), sensors, structure=beam)
+def rig(hinged_rig):
+    return hinged_rig()
 
 
-def measured(real, name, level, seed):
-    rng = np.random.default_rng(seed)
-    command = np.repeat(level * rng.normal(size=SAMPLES // 10), 10)[None]
-    clean = simulate(real, command, sample_time=DT).outputs
-    return Record(
-        sample_time=DT,
-        outputs=clean + NOISE * rng.normal(size=clean.shape),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in real.sensors),
-        inputs=command,
-        input_channels=(Channel("F", "force", at=0.45),),
-        name=name,
-    )
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real, name, level, seed):
+        rng = np.random.default_rng(seed)
+        return record_of(real, np.repeat(level * rng.normal(size=SAMPLES // 10), 10)[None], rng, name=name)
+
+    return make
 
 
 def where(rig, records):
     return locate(Evidence.of(rig, FitData(tuple(records), np.full(4, NOISE))), ())
 
 
-def test_a_tone_on_one_sensor_late_in_one_record(rig):
+def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
     quiet, loud = measured(rig, "quiet", 0.1, 0), measured(rig, "loud", 1.0, 1)
     tone = 0.05 * loud.outputs[2].std() * np.sin(2 * np.pi * 20.0 * loud.time) * (loud.time > 7 / 8 * loud.time[-1])
     loud = replace(loud, outputs=loud.outputs + np.array([[0.0], [0.0], [1.0], [0.0]]) * tone)
@@ -66,7 +46,7 @@ def test_a_tone_on_one_sensor_late_in_one_record(rig):
     assert found.record_gaps[1] > 10 * NOISE / loud.outputs.std()
 
 
-def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig):
+def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig, measured):
     frequency = 1.1 * rig.modes.frequencies_hz[1]
     real = replace(rig, elements=(PeriodicForce(1.37, frequency, 0.05, 0.3),))
     found = where(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
@@ -76,7 +56,7 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     assert found.path == "structure" and found.linear_share < 0.1
 
 
-def test_no_gap_has_no_path(rig):
+def test_no_gap_has_no_path(rig, measured):
     found = where(rig, [measured(rig, "a", 0.3, 4)])
     assert found.path == "none"
 
@@ -89,7 +69,7 @@ def test_no_gap_has_no_path(rig):
         ({"elements": (CoulombFriction(0.9, 0.05, 0.005),)}, 0.0, 0.6),
     ],
 )
-def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed, low, high):
+def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed, low, high, measured):
     real = replace(rig, **changed)
     found = where(rig, [measured(real, f"{level}", level, seed) for seed, level in enumerate((0.1, 0.3, 1.0))])
     assert low <= found.linear_share <= high

@@ -7,44 +7,21 @@ from workbench.gap.check import readiness
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Kind
 from workbench.gap.prediction import FitData
-from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
-from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 NOISE = 1e-5
 
 
 @pytest.fixture(scope="module")
-def rig():
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
-    sensors = [Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
-    return Rig(beam.modes(6), (Actuator("F1", 0.45), Actuator("F2", 1.35)), sensors, structure=beam)
+def rig(hinged_rig):
+    return hinged_rig(actuators=(Actuator("F1", 0.45), Actuator("F2", 1.35)))
 
 
 @pytest.fixture(scope="module")
-def data(rig):
+def data(rig, record_of):
     rng = np.random.default_rng(5)
     commands = np.vstack([np.repeat(0.3 * rng.normal(size=100), 10), np.zeros(1000)])
-    clean = simulate(rig, commands, sample_time=0.01).outputs
-    record = Record(
-        sample_time=0.01,
-        outputs=clean + NOISE * rng.normal(size=clean.shape),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=commands,
-        input_channels=tuple(Channel(a.name, "force", at=a.at) for a in rig.actuators),
-    )
-    return FitData((record,), np.full(4, NOISE))
+    return FitData((record_of(rig, commands, rng),), np.full(4, NOISE))
 
 
 def test_only_the_actuator_at_rest_hides_its_faults(rig, data):

@@ -105,17 +105,17 @@ class _Problem:
         return np.array(columns).T
 
 
-def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> tuple[np.ndarray, np.ndarray]:
-    """How the residual moves with each parameter of believed effects, (n_values, n_parameters), in units of its belief.
+def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray:
+    """How the residual moves with each number of believed effects, (n_values, n_numbers), in units of its belief.
 
-    The second is the residual that their values leave.
+    Raises:
+        ValueError: the rig cannot be simulated with these effects.
     """
     problem = _Problem(rig, effects, data)
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    jacobian = problem.jacobian(problem.start, residual)[: data.n_values]
-    return jacobian * problem.prior_std, residual[: data.n_values]
+    return problem.jacobian(problem.start, residual)[: data.n_values] * problem.prior_std
 
 
 def fit(

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from workbench.gap.effects.structural import known_places
 from workbench.gap.evidence import Evidence
 from workbench.gap.missing_force import ForceFilter, log_likelihoods, wandering_force_filter
 
@@ -42,7 +43,7 @@ def placed(evidence: Evidence) -> Placed:
     places = evidence.places
     profile = np.array([_likelihood(evidence, x, size) for x in places])
     best = int(np.argmax(profile))
-    if getattr(evidence.rig.modes.shapes, "places", None) is not None:
+    if known_places(evidence.rig) is not None:
         return Placed(places, profile, float(places[best]), 0.0, float(profile[best]))
     spacing = places[1] - places[0]
     refined = minimize_scalar(

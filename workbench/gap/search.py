@@ -79,7 +79,7 @@ class Search:
         """The same search beside believed figures, which give way to every candidate to first order."""
 
         def giving_way(data: FitData) -> FitData:
-            return data.giving_way(sensitivity(self.rig, (figures,), data)[0])
+            return data.giving_way(sensitivity(self.rig, (figures,), data))
 
         data, quick, first = self.pool.map(giving_way, (self.data, self.quick, self.first))
         return replace(self, data=data, quick=quick, first=first, held=(figures,))

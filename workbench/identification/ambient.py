@@ -17,9 +17,10 @@ import numpy as np
 from scipy.stats import t as student
 
 from workbench.identification.ibrahim import normalised_shapes, stacked_delays
-from workbench.identification.identified import MOST_DAMPED
+from workbench.identification.identified import MOST_DAMPED, SAME_SHAPE
 from workbench.identification.refinement import Refined, refine
 from workbench.identification.stabilisation import real_modes, stabilise
+from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen, mac
@@ -32,11 +33,10 @@ ABOVE_ERRORS = 4.0
 LEAST_LAGS = 64
 # Relative standard error of a frequency up to which a mode counts as found.
 LEAST_SURE = 0.01
-SAME_SHAPE = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class AmbientModes:
+class AmbientModes(StandardErrors):
     """Modes of a driven structure, and how far each figure is to be trusted.
 
     Attributes:
@@ -51,22 +51,9 @@ class AmbientModes:
     n_blocks: int
     decays: tuple[Record, ...]
 
-    @property
-    def omega_std(self) -> np.ndarray:
-        """Standard error of each frequency (n_modes,), rad/s."""
-        return np.sqrt(np.diag(self.covariance)[: self.modes.n_modes])
-
-    @property
-    def zeta_std(self) -> np.ndarray:
-        """Standard error of each damping ratio (n_modes,)."""
-        return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
-
     def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
         """Confidence intervals of ω and of ζ, (2, n_modes) each, by Student's t of n_blocks - 1."""
-        width = float(student.ppf(0.5 * (1.0 + level), self.n_blocks - 1))
-        both = ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
-        omega, zeta = (np.stack([value - width * std, value + width * std]) for value, std in both)
-        return omega, zeta
+        return self._within(float(student.ppf(0.5 * (1.0 + level), self.n_blocks - 1)))
 
 
 def ambient_decays(

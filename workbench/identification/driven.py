@@ -32,6 +32,7 @@ from workbench.identification.modal_fit import (
     moves,
     tell,
 )
+from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
@@ -44,7 +45,7 @@ PEAKS_A_RATE = 12
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class Driven(StandardErrors):
     """Modes with what drives them: H(s) = D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate].
 
     Attributes:
@@ -78,16 +79,6 @@ class Driven:
     converged: bool
     output_channels: tuple[Channel, ...] = field(repr=False)
     input_channels: tuple[Channel, ...] = field(repr=False)
-
-    @property
-    def omega_std(self) -> np.ndarray:
-        """Standard error of each frequency (n_modes,), rad/s."""
-        return np.sqrt(np.diag(self.covariance)[: self.modes.n_modes])
-
-    @property
-    def zeta_std(self) -> np.ndarray:
-        """Standard error of each damping ratio (n_modes,)."""
-        return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
 
     @property
     def residues(self) -> np.ndarray:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from workbench.identification.driven import pole_covariance
 from workbench.identification.ibrahim import normalised_shapes
 from workbench.identification.modal_fit import FALSE_ALARM, MOST_DAMPED, errors, tell
+from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Channel
 from workbench.structure.modes import SampledModes, frozen
@@ -22,7 +23,7 @@ MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
 
 
 @dataclass(frozen=True, eq=False)
-class TransferModes:
+class TransferModes(StandardErrors):
     """Modes of transfer functions.
 
     Attributes:
@@ -47,16 +48,6 @@ class TransferModes:
     converged: bool
     fitted: np.ndarray = field(repr=False)
     frequencies_hz: np.ndarray = field(repr=False)
-
-    @property
-    def omega_std(self) -> np.ndarray:
-        """Standard error of each frequency (n_modes,), rad/s."""
-        return np.sqrt(np.diag(self.covariance)[: self.modes.n_modes])
-
-    @property
-    def zeta_std(self) -> np.ndarray:
-        """Standard error of each damping ratio (n_modes,)."""
-        return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
 
 
 def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:

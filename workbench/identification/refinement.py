@@ -19,6 +19,7 @@ from scipy.special import ndtri
 
 from workbench.identification.ibrahim import check_alike, normalised_shapes
 from workbench.identification.projection import Projection, project
+from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
@@ -30,7 +31,7 @@ ROUND_OFF = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
-class Refined:
+class Refined(StandardErrors):
     """Most likely modes of a record, and how far each figure is to be trusted.
 
     Attributes:
@@ -53,28 +54,13 @@ class Refined:
     steps: int
 
     @property
-    def omega_std(self) -> np.ndarray:
-        """Standard error of each frequency (n_modes,), rad/s."""
-        return np.sqrt(np.diag(self.covariance)[: self.modes.n_modes])
-
-    @property
-    def zeta_std(self) -> np.ndarray:
-        """Standard error of each damping ratio (n_modes,)."""
-        return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
-
-    @property
     def shape_std(self) -> np.ndarray:
         """Standard error of the real part of each shape (n_outputs, n_modes)."""
         return np.sqrt(np.einsum("rjj->jr", self.shape_covariance))
 
     def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
         """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row."""
-        width = float(ndtri(0.5 * (1.0 + level)))
-        omega, zeta = (
-            np.stack([value - width * std, value + width * std])
-            for value, std in ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
-        )
-        return omega, zeta
+        return self._within(float(ndtri(0.5 * (1.0 + level))))
 
 
 def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: bool = False) -> Refined:
