@@ -70,7 +70,8 @@ def amplitude_dependence(
     if stretches < 2:
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
     records = [records] if isinstance(records, Record) else records
-    told = [_stretches(r, refined, np.abs(a), stretches) for r, a in zip(records, refined.amplitudes, strict=True)]
+    each = zip(records, refined.amplitudes, refined.noise, strict=True)
+    told = [_stretches(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
     start = np.concatenate([each[0] for each in told])
     amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in told]))
     alike = np.stack([_alike(omega, omega_std), _alike(zeta, zeta_std)])
@@ -80,7 +81,9 @@ def amplitude_dependence(
     )
 
 
-def _stretches(record: Record, refined: Refined, size: np.ndarray, stretches: int) -> tuple[np.ndarray, np.ndarray]:
+def _stretches(
+    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Starts (n_stretches,), and (5, n_stretches, n_modes) of amplitude, ω and its error, ζ and its error."""
     modes = refined.modes
     edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
@@ -90,7 +93,7 @@ def _stretches(record: Record, refined: Refined, size: np.ndarray, stretches: in
         begun = size * np.exp(-decay * first * record.sample_time)
         # Mean over the stretch of the squared envelope.
         mean = begun**2 * _mean_of_decay(2.0 * decay * span)
-        evidence = (0.5 * (last - first) * mean / refined.noise_std[:, None] ** 2).sum(axis=0)
+        evidence = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
         there = np.flatnonzero(evidence > LEAST_EVIDENCE)
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue

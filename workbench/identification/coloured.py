@@ -7,9 +7,9 @@ A mode listens to noise within its own band only. Where output j has noise of sp
 white noise s_j² has the covariance H^-1 (Σ_j J_j^T S_j J_j) H^-1 (White, Econometrica 48, 1980), and each column of J
 lives where its mode does, so that
 
-    κ_jr = S_j(ω_r) / s_j²,   κ_r = Σ_j κ_jr |a_jr|² / s_j² / Σ_j |a_jr|² / s_j²
+    J_j^T S_j J_j  ≈  κ_jr^½ κ_js^½ (J_jr^T J_js),     κ_jr = S_j(ω_r) / s_j²,
 
-are the factors of its variances. Where nothing speaks against white noise they are one: the Cramér-Rao bound.
+for modes r and s. Where nothing speaks against white noise κ is one: the Cramér-Rao bound.
 """
 
 from collections.abc import Sequence
@@ -19,11 +19,9 @@ import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
-from workbench.identification.projection import Projection, project
-from workbench.identification.refinement import Refined
-from workbench.identification.synthesis import time_derivatives
+from workbench.identification.projection import project
+from workbench.identification.refinement import Refined, as_refined
 from workbench.records.record import Record
-from workbench.structure.modes import frozen
 
 # Chance that white noise is taken for coloured, and the least number of bins over which a spectrum is averaged.
 FALSE_ALARM, LEAST_BINS = 1e-3, 6
@@ -43,21 +41,16 @@ def in_its_noise(refined: Refined, records: Record | Sequence[Record], *, offset
     """
     records = [records] if isinstance(records, Record) else list(records)
     fits = [project(record, refined.modes.poles, offset) for record in records]
-    factors = [
-        noise_near(refined.modes.poles, fit.residual / refined.noise_std, record.sample_time)
-        for record, fit in zip(records, fits, strict=True)
-    ]
-    if all((each == 1.0).all() for each in factors):
-        return refined
-    told = np.array([(np.abs(a) / refined.noise_std[:, None]) ** 2 for a in refined.amplitudes])
-    near_pole = (told * factors).sum(axis=(0, 1)) / told.sum(axis=(0, 1))
-    wider = np.sqrt(np.r_[near_pole, near_pole])
-    loudest = int(np.argmax([(fit.coefficients**2).sum() for fit in fits]))
-    return replace(
-        refined,
-        covariance=frozen(refined.covariance * np.outer(wider, wider)),
-        shape_covariance=frozen(_shapes(refined, fits[loudest], records[loudest], near_pole, factors[loudest])),
+    factors = np.array(
+        [
+            noise_near(refined.modes.poles, fit.residual / noise, record.sample_time)
+            for record, fit, noise in zip(records, fits, refined.noise, strict=True)
+        ]
     )
+    if (factors == 1.0).all():
+        return refined
+    found = records, refined.modes.poles, fits, refined.noise
+    return as_refined(*found, converged=refined.converged, steps=refined.steps, heard=factors)
 
 
 def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = True) -> list[Record] | None:
@@ -77,7 +70,9 @@ def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = Tru
     if order == 0 or rounding or all(_white(power, poles.size).all() for power in powers):
         return None
     filters = []
-    for row in zip(*left, strict=True):
+    for rows in zip(*left, strict=True):
+        # Records of one colour may differ in loudness.
+        row = [each * np.sqrt(each.size) / max(float(np.linalg.norm(each)), 1e-300) for each in rows]
         lags = [sum(float(each[k:] @ each[: each.size - k]) for each in row) for k in range(order + 1)]
         filters.append(np.r_[1.0, -solve_toeplitz(lags[:-1], lags[1:])] if lags[0] > 0 else np.r_[1.0, np.zeros(order)])
     return [
@@ -126,27 +121,3 @@ def _white(power: np.ndarray, n_modes: int) -> np.ndarray:
     apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
     # What the modes took out of their bins makes no colour.
     return apart < np.sqrt(0.5 * np.log(2.0 * m / FALSE_ALARM) / bins) + (n_modes + 1) / bins
-
-
-def _shapes(refined: Refined, fit: Projection, record: Record, near_pole: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Covariance of the shapes: what they have of the poles' errors by κ_r, of each output's noise by κ_jr."""
-    n, derivative = refined.modes.n_modes, time_derivatives(record.output_channels)
-    found = np.zeros_like(refined.shape_covariance)
-    for r, pole in enumerate(refined.modes.poles):
-        seen = fit.complex_amplitudes[:, r] / pole**derivative
-        k = int(np.argmax(np.abs(seen)))
-        # What an output's own amplitude, and that of the reference, do to the real part of a shape.
-        alone = 1.0 / (pole**derivative * seen[k])
-        shared = alone[k] * seen / seen[k]
-        spread = fit.spread[np.ix_([r, n + r], [r, n + r])]
-        white, own = (_own(alone, shared, k, spread, refined.noise_std**2 * by) for by in (1.0, near[:, r]))
-        found[r] = near_pole[r] * (refined.shape_covariance[r] - white) + own
-    return found
-
-
-def _own(alone: np.ndarray, shared: np.ndarray, k: int, spread: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Covariance of Re(alone_j a_j - shared_j a_k), (n_outputs, n_outputs), poles held."""
-    a, s = (np.column_stack([c.real, c.imag]) for c in (alone, shared))
-    whole = np.diag(variance * np.einsum("ja,ab,jb->j", a, spread, a)) + variance[k] * s @ spread @ s.T
-    whole[k], whole[:, k] = 0.0, 0.0
-    return whole

@@ -32,6 +32,7 @@ from workbench.identification.modal_fit import (
     moves,
     tell,
 )
+from workbench.identification.noise_levels import differ, variances
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
@@ -42,6 +43,8 @@ TERMS = 40
 SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
 BESIDE = 50
 PEAKS_A_RATE = 12
+# Where one record is noisier than another, what hid in its noise shows once it counts less.
+REWEIGHTED = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +61,7 @@ class Driven(StandardErrors):
         feedthrough: (n_outputs, n_inputs) D: what an acceleration feels at once, and the modes above those found.
         feedthrough_std: (n_outputs, n_inputs).
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
-        noise_std: (n_outputs,) of what the modes leave, in the unit of each output.
+        noise: (n_records, n_outputs) standard deviation of what the modes leave, in the unit of each output.
         evidence: (n_modes,) χ² of each mode in the noise.
         limit: what a mode fitted to noise alone exceeds with the chance of a false alarm.
         converged: whether the search ended because the step was small.
@@ -73,12 +76,17 @@ class Driven(StandardErrors):
     feedthrough: np.ndarray = field(repr=False)
     feedthrough_std: np.ndarray = field(repr=False)
     initial: tuple[np.ndarray, ...] = field(repr=False)
-    noise_std: np.ndarray
+    noise: np.ndarray
     evidence: np.ndarray
     limit: float
     converged: bool
     output_channels: tuple[Channel, ...] = field(repr=False)
     input_channels: tuple[Channel, ...] = field(repr=False)
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Of each output (n_outputs,), root mean square over the records."""
+        return np.sqrt((self.noise**2).mean(axis=0))
 
     @property
     def residues(self) -> np.ndarray:
@@ -159,7 +167,12 @@ def identify_driven(
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    told = tell(drive, most_modes=min(most_modes, (rows - columns) // 6), false_alarm=false_alarm)
+    how = {"most_modes": min(most_modes, (rows - columns) // 6), "false_alarm": false_alarm}
+    told = tell(drive, **how)
+    for _ in range(REWEIGHTED):
+        if not drive.reweighted(told.fit):
+            break
+        told = tell(drive, **how)
     if told.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
@@ -220,6 +233,30 @@ class _Inputs:
         fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
         self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
         self.cells = self.rates.size * max(lengths)
+
+    def noise(self, fit: Fit) -> np.ndarray:
+        """Standard deviation of what is left of each output in each record, (n_records, n_outputs)."""
+        weights = 1.0 if self.weights is None else np.array([self.weights[rows.start] for rows in self.rows])
+        return np.sqrt(variances(*self._left(fit))) / weights
+
+    def reweighted(self, fit: Fit) -> bool:
+        """Count each record by its noise; whether that changed anything."""
+        squares, free = self._left(fit)
+        if not differ(squares, free).any():
+            return False
+        raw = self.values if self.weights is None else self.values / self.weights
+        weights = np.repeat(1.0 / self.noise(fit), [rows.stop - rows.start for rows in self.rows], axis=0)
+        self.weights = weights / np.sqrt((weights**2).mean(axis=0))
+        self.values = self.weights * raw
+        return True
+
+    def _left(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Squares of what is left, records counted as they are, and their degrees of freedom."""
+        length = np.array([rows.stop - rows.start for rows in self.rows])
+        squares = np.array([(fit.residual[rows] ** 2).sum(axis=0) for rows in self.rows])
+        lost = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
+        floor = 1e-28 * squares.max() + 1e-300
+        return np.maximum(squares, floor), np.maximum(length * (1.0 - lost / length.sum()), 1.0)
 
     def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         x = np.zeros((self.values.shape[0], self.n_drives), complex)
@@ -348,7 +385,7 @@ def _report(records: Sequence[Record], drive: _Inputs, told: Told) -> Driven:
         initial=tuple(
             frozen(np.zeros(n) if drive.at_rest else loads[:, n_inputs + k], complex) for k in range(len(records))
         ),
-        noise_std=frozen(fit.noise),
+        noise=frozen(drive.noise(fit)),
         evidence=frozen(told.evidence),
         limit=told.limit,
         converged=fit.converged,

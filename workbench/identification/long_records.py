@@ -89,7 +89,7 @@ class _Peeled:
         # Swings as they stood out, of the modes and of what was refused.
         self.origins = np.zeros(0, complex)
         self.refused: list[tuple[complex, float]] = []
-        self.weights = np.ones(records[0].n_outputs)
+        self.weights = np.ones((len(records), records[0].n_outputs))
         self.fine = np.zeros(1)
         self.settle(np.zeros(0, complex), 0)
 
@@ -107,7 +107,7 @@ class _Peeled:
         else:
             fits = [_nothing(record) for record in self.records]
         self.poles, self.fits = poles, fits
-        self.noise = np.maximum(noise_level(self.records, fits), self.floor)
+        self.noise = np.maximum(noise_level(self.records, fits, self.weights), self.floor)
         self.weights = 1.0 / self.noise
 
     def peaks(self) -> np.ndarray:
@@ -149,17 +149,17 @@ class _Peeled:
     @property
     def _shapes(self) -> np.ndarray:
         """Amplitudes over the noise, (n_signals, n_modes), of one record below the other."""
-        return np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in self.fits])
+        return np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(self.fits, self.weights, strict=True)])
 
     def evidence(self) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
-        return np.array([self._strength(r, np.zeros((self.weights.size, 0))) for r in range(self.poles.size)])
+        return np.array([self._strength(r, np.zeros((self.weights.shape[1], 0))) for r in range(self.poles.size)])
 
     def _strength(self, r: int, without: np.ndarray) -> float:
         """χ² of the amplitudes of mode r, less what lies along some directions (n_outputs, n_directions)."""
         strength, both = 0.0, [r, self.poles.size + r]
-        for fit in self.fits:
-            a = fit.coefficients[both] * self.weights
+        for fit, weights in zip(self.fits, self.weights, strict=True):
+            a = fit.coefficients[both] * weights
             a = a - (a @ without) @ without.T
             strength += float((a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)).sum())
         return strength
@@ -187,11 +187,11 @@ class _Peeled:
         """χ² of the swings of one rate at every frequency of its transform, as if no mode stood near."""
         lives, size = self._size(rate)
         found = np.zeros(size // 2 + 1, np.float32)
-        for fit in self.fits:
+        for fit, weights in zip(self.fits, self.weights, strict=True):
             n = min(lives, len(fit.residual))
             decay = np.exp(-rate * self.dt * np.arange(n))
-            scale = np.sqrt(2.0 / np.sum(decay**2)) * self.weights
-            for first in range(0, self.weights.size, AT_ONCE):
+            scale = np.sqrt(2.0 / np.sum(decay**2)) * weights
+            for first in range(0, weights.size, AT_ONCE):
                 some = slice(first, first + AT_ONCE)
                 left = (fit.residual[:n, some] * scale[some]).T.astype(np.float32) * decay.astype(np.float32)
                 spectrum = rfft(left, size, axis=1, workers=os.cpu_count())
@@ -258,12 +258,12 @@ class _Peeled:
         shapes = np.hstack(np.split(self._shapes[:, near], len(self.fits)))
         directions = np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]
         seen, channels = [], self.records[0].output_channels[: directions.shape[1]]
-        for record, fit in zip(self.records, self.fits, strict=True):
-            left = (fit.residual * self.weights) @ directions
-            a = directions.T @ (fit.complex_amplitudes[:, near] * self.weights[:, None])
+        for record, fit, weights in zip(self.records, self.fits, self.weights, strict=True):
+            left = (fit.residual * weights) @ directions
+            a = directions.T @ (fit.complex_amplitudes[:, near] * weights[:, None])
             own = (a @ np.exp(np.outer(self.poles[near], self.dt * np.arange(record.n_samples)))).real
             seen.append(replace(record, outputs=left.T + own, output_channels=channels))
-        alone = np.ones(directions.shape[1])
+        alone = np.ones((len(seen), directions.shape[1]))
         _, with_it, *_ = search(seen, self.poles[near], alone, False, 12)
         _, without, *_ = search(seen, self.poles[near[near != r]], alone, False, 12)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))

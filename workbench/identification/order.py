@@ -22,6 +22,7 @@ from workbench.identification.coloured import in_its_noise, whitened
 from workbench.identification.ibrahim import check_alike
 from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
 from workbench.identification.long_records import identify_long
+from workbench.identification.noise_levels import differ, variances
 from workbench.identification.projection import project
 from workbench.identification.refinement import MOST_STEPS, refine, search
 from workbench.records.record import Record
@@ -161,7 +162,7 @@ class Told:
     def _no_modes(self, poles: np.ndarray) -> np.ndarray:
         """Which poles are damped beyond what rings, or split another mode that has their shape and their band."""
         fits = [project(record, poles, self.offset) for record in self.records]
-        shapes = np.vstack([fit.complex_amplitudes * self.weights[:, None] for fit in fits])
+        shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(fits, self.weights, strict=True)])
         return no_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width)
 
     def report(self, records: Sequence[Record]) -> Identified:
@@ -176,8 +177,8 @@ class Told:
         )
 
     def _settled(self, poles: np.ndarray, most_steps: int = MOST_STEPS):
-        """Poles, weights and fits after a search, sensors weighted by the noise found."""
-        weights = getattr(self, "weights", np.ones(self.records[0].n_outputs))
+        """Poles, weights and fits after a search, sensors weighted by the noise found in each record."""
+        weights = getattr(self, "weights", np.ones((len(self.records), self.records[0].n_outputs)))
         if poles.size == 0:
             fits = [grid.nothing for grid in self.grids]
             return poles, 1.0 / _spread(fits), fits
@@ -191,10 +192,10 @@ class Told:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
         fits = [project(record, self.poles, self.offset) for record in self.records]
         n, strength = self.poles.size, np.zeros(self.poles.size)
-        for fit in fits:
+        for fit, weights in zip(fits, self.weights, strict=True):
             for r in range(n):
                 both = [r, n + r]
-                a = fit.coefficients[both] * self.weights
+                a = fit.coefficients[both] * weights
                 strength[r] += float(np.sum(a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)))
         return strength
 
@@ -214,22 +215,23 @@ class Told:
     def _colour(self, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the spectrum left over, 1 if white."""
         grid = self.grids[0]
-        left = grid.power(self.fits[0] * self.weights).mean(axis=1)
+        left = grid.power(self.fits[0] * self.weights[0]).mean(axis=1)
         at = round((pole.imag - grid.lowest) / grid.bin_width)
         beside = left[max(at - BESIDE, 0) : at + BESIDE + 1]
         return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
 
     def _ratio(self, before, after) -> float:
-        """Twice the log likelihood ratio, each sensor's noise unknown: Σ_j N log(SSR_before / SSR_after)."""
-        n = sum(residual.shape[0] for residual in after)
-        squares = [sum((residual**2).sum(axis=0) for residual in fits) for fits in (before, after)]
-        floor = 1e-26 * sum((r.outputs**2).sum(axis=1) for r in self.records) + 1e-300
-        return float(n * np.log((squares[0] + floor) / (squares[1] + floor)).sum())
+        """Twice the log likelihood ratio, noise unknown: Σ_ij N_i log(s²_before / s²_after), records i, sensors j."""
+        n = np.array([residual.shape[0] for residual in after])
+        floor = 1e-26 * np.array([(r.outputs**2).sum(axis=1) for r in self.records]) + 1e-300
+        first, second = (np.array([(r**2).sum(axis=0) for r in fits]) + floor for fits in (before, after))
+        apart = differ(second, n)
+        return float((n @ np.log(variances(first, n, apart) / variances(second, n, apart))).sum())
 
     def _strongest_swing(self) -> tuple[complex, float]:
         """The strongest swing left that was not refused before, and its χ²."""
-        both = zip(self.grids, self.fits, strict=True)
-        strengths = np.sum([grid.strengths(residual, self.weights, self.poles) for grid, residual in both], axis=0)
+        each = zip(self.grids, self.fits, self.weights, strict=True)
+        strengths = np.sum([grid.strengths(left, weights, self.poles) for grid, left, weights in each], axis=0)
         grid = self.grids[0]
         for pole, _ in self.refused:
             strengths[:, grid.near(pole, 2.0)] = 0.0
@@ -320,6 +322,7 @@ def _geometric(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
 
 
 def _spread(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    n = sum(r.shape[0] for r in residuals)
-    squares = sum((r**2).sum(axis=0) for r in residuals)
-    return np.sqrt(np.maximum(squares / n, 1e-28 * squares.max() + 1e-300))
+    """Of what is left of each output in each record, (n_records, n_outputs)."""
+    squares = np.array([(r**2).sum(axis=0) for r in residuals])
+    n = np.array([r.shape[0] for r in residuals])
+    return np.sqrt(variances(np.maximum(squares, 1e-28 * squares.max() + 1e-300), n))

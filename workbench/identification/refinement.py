@@ -17,7 +17,9 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.special import ndtri
 
+from workbench.identification.agreed_shapes import agreed_shapes
 from workbench.identification.ibrahim import check_alike, normalised_shapes
+from workbench.identification.noise_levels import variances
 from workbench.identification.projection import Projection, project
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
@@ -40,7 +42,7 @@ class Refined(StandardErrors):
         amplitudes: one (n_outputs, n_modes) complex a record: y = Re Σ a_r e^{λ_r (t - t_first)}, in its own units.
         shape_covariance: (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to each one's
             largest entry (which is 1 and so without error).
-        noise_std: (n_outputs,) of what the modes leave over, in the unit of each output.
+        noise: (n_records, n_outputs) standard deviation of what the modes leave over, in the unit of each output.
         converged: whether the search ended because the step was small.
         steps: taken.
     """
@@ -49,9 +51,14 @@ class Refined(StandardErrors):
     covariance: np.ndarray
     amplitudes: tuple[np.ndarray, ...] = field(repr=False)
     shape_covariance: np.ndarray = field(repr=False)
-    noise_std: np.ndarray
+    noise: np.ndarray
     converged: bool
     steps: int
+
+    @property
+    def noise_std(self) -> np.ndarray:
+        """Of each output (n_outputs,), root mean square over the records."""
+        return np.sqrt((self.noise**2).mean(axis=0))
 
     @property
     def shape_std(self) -> np.ndarray:
@@ -66,7 +73,7 @@ class Refined(StandardErrors):
 def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: bool = False) -> Refined:
     """The most likely modes near `start`, with the Cramér-Rao covariance of frequencies, damping and shapes.
 
-    Sensors are weighted by the noise that each turns out to have. Several records share poles, not amplitudes.
+    Sensors are weighted by the noise that each turns out to have in each record. Records share poles, not amplitudes.
 
     Args:
         records: free decay in white noise, of the same sensors at one rate.
@@ -89,13 +96,13 @@ def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: b
         raise ValueError(
             f"{start.n_modes} modes are {unknowns} unknowns a sensor; a record has {shortest} samples: measure longer"
         )
-    poles, weights = start.poles, np.ones(records[0].n_outputs)
+    poles, weights = start.poles, np.ones((len(records), records[0].n_outputs))
     steps = 0
     for _ in range(2):
-        # Noise differs from sensor to sensor: it is measured at the first optimum and the sensors reweighted.
+        # Noise differs from sensor to sensor and from record to record: it is measured at the first optimum.
         poles, fit, converged, taken = search(records, poles, weights, offset)
         steps += taken
-        noise = noise_level(records, fit)
+        noise = noise_level(records, fit, weights)
         weights = 1.0 / noise
     return as_refined(records, poles, fit, noise, converged=converged, steps=steps)
 
@@ -114,7 +121,7 @@ def bound(modes: SampledModes, record: Record, *, noise_std: float | Sequence[fl
     derivative = time_derivatives(record.output_channels)[:, None]
     amplitude = modes.shapes * modes.poles**derivative
     clean = replace(record, outputs=(amplitude @ np.exp(modes.poles[:, None] * record.time)).real)
-    noise = np.broadcast_to(np.asarray(noise_std, float), (record.n_outputs,))
+    noise = np.broadcast_to(np.asarray(noise_std, float), (1, record.n_outputs))
     fits = [project(clean, modes.poles, False)]
     return as_refined([clean], modes.poles, fits, noise, converged=True, steps=0)
 
@@ -137,13 +144,17 @@ def amplitudes(record: Record, modes: SampledModes, *, at: float = 0.0, offset: 
     return replace(modes, shapes=fit.complex_amplitudes * lag / modes.poles ** derivative[:, None])
 
 
-def _normal(fits: Sequence[Projection], weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton matrix H and right-hand side, over all records, outputs weighted by 1 / noise."""
+def _normal(fits: Sequence[Projection], weights: np.ndarray, heard=1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton matrix H and right-hand side, over all records, outputs weighted by 1 / noise.
+
+    `heard`, (n_records, n_modes, n_outputs), makes it what noise louder by so much about a mode brings in.
+    """
     size = fits[0].gram.shape[0]
     n = size // 2
     h, g = np.zeros((size, size)), np.zeros(size)
-    for fit in fits:
-        a, b = fit.coefficients[:n] * weights, fit.coefficients[n : 2 * n] * weights
+    heard = np.broadcast_to(heard, (len(fits), n, weights.shape[1]))
+    for fit, weight, loud in zip(fits, weights, heard, strict=True):
+        a, b = fit.coefficients[:n] * weight * loud, fit.coefficients[n : 2 * n] * weight * loud
         aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
         (cc, cs), (sc, ss) = fit.gram.reshape(2, n, 2, n).transpose(0, 2, 1, 3)
         h[:n, :n] += aa * cc + ab * cs + ab.T * sc + bb * ss
@@ -151,7 +162,7 @@ def _normal(fits: Sequence[Projection], weights: np.ndarray) -> tuple[np.ndarray
         cross = -(ab * cc) + aa * cs - bb * sc + ab.T * ss
         h[:n, n:] += cross
         h[n:, :n] += cross.T
-        x, y = fit.slopes[:n] * weights, fit.slopes[n:] * weights
+        x, y = fit.slopes[:n] * weight, fit.slopes[n:] * weight
         g[:n] += -(a * x + b * y).sum(axis=1)
         g[n:] += (b * x - a * y).sum(axis=1)
     return h, g
@@ -167,7 +178,7 @@ def search(records, poles: np.ndarray, weights: np.ndarray, offset: bool, most_s
     fits = [project(record, poles, offset) for record in records]
     cost = _cost(fits, weights)
     free = sum(r.outputs.size for r in records) - 2 * n - sum(f.coefficients.size for f in fits)
-    signal = sum(float(weights**2 @ np.einsum("jt,jt->j", r.outputs, r.outputs)) for r in records)
+    signal = float((weights**2 * _squares(records)).sum())
     blur = max(fit.round_off for fit in fits) * signal
     damping = 1e-3
     for step in range(1, most_steps + 1):
@@ -225,25 +236,45 @@ def _tried(records, poles: np.ndarray, offset: bool) -> list[Projection] | None:
 
 
 def _cost(fits, weights: np.ndarray) -> float:
-    return float(sum(weights**2 @ fit.squares for fit in fits))
+    return float(sum(weight**2 @ fit.squares for fit, weight in zip(fits, weights, strict=True)))
 
 
-def noise_level(records, fits) -> np.ndarray:
-    """Standard deviation of the residual of each output, the degrees of freedom the fit took away made good."""
-    n_poles, m = fits[0].gram.shape[0], records[0].n_outputs
-    free = sum(r.n_samples - f.coefficients.shape[0] for r, f in zip(records, fits, strict=True)) - n_poles / m
-    squares = sum(np.einsum("tj,tj->j", f.residual, f.residual) for f in fits)
-    signal = sum(np.einsum("jt,jt->j", r.outputs, r.outputs) for r in records)
+def _squares(records) -> np.ndarray:
+    """Sums of those of every output, (n_records, n_outputs)."""
+    return np.array([np.einsum("jt,jt->j", r.outputs, r.outputs) for r in records])
+
+
+def noise_level(records, fits, weights: np.ndarray) -> np.ndarray:
+    """Standard deviation of the residual of each output in each record, (n_records, n_outputs), the degrees of freedom
+    the fit took away made good: the poles take theirs where they are learnt."""
+    n_poles = fits[0].gram.shape[0]
+    lost = np.full(len(fits), n_poles / len(fits))
+    if len(fits) > 1 and n_poles:
+        each = np.array([_normal([fit], weight[None])[0] for fit, weight in zip(fits, weights, strict=True)])
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(each.sum(axis=0)), 1e-300))
+        each *= np.outer(scale, scale)
+        lost = np.trace(np.linalg.pinv(each.sum(axis=0), hermitian=True) @ each, axis1=1, axis2=2)
+    free = np.array([r.n_samples - f.coefficients.shape[0] for r, f in zip(records, fits, strict=True)])
+    squares = np.array([np.einsum("tj,tj->j", f.residual, f.residual) for f in fits])
+    signal = _squares(records)
     floor = np.maximum(1e-32 * signal, 1e-32 * signal.max() + 1e-300)
-    return np.sqrt(np.maximum(squares, floor) / max(free, 1.0))
+    return np.sqrt(variances(np.maximum(squares, floor), np.maximum(free - lost / records[0].n_outputs, 1.0)))
 
 
-def as_refined(records, poles, fits, noise, *, converged: bool, steps: int) -> Refined:
-    """What a search ended with, with the covariance that follows from it."""
+def as_refined(records, poles, fits, noise, *, converged: bool, steps: int, heard=None) -> Refined:
+    """What a search ended with, with the covariance that follows from it.
+
+    Args:
+        noise: (n_records, n_outputs) standard deviations.
+        heard: (n_records, n_outputs, n_modes) variance of the noise about each mode over that; 1 unless given. The
+            search has weighted all noise as white, so that its errors are H^-1 M H^-1 (White, Econometrica 48, 1980).
+    """
     n = poles.size
     h, _ = _normal(fits, 1.0 / noise)
     scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
     covariance = np.linalg.pinv(h * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
+    if heard is not None:
+        covariance = covariance @ _normal(fits, 1.0 / noise, np.sqrt(heard).swapaxes(1, 2))[0] @ covariance
     omega = np.abs(poles)
     sigma, omega_d = -poles.real, poles.imag
     # ω² = σ² + ω_d² and ζ = σ/ω carry the covariance of (σ, ω_d) to that of (ω, ζ).
@@ -255,10 +286,9 @@ def as_refined(records, poles, fits, noise, *, converged: bool, steps: int) -> R
     )
     order = np.argsort(omega)
     both = np.r_[order, order + n]
-    derivative = time_derivatives(records[0].output_channels)[:, None]
-    loudest = max(fits, key=lambda fit: float((fit.coefficients**2).sum()))
-    shapes = loudest.complex_amplitudes / poles**derivative
-    shape_covariance = _shape_covariance(loudest, poles, derivative, covariance, noise)
+    variance = noise[:, :, None] ** 2 * np.ones(n) * (1.0 if heard is None else heard)
+    derivative = time_derivatives(records[0].output_channels)
+    shapes, shape_covariance = agreed_shapes(fits, derivative, covariance, variance)
     return Refined(
         modes=SampledModes(
             omega[order], (sigma / omega)[order], normalised_shapes(shapes)[:, order], records[0].positions
@@ -266,43 +296,7 @@ def as_refined(records, poles, fits, noise, *, converged: bool, steps: int) -> R
         covariance=frozen((jacobian @ covariance @ jacobian.T)[np.ix_(both, both)]),
         amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
         shape_covariance=frozen(shape_covariance[order]),
-        noise_std=frozen(noise),
+        noise=frozen(noise),
         converged=bool(converged),
         steps=steps,
     )
-
-
-def _shape_covariance(fit: Projection, poles, derivative, pole_covariance, noise) -> np.ndarray:
-    """Of Re(s_j / s_k), k the largest entry: (n_modes, n_outputs, n_outputs).
-
-    d(s_j/s_k) = (ds_j - ds_k s_j/s_k) / s_k. An amplitude moves with its own noise, of covariance (Φ^T Φ)^-1, and with
-    the poles, by -Φ^+ dΦ.
-    """
-    shapes = fit.complex_amplitudes / poles**derivative
-    n, m = poles.size, shapes.shape[0]
-    alpha, beta = fit.coefficients[:n], fit.coefficients[n : 2 * n]
-    result = np.zeros((n, m, m))
-    root = _root(pole_covariance)
-    for r in range(n):
-        k = int(np.argmax(np.abs(shapes[:, r])))
-        # dΦ of mode p is -(α, β) tΦ_p by σ and (β, -α) tΦ_p by ω_d.
-        cosine, sine = (np.array([1.0, -1j]) @ fit.tilt[[r, n + r]]).reshape(2, n, 1)
-        moved = np.vstack([cosine * alpha + sine * beta, sine * alpha - cosine * beta])
-        with_poles = (moved.T @ root) / poles[r] ** derivative
-        own = fit.spread[np.ix_([r, n + r], [r, n + r])]
-        pair = np.array([1.0, -1j]) @ _root(own)
-        each = noise[:, None] * pair / poles[r] ** derivative  # (n_outputs, 2)
-        ratio = shapes[:, r] / shapes[k, r]
-        shared = ((with_poles - ratio[:, None] * with_poles[k]) / shapes[k, r]).real
-        single = (each / shapes[k, r]).real
-        common = (ratio[:, None] * each[k] / shapes[k, r]).real
-        common[k] = single[k] = 0.0
-        result[r] = shared @ shared.T + common @ common.T + np.diag((single**2).sum(axis=1))
-        result[r][k] = result[r][:, k] = 0.0
-    return result
-
-
-def _root(matrix: np.ndarray) -> np.ndarray:
-    """R with R R^T = matrix, for a matrix that may be singular."""
-    values, vectors = np.linalg.eigh(matrix)
-    return vectors * np.sqrt(np.maximum(values, 0.0))

@@ -22,7 +22,7 @@ def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, 
     perhaps only the distortion of that one (a mode may stand there too: those of a hinged beam do).
     """
     modes, found = refined.modes, []
-    size = np.abs(np.stack(refined.amplitudes) / refined.noise_std[:, None]).max(axis=(0, 1))
+    size = np.abs(np.stack(refined.amplitudes) / refined.noise[:, :, None]).max(axis=(0, 1))
     records = [records] if isinstance(records, Record) else records
     span = max(record.n_samples * record.sample_time for record in records)
     for r in range(modes.n_modes):

@@ -140,7 +140,7 @@ def _without_drift(records: list[Record], n_modes: int | None) -> tuple[Identifi
         if not drifting or (poles.size == before.size and size.any()):
             break
         cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
-    in_noise = size / found.refined.noise_std
+    in_noise = size / found.refined.noise
     if not (in_noise >= 1.0).any():
         return found, cleared if size.any() else records, []
     i, j = np.unravel_index(int(np.argmax(in_noise)), size.shape)
@@ -219,8 +219,8 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
 
     Noise of sensors leaves there no more than beside.
     """
-    for record, residual in zip(records, left, strict=True):
-        scaled = ((part / refined.noise_std[:, None]) for part in (residual, record.outputs))
+    for record, residual, noise in zip(records, left, refined.noise, strict=True):
+        scaled = ((part / noise[:, None]) for part in (residual, record.outputs))
         power, motion = ((np.abs(np.fft.rfft(part, axis=1)[:, 1:]) ** 2).sum(axis=0) for part in scaled)
         bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
         away = np.abs(np.arange(1, power.size + 1)[:, None] - refined.modes.poles.imag / bin_width)
@@ -242,9 +242,9 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
 def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
     """Of each mode in all records, (n_modes,), each output in units of its noise."""
     found = np.zeros(refined.modes.n_modes)
-    for record, amplitudes in zip(records, refined.amplitudes, strict=True):
+    for record, amplitudes, noise in zip(records, refined.amplitudes, refined.noise, strict=True):
         decay = np.exp(2.0 * record.sample_time * np.outer(refined.modes.poles.real, np.arange(record.n_samples)))
-        found += (np.abs(amplitudes / refined.noise_std[:, None]) ** 2).sum(axis=0) * decay.sum(axis=1)
+        found += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * decay.sum(axis=1)
     return found
 
 
