@@ -7,6 +7,7 @@ from skfem.helpers import dd, ddot, dot, grad
 from workbench.identification.distributions import Basis
 from workbench.identification.local_loss import WIDTHS, find_loss, scan
 from workbench.identification.order import identify
+from workbench.identification.sensitivity import LocalLoss
 from workbench.identification.structure_fit import Task
 from workbench.identification.synthesis import free_decay
 from workbench.structure.member import Bar, Beam
@@ -87,6 +88,32 @@ def test_the_first_look_points_at_the_place():
     problem = task.problem(Basis.polynomial(2), Basis.polynomial(3))
     places, gains = scan(problem, problem.fit())
     assert abs(places[np.argmax(gains[WIDTHS.index(0.1)])] - 0.4) < 0.05
+
+
+@pytest.fixture(scope="module")
+def beside_the_end():
+    """Lost from 0.87 to 0.97 of a beam; near its free end the moment is next to nothing."""
+    return measured("beam", lost=0.2, centre=0.92)
+
+
+def test_an_edge_that_passes_the_end_comes_back(beside_the_end):
+    problem = Task.of(beside_the_end, NOMINAL["beam"], known_mass=[(0.5, 1.0)]).problem(
+        Basis.polynomial(2), Basis.polynomial(3)
+    )
+    from_truth = problem.fit(loss=LocalLoss(0.2, 0.92, 0.1))
+    from_beyond = problem.fit(loss=LocalLoss(0.2, 0.98, 0.2))
+    assert from_beyond.chi2 == pytest.approx(from_truth.chi2, abs=0.1)
+
+
+@pytest.mark.parametrize("centre", [0.92, 0.96])
+def test_what_of_a_loss_passes_the_end_is_not_told(centre, beside_the_end):
+    modes = beside_the_end if centre == 0.92 else measured("beam", lost=0.2, centre=centre)
+    found = find_loss(modes, NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[2], stiffness_terms=[3])
+    loss, truth = found.loss, LocalLoss(0.2, centre, 0.1).within(1.0)
+    assert loss.centre + 0.5 * loss.width <= 1.0 + 1e-12
+    low, high = found.interval().T
+    assert (low < [truth.share, truth.centre, truth.width]).all() and (high > [0.2, truth.centre, truth.width]).all()
+    assert high[2] - low[2] > 0.01  # the edge near the end is all but unknown
 
 
 def test_a_number_of_terms_must_be_given():

@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
-from scipy.stats import norm
 
 from workbench.identification.distributions import Basis
 from workbench.identification.refinement import Refined
@@ -32,6 +31,7 @@ TYPICAL_WIDTH = 0.1  # of the length
 WIDTHS = (0.05, 0.1, 0.2, 0.4)  # of the length: a search finds a loss from half and from twice its width, not from any
 MOST_STARTS, MOST_LOOKS = 2, 4  # of each width; after the first
 FIRST_TERMS, FEWER_TERMS = 3, 2
+N_DRAWS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +67,16 @@ class LossFound:
         return self.lossy if self.found else self.smooth
 
     def interval(self, level: float = 0.95) -> np.ndarray:
-        """Confidence intervals of share, centre and width, (3, 2)."""
-        std = np.sqrt(np.diag(self.lossy.covariance)[-3:])
-        half = float(norm.ppf(0.5 * (1.0 + level))) * std
-        return self.lossy.parameters[-3:, None] + half[:, None] * np.array([-1.0, 1.0])
+        """Confidence intervals of share, centre and width, (3, 2); what of a loss passes an end does not count."""
+        likely, length = self.lossy.parameters[-3:], self.lossy.structure.length
+        share, centre, width = (
+            np.random.default_rng(0)
+            .multivariate_normal(likely, self.lossy.covariance[-3:, -3:], N_DRAWS, method="eigh")
+            .T
+        )
+        begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
+        tail = 0.5 * (1.0 - level)
+        return np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T
 
 
 def find_loss(

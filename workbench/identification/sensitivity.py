@@ -44,6 +44,11 @@ class LocalLoss:
         """Where it begins and ends, m."""
         return max(self.centre - 0.5 * self.width, 0.0), min(self.centre + 0.5 * self.width, length)
 
+    def within(self, length: float) -> "LocalLoss":
+        """The part of it that lies on the structure."""
+        begin, end = self.edges(length)
+        return LocalLoss(self.share, 0.5 * (begin + end), end - begin)
+
     def of(self, stiffness: Profile, length: float) -> Profile:
         """A stiffness with this loss."""
         return stiffness.scaled(1.0 - self.share, *self.edges(length))

@@ -12,13 +12,13 @@ criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978), which an unneeded te
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, null_space
-from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.optimize import OptimizeResult, least_squares, linear_sum_assignment
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.distributions import KNOWN_TOLERANCE, Basis
@@ -40,6 +40,7 @@ NARROWEST, WIDEST = 0.02, 0.5  # of the length: a loss narrower is a crack, one 
 MOST_LOST = 0.95
 N_DRAWS = 1000
 MOST_STEPS = 25
+FROM_EDGES = np.array([[0.5, 0.5], [-1.0, 1.0]])  # centre and width of where a loss begins and ends
 
 
 @dataclass(frozen=True)
@@ -380,10 +381,18 @@ class Problem:
                 memory[key] = self.misses(z)
             return memory[key]
 
-        tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9, "max_nfev": MOST_STEPS}
-        found = least_squares(
-            lambda z: at(z)[0], z, lambda z: at(z)[1], bounds=(low, high), x_scale="jac", **tolerances
-        )
+        def search(z: np.ndarray) -> OptimizeResult:
+            tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9, "max_nfev": MOST_STEPS}
+            return least_squares(
+                lambda z: at(z)[0], z, lambda z: at(z)[1], bounds=(low, high), x_scale="jac", **tolerances
+            )
+
+        found = search(z)
+        if loss is not None:
+            # nothing draws back an edge that has passed an end
+            inside = self._edges_inside(found.x)
+            if inside is not found.x:
+                found = min(found, search(np.clip(inside, low, high)), key=lambda ended: ended.cost)
         return self.report(found.x)
 
     def nominal(self) -> FittedStructure:
@@ -441,13 +450,15 @@ class Problem:
     def report(self, z: np.ndarray) -> FittedStructure:
         """The structure of free parameters z, with what the data leave open about it."""
         task, series = self.task, self.series
-        rows, slopes = self.misses(z)
+        if z.size > self.n_free:
+            z = np.r_[z[: self.n_free], astuple(LocalLoss(*z[self.n_free :]).within(task.nominal.length))]
+        rows = self.misses(z)[0]
         chi2 = float(rows @ rows)
         freedom = rows.size - z.size
         d, e, loss = self.parts(z)
         parameters = np.r_[d, e, z[self.n_free :]]
         carry = self.carry(z)
-        covariance = carry @ _inverse(slopes.T @ slopes) @ carry.T
+        covariance = carry @ self._covariance(z) @ carry.T
         if freedom > 0 and chi2 > chi2_distribution.isf(UNLIKELY, freedom):
             covariance = covariance * chi2 / freedom
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
@@ -490,6 +501,48 @@ class Problem:
             numbers=task.which + 1,
             check=SelfCheck(found.omega / task.measured.modes.omega - 1.0, agreement),
         )
+
+    def _covariance(self, z: np.ndarray) -> np.ndarray:
+        """Of the free parameters, the Cramér-Rao bound.
+
+        Nothing changes where an edge of a loss passes an end, and little just before it: such an edge is taken to be
+        as uncertain as it would be one standard error inside.
+        """
+        if z.size == self.n_free:
+            slopes = self.misses(z)[1]
+            return _inverse(slopes.T @ slopes)
+        carry = block_diag(np.eye(z.size - 2), FROM_EDGES)
+        return carry @ self._by_edges(self._edges_inside(z)) @ carry.T
+
+    def _by_edges(self, z: np.ndarray) -> np.ndarray:
+        """The bound with the edges of the loss in place of centre and width."""
+        slopes = self.misses(z)[1]
+        slopes = np.hstack([slopes[:, :-2], slopes[:, -2:] @ FROM_EDGES])
+        return _inverse(slopes.T @ slopes)
+
+    def _edges_inside(self, z: np.ndarray) -> np.ndarray:
+        """The same with each edge of the loss at least one standard error inside; itself where they are."""
+        return self._edge_inside(self._edge_inside(z, 0, 1.0), 1, -1.0)
+
+    def _edge_inside(self, z: np.ndarray, edge: int, inward: float) -> np.ndarray:
+        width, length = z[-1], self.task.nominal.length
+        depth = np.linalg.solve(FROM_EDGES, z[-2:])[edge]
+        depth = depth if inward > 0 else length - depth
+
+        def moved(to: float) -> np.ndarray:
+            return np.r_[z[:-2], z[-2:] + inward * (to - depth) * FROM_EDGES[:, edge]]
+
+        def too_near(to: float) -> bool:
+            return bool(self._by_edges(moved(to))[edge - 2, edge - 2] > to**2)
+
+        least = 1e-5 * length
+        if depth > width or (depth > least and not too_near(depth)):
+            return z
+        low, high = max(depth, least), depth + 0.9 * width
+        while high > 1.1 * low:
+            middle = float(np.sqrt(low * high))
+            low, high = (middle, high) if too_near(middle) else (low, middle)
+        return moved(high)
 
     def free_near(self, found: FittedStructure) -> np.ndarray:
         """Free parameters, a loss with them, of the series nearest to a structure found with other terms."""
