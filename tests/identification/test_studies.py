@@ -26,15 +26,6 @@ def failed(outcome):
     return [check for check in outcome.checks if not check["holds"]]
 
 
-def test_bar_identification(tmp_path):
-    outcome = run("bar_identification", tmp_path)
-    assert len(outcome.checks) == 20
-    assert not failed(outcome)
-    assert set(outcome.tables["table_4_1"]) == {"12", "15", "18"}
-    assert set(outcome.tables["table_4_1_default"]) == {"6", "12", "15", "18"}
-    assert len(outcome.tables["tables_4_2_4_3"]["15"]["4"]["stiffness"]) == 4
-
-
 @pytest.mark.skipif(not RULER.is_file(), reason="the measured ruler is not at hand; set WORKBENCH_SHARED")
 def test_ruler(tmp_path):
     outcome = run("ruler", tmp_path, RULER)
