@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.gap.diagnose import _fails_unseen
-from workbench.gap.disturbance import _tonal
+from workbench.gap.disturbance import tonal
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.containment import fewer, simpler_forms
 from workbench.gap.effects.effect import Effect
@@ -77,8 +77,8 @@ def test_a_tone_is_no_random_force():
     time = DT * np.arange(2000)
     noise = np.random.default_rng(0).normal(size=2000)
     slow = np.convolve(noise, np.exp(-np.arange(400) / 80.0), "same")
-    assert _tonal(np.sin(2 * np.pi * 0.33 * time + 1.0) + 0.1 * noise, DT) > 0.95
-    assert _tonal(noise, DT) < 0.1 and _tonal(slow, DT) < 0.6
+    assert tonal(np.sin(2 * np.pi * 0.33 * time + 1.0) + 0.1 * noise, DT) > 0.95
+    assert tonal(noise, DT) < 0.1 and tonal(slow, DT) < 0.6
 
 
 class Found:

@@ -6,6 +6,7 @@ import pytest
 from workbench.gap.check import readiness
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Kind
+from workbench.gap.evidence import Evidence
 from workbench.gap.prediction import FitData
 from workbench.rig.actuators import Actuator
 
@@ -25,7 +26,7 @@ def data(rig, record_of):
 
 
 def test_only_the_actuator_at_rest_hides_its_faults(rig, data):
-    found = readiness(rig, data)
+    found = readiness(Evidence.of(rig, data))
     assert found.invisible
     assert all(label.startswith("actuator_") and "[F2]" in label for label in found.invisible)
     assert "actuator_gain[F2]" in found.invisible and found.strengths["actuator_gain[F2]"] == 0.0
@@ -36,11 +37,11 @@ def test_a_weak_start_hides_nothing_and_what_does_nothing_stays_hidden(rig, data
     modulus = vars(kind_named("modulus_error", CATALOGUE))
     weak = Kind(**{**modulus, "starts": lambda *_: [{"factor": 1.0 + 1e-12}, {"factor": 1.1}]})
     idle = Kind(**{**modulus, "name": "idle", "apply": lambda rig, *_: rig})
-    assert readiness(rig, data, catalogue=(weak, idle)).invisible == ("idle",)
+    assert readiness(Evidence.of(rig, data), catalogue=(weak, idle)).invisible == ("idle",)
 
 
 def test_two_effects_that_do_the_same_are_told_to_be_alike(rig, data):
     gain = kind_named("actuator_gain", CATALOGUE)
     twin = Kind(**{**vars(gain), "name": "another_gain"})
-    found = readiness(rig, data, catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE)))
+    found = readiness(Evidence.of(rig, data), catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE)))
     assert found.alike == (("actuator_gain[F1]", "another_gain[F1]", pytest.approx(1.0)),)

@@ -5,16 +5,17 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from workbench.gap.beside_nominal import decide_beside_nominal, decide_with_figures_freed
-from workbench.gap.decide import Decision, decide, decide_on_pairs, decide_on_random, pairs_of
+from workbench.gap.beside_random import decide_on_random, looks_random
+from workbench.gap.decide import decide, decide_on_pairs
 from workbench.gap.disturbance import RandomForceFit
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of
+from workbench.gap.outcome import Decision
 from workbench.gap.prediction import FitData
 from workbench.gap.search import Search, one_more
 from workbench.records.record import Record
@@ -31,7 +32,7 @@ class Attribution:
         random: statistics of a random disturbance, where the set holds one.
         rivals: other sets, best first, with their probabilities against the best.
         nominal_cost: mean square of the nominal residual in noise units.
-        singles: every kind's best fit alone, best first.
+        singles: every kind's best fit alone, best first; beside the random disturbance, where one holds.
         evidence: of the nominal rig.
         data: what was fitted, noise of rounded sensors included.
     """
@@ -78,8 +79,7 @@ def attribute(
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
     plain = FitData(tuple(records), noise, lead=round(settle / records[0].sample_time))
     seen, data = _plain_to_see(rig, plain)
-    # the threads of the search and those of the linear algebra would wait for one another
-    with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         return _search(rig, seen, data, catalogue, report, pool, free_nominal)
 
 
@@ -105,7 +105,7 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     nominal = data.by_channel(data.residual(rig))
     start = Fit(seen, cost_of(base, (), data), data.by_channel(data.residual(base)), 0, "read off the records")
     telling = _telling(data, start)
-    quick, first = data.only(telling), data.only(telling[:1]).stepped(2)
+    quick, first = data.only(telling).stepped(2), data.only(telling[:1]).stepped(2)
     search = Search(base, data, quick, first, catalogue, report, pool, nominal)
     report("looking for the missing force", 0.02)
     evidence = Evidence.of(base, data)
@@ -113,11 +113,13 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     if free_nominal and not search.explains(start):
         found, singles = decide_with_figures_freed(search, start)
     else:
-        singles = one_more(search, (), evidence, 0.05, 0.45, finalists=8)
-        found = decide(search, start, singles) or decide_on_random(search, start, singles[0])
+        found, singles = None, []
+        if not search.explains(start) and looks_random(evidence):
+            found, singles = decide_on_random(search, start, evidence)
         if found is None:
-            found = decide_on_pairs(search, start, singles, pairs_of(search, singles))
-            if found.outcome != "explained":
+            singles = one_more(search, (), evidence, 0.05, 0.45, finalists=8)
+            found = decide(search, start, singles) or decide_on_pairs(search, start, singles)
+            if found.outcome not in ("none", "explained"):
                 found = decide_beside_nominal(search, start, singles) or found
     outcome, best, random, rivals = found
     if seen:

@@ -2,12 +2,14 @@
 
 from collections.abc import Sequence
 
-from workbench.gap.decide import NEAR, Decision, unexplained
+from workbench.gap.beside_random import NEAR
+from workbench.gap.decide import unexplained
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.outcome import Decision
 from workbench.gap.search import Search, one_more, spread_over_kinds
 from workbench.rig.rig import Rig
 

@@ -9,7 +9,6 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
-from workbench.gap.prediction import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate
@@ -91,16 +90,16 @@ def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
             )
 
 
-def readiness(rig: Rig, data: FitData, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Readiness:
+def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Readiness:
     """Simulate each effect at a strength that the records show, and compare the responses."""
-    evidence = Evidence.of(rig, data, 20)
+    rig, data = evidence.rig, evidence.data
     base = data.residual(rig)
     labels, signatures, strengths = [], [], {}
     for kind in catalogue:
         if kind is RANDOM_DISTURBANCE:
             continue
         for target in kind.targets(rig):
-            effect, change = _first_seen(kind, target, rig, data, evidence, base)
+            effect, change = _first_seen(kind, target, evidence, base)
             if effect is None:
                 continue
             size = float(np.linalg.norm(change))
@@ -122,13 +121,13 @@ def readiness(rig: Rig, data: FitData, *, catalogue: tuple[Kind, ...] = CATALOGU
     )
 
 
-def _first_seen(kind: Kind, target, rig: Rig, data: FitData, evidence: Evidence, base: np.ndarray):
+def _first_seen(kind: Kind, target, evidence: Evidence, base: np.ndarray):
     """The first strength of a kind that these records show, or the one that they show most; and what it changes."""
     best, change, most = None, np.zeros(0), -1.0
-    for effect in _strengths(kind, target, rig, evidence):
+    for effect in _strengths(kind, target, evidence):
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                moved = (data.residual(effect.apply(rig)) - base)[::THINNING]
+                moved = (evidence.data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
                 size = float(moved @ moved) * THINNING
             except (ValueError, np.linalg.LinAlgError):
                 continue
@@ -139,7 +138,7 @@ def _first_seen(kind: Kind, target, rig: Rig, data: FitData, evidence: Evidence,
     return best, change
 
 
-def _strengths(kind: Kind, target, rig: Rig, evidence: Evidence) -> Iterator[Effect]:
+def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
     """Where a search would start, and from there each number by decades up and down.
 
     A search starts from the missing force, and where none is missing it starts from nothing.
@@ -151,7 +150,7 @@ def _strengths(kind: Kind, target, rig: Rig, evidence: Evidence) -> Iterator[Eff
     if effect is None:
         return
     for factor in DECADES:
-        for parameter in effect.parameters(rig):
+        for parameter in effect.parameters(evidence.rig):
             if parameter.name != "at":
                 moved = float(np.clip(effect.values[parameter.name] * factor, parameter.low, parameter.high))
                 yield replace(effect, values={**effect.values, parameter.name: moved})

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+from threadpoolctl import threadpool_limits
+
 from workbench.gap.attribute import Attribution, attribute
 from workbench.gap.check import check_records, readiness
 from workbench.gap.effects.catalogue import CATALOGUE
@@ -53,15 +55,28 @@ def diagnose(
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_records(rig, records)
-    found = attribute(
-        rig,
-        records,
-        catalogue=catalogue,
-        report=report,
-        workers=workers,
-        settle=settle,
-        free_nominal=free_nominal,
-    )
+    # the threads of the search and those of the linear algebra would wait for one another
+    with threadpool_limits(1, user_api="blas"):
+        found = attribute(
+            rig,
+            records,
+            catalogue=catalogue,
+            report=report,
+            workers=workers,
+            settle=settle,
+            free_nominal=free_nominal,
+        )
+        return _verdict(rig, found, validation, catalogue, name, settle)
+
+
+def _verdict(
+    rig: Rig,
+    found: Attribution,
+    validation: Sequence[Record],
+    catalogue: tuple[Kind, ...],
+    name: str,
+    settle: float,
+) -> Verdict:
     corrected = apply_all(rig, found.best.effects)
     shrinkage = measure(rig, corrected, validation, settle=settle)
     outcome = "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
@@ -76,7 +91,7 @@ def diagnose(
         corrected=corrected,
         nominal=rig,
         attribution=found,
-        readiness=readiness(rig, found.data, catalogue=catalogue),
+        readiness=readiness(found.evidence, catalogue=catalogue),
         experiment=_next(rig, found),
         notes=_notes(found, outcome),
     )

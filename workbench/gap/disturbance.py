@@ -122,11 +122,11 @@ def fit_random_force(
             _followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
             for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
         ),
-        tonal=min(_tonal(force, data.counted[0].sample_time) for force in forces),
+        tonal=min(tonal(force, data.counted[0].sample_time) for force in forces),
     )
 
 
-def _tonal(force: np.ndarray, sample_time: float) -> float:
+def tonal(force: np.ndarray, sample_time: float) -> float:
     """Share of a force that its strongest sinusoid accounts for."""
     _, amplitude, _ = tone(force, sample_time)
     return float(min(0.5 * amplitude**2 / max(force.var(), 1e-300), 1.0))

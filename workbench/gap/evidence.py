@@ -4,18 +4,25 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
+from workbench.gap.effects.structural import known_places
 from workbench.gap.missing_force import (
     ForceFilter,
     SampledModel,
-    force_filter,
     log_likelihood,
     sampled_model,
     smoothed_states,
+    wandering_force_filter,
 )
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
+
+LEVELS = (1e-3, 1e-2, 1e-1, 1.0)  # rms of a missing force over that of the inputs
+MEMORIES = (10.0, 1000.0)  # its correlation time, in samples
+MOST_PEAKS = 3
+BESIDE, RESOLVED = 0.95, 2e-3  # of the spacing of places
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,57 +82,54 @@ class Evidence:
         noise = self.data.noise
         return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
 
-    def filter_at(self, x: float, size: float, memory: float) -> ForceFilter:
-        """The filter for an unknown force at x of process standard deviation `size`, N."""
-        return force_filter(self.model, self.rig.modes.phi(x).T, np.array([size**2]), memory)
+    def filter_at(self, x: float, rms: float, memory: float) -> ForceFilter:
+        """The filter for an unknown force at x of that rms, N, and correlation time, in samples."""
+        modes, sample_time = self.rig.modes, self.data.counted[0].sample_time
+        return wandering_force_filter(modes, self.model, modes.phi(x)[0], rms, memory * sample_time, sample_time)
 
     @cached_property
     def places(self) -> np.ndarray:
         """Positions along the structure where a missing force is looked for, m."""
-        known = getattr(self.rig.modes.shapes, "places", None)
+        known = known_places(self.rig)
         if known is not None:
             return np.asarray(known, float)
         return self.length * np.arange(1, self.n_places) / self.n_places
 
     @cached_property
-    def _settings(self) -> tuple[float, float]:
-        """Process size and memory of the missing force, by maximum likelihood over a coarse grid."""
+    def size(self) -> tuple[float, float]:
+        """Rms, N, and correlation time, in samples, of the missing force: the likeliest of a coarse grid."""
         coarse = self.places[::5] if self.places.size > 8 else self.places
-        best, settings = -np.inf, (1e-2 * self.force_rms, 0.9)
-        quick = self.residuals[: max(2, len(self.residuals) - 2)]
-        for memory in (0.0, 0.9, 0.999):
-            for share in (1e-3, 1e-2, 1e-1, 1.0):
-                size = share * self.force_rms
-                likelihood = max(log_likelihood(self.filter_at(x, size, memory), list(quick)) for x in coarse)
-                if likelihood > best:
-                    best, settings = likelihood, (size, memory)
-        return settings
+        quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
+        sizes = [(share * self.force_rms, memory) for memory in MEMORIES for share in LEVELS]
+        return max(sizes, key=lambda size: max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse))
 
     @cached_property
     def profile(self) -> np.ndarray:
         """Log-likelihood of an unknown force at each of `places`."""
-        size, memory = self._settings
-        return np.array([log_likelihood(self.filter_at(x, size, memory), list(self.residuals)) for x in self.places])
+        residuals = list(self.residuals)
+        return np.array([log_likelihood(self.filter_at(x, *self.size), residuals) for x in self.places])
 
     @cached_property
     def peaks(self) -> tuple[float, ...]:
-        """The most likely places of a missing force, best first, refined between the grid points."""
+        """The likeliest places of a missing force, best first, refined between the grid points."""
         profile, places = self.profile, self.places
-        if places.size < 5:
+        if known_places(self.rig) is not None:
             return tuple(places[np.argsort(-profile)])
         padded = np.r_[-np.inf, profile, -np.inf]
-        tops = [i for i in range(places.size) if padded[i + 1] >= padded[i] and padded[i + 1] >= padded[i + 2]]
-        tops.sort(key=lambda i: -profile[i])
-        refined = []
-        for i in tops[:3]:
-            x = places[i]
-            if 0 < i < places.size - 1:
-                left, top, right = profile[i - 1 : i + 2]
-                bend = left - 2.0 * top + right
-                if bend < 0:
-                    x += np.clip(0.5 * (left - right) / bend, -1.0, 1.0) * (places[1] - places[0])
-            refined.append(float(x))
-        return tuple(refined)
+        tops = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
+        refined = [self._refined(places[i]) for i in tops[np.argsort(-profile[tops])][:MOST_PEAKS]]
+        return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
+
+    def _refined(self, at: float) -> tuple[float, float]:
+        """The top of the log-likelihood beside a place of the grid: where, and how high."""
+        spacing, residuals = self.places[1] - self.places[0], list(self.residuals)
+        found = minimize_scalar(
+            lambda x: -log_likelihood(self.filter_at(x, *self.size), residuals),
+            bounds=(at - BESIDE * spacing, at + BESIDE * spacing),
+            method="bounded",
+            options={"xatol": RESOLVED * spacing},
+        )
+        return float(found.x), -float(found.fun)
 
     @cached_property
     def at_peaks(self) -> tuple[Place, ...]:
@@ -134,8 +138,7 @@ class Evidence:
 
     def place(self, x: float) -> Place:
         """The missing force at x and the motion there, smoothed."""
-        size, memory = self._settings
-        kalman = self.filter_at(x, size, memory)
+        kalman = self.filter_at(x, *self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi(x)[0]
         pieces = []
         for motion, residual in zip(self.motions, self.residuals, strict=True):

@@ -11,11 +11,16 @@ from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.search import Search
 
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
+NO_NEARER = 0.9
 FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
 def finished(search: Search, candidate: Fit) -> Fit:
-    """The same set on all records with finer substeps, to the end."""
+    """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
+    if candidate.falling == 0 and not search.explains(candidate):
+        finely = cost_of(search.rig, candidate.effects, search.data.stepped(8))
+        if finely - 1.0 > NO_NEARER * (candidate.cost - 1.0):
+            return candidate
     return fit(search.rig, candidate.effects, search.data.stepped(8), iterations=25, tolerance=1e-7)
 
 

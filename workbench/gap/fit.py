@@ -8,9 +8,11 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, Parameter, apply_all
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped
 
 HOPELESS = 1e300
 BENT, MOST_BENT = 0.1, 0.75
+SLOPE_SUBSTEPS = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +25,7 @@ class Fit:
         cost_by_channel: (n_records, n_outputs) of the same, without the share of a random disturbance's statistics.
         n_parameters: numbers fitted.
         status: why the fit stopped.
+        falling: share of the cost that the last iteration took away; 0 where the fit came to rest.
     """
 
     effects: tuple[Effect, ...]
@@ -30,6 +33,7 @@ class Fit:
     cost_by_channel: np.ndarray
     n_parameters: int
     status: str
+    falling: float = 0.0
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -62,6 +66,7 @@ class _Problem:
 
     def __init__(self, rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()):
         self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
+        self.coarse = data.stepped(min(SLOPE_SUBSTEPS, data.substeps))
         self.parameters: list[tuple[int, Parameter]] = []
         base = rig
         for i, effect in enumerate(self.effects):
@@ -83,13 +88,20 @@ class _Problem:
             values[i][parameter.name] = parameter.from_free(z)
         return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
 
-    def residual(self, free: np.ndarray) -> np.ndarray | None:
-        residual = _finite_residual(self.rig, (*self.at(free), *self.held), self.data)
+    def residual(self, free: np.ndarray, *, coarsely: bool = False) -> np.ndarray | None:
+        data = self.coarse if coarsely else self.data
+        residual = _finite_residual(self.rig, (*self.at(free), *self.held), data)
         if residual is None or not self.believed:
             return residual
         return np.r_[residual, (free[self.believed] - self.centre) / self.prior_std]
 
     def jacobian(self, free: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        """Differences, by coarser steps of time where the rig is stepped: slopes need not be as exact as residuals."""
+        stepped = is_stepped(apply_all(self.rig, (*self.at(free), *self.held)))
+        on_coarse = self.residual(free, coarsely=True) if stepped and self.data.substeps > SLOPE_SUBSTEPS else None
+        coarsely = on_coarse is not None
+        if on_coarse is not None:
+            residual = on_coarse
         columns = []
         for j, (_, parameter) in enumerate(self.parameters):
             step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name == "at" else self.steps[j]
@@ -97,10 +109,10 @@ class _Problem:
             moved[j] += step
             if parameter.to_free(parameter.high) < moved[j]:
                 moved[j] = free[j] - step
-            beside = self.residual(moved)
+            beside = self.residual(moved, coarsely=coarsely)
             if beside is None:
                 moved[j] = 2.0 * free[j] - moved[j]
-                beside = self.residual(moved)
+                beside = self.residual(moved, coarsely=coarsely)
             columns.append(np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j]))
         return np.array(columns).T
 
@@ -144,9 +156,8 @@ def fit(
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), free.size, "no rig at the start")
     cost = residual @ residual
-    damping, status = 1e-3, "most iterations done"
+    damping, status, falling = 1e-3, "most iterations done", 0.0
     normal = np.zeros((free.size, free.size))
-    idle = 0
     for _ in range(iterations if free.size else 0):
         jacobian = problem.jacobian(free, residual)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
@@ -162,16 +173,15 @@ def fit(
                 break
             damping *= 6.0
         if improved is None:
-            status = "no step lowers the cost"
+            status, falling = "no step lowers the cost", 0.0
             break
-        decrease = 1.0 - (improved @ improved) / cost
+        falling = 1.0 - (improved @ improved) / cost
         free, residual, cost = free + step, improved, improved @ improved
         damping = max(damping / 8.0, 1e-9)
-        idle = idle + 1 if decrease < tolerance else 0
-        if idle >= 1:
-            status = "settled"
+        if falling < tolerance:
+            status, falling = "settled", 0.0
             break
-    return _result(problem, free, residual, normal, status)
+    return _result(problem, free, residual, normal, status, falling)
 
 
 def _bend(problem: _Problem, free, residual, jacobian, damped, step) -> np.ndarray:
@@ -202,7 +212,9 @@ def _reach(problem: _Problem) -> np.ndarray:
     )
 
 
-def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, status: str) -> Fit:
+def _result(
+    problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, status: str, falling: float
+) -> Fit:
     residual = residual[: problem.data.n_values]
     cost = float(residual @ residual) / residual.size
     deviations = np.zeros(free.size)
@@ -221,4 +233,5 @@ def _result(problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: n
         cost_by_channel=problem.data.by_channel(residual),
         n_parameters=free.size,
         status=status,
+        falling=falling,
     )

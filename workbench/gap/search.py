@@ -21,6 +21,9 @@ WORTHWHILE = 0.01  # of the noise power: less is within what two good finite-ele
 TARGETS_A_KIND, JOINED = 2, 10
 ELSEWHERE = 0.1  # of the length
 CLOSE = 1.5
+FEW, MORE = 3, 4  # iterations of a quick fit, and of one that may come first
+AT_REST = 5e-3  # share of the cost: a quick fit that falls by less has said what it can
+HOPEFUL, FAR = 24, 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +112,9 @@ def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begi
         started = _promising(started, TARGETS_A_KIND)[:JOINED]
     quick_fits: list[Fit] = []
     for i, candidate in enumerate(search.pool.map(lambda s: _quick_fit(search, given, s), started)):
-        search.report(candidate.effects[-1].kind.words, begin + (end - begin) * (0.3 + 0.5 * (i + 1) / len(started)))
+        search.report(candidate.effects[-1].kind.words, begin + (end - begin) * (0.3 + 0.4 * (i + 1) / len(started)))
         quick_fits.append(candidate)
-    quick_fits.sort(key=lambda f: f.cost)
+    quick_fits = _with_more_time(search, quick_fits)
     chosen = spread_over_kinds(quick_fits, 3)
     close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
     chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
@@ -192,10 +195,25 @@ def _alone(search: Search, rig: Rig, started: list[tuple[float, Effect]]) -> lis
 
 
 def _quick_fit(search: Search, given: tuple[Effect, ...], started: list[tuple[float, Effect]]) -> Fit:
-    """The best of a kind's starts, improved a little on the quick records, jointly with the given effects."""
-    most = 4 if given else 7
-    fits = [fit(search.rig, (*given, e), search.quick, held=search.held, iterations=most) for _, e in started]
-    return min(fits, key=lambda f: f.cost)
+    """The most promising of a kind's starts, improved a little on the quick records, jointly with the given effects."""
+    return min((_quickly(search, (*given, effect), FEW) for _, effect in started), key=_promise)
+
+
+def _with_more_time(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits by their costs, those improved further that are still on their way and not far behind."""
+    order = sorted(fits, key=_promise)
+    hopeful = [f for f in order[:HOPEFUL] if f.falling > 0 and _promise(f) < FAR * _promise(order[0])]
+    longer = search.pool.map(lambda f: _quickly(search, f.effects, MORE), hopeful)
+    return sorted((*(f for f in fits if f not in hopeful), *longer), key=lambda f: f.cost)
+
+
+def _quickly(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
+    return fit(search.rig, effects, search.quick, held=search.held, iterations=iterations, tolerance=AT_REST)
+
+
+def _promise(candidate: Fit) -> float:
+    """The cost that one more iteration like the last would come to."""
+    return candidate.cost * (1.0 - candidate.falling)
 
 
 def _on_all(search: Search, candidate: Fit, iterations: int) -> Fit:

@@ -102,10 +102,14 @@ def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int 
 
 def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8) -> Motion:
     """Modal motion from rest; see `simulate`."""
-    stepped = [e for e in rig.elements if not isinstance(e, PeriodicForce | RandomForce)]
-    if not stepped and rig.stiffness_rate == 0:
-        return _move_exactly(rig, inputs, sample_time)
-    return _move_in_steps(rig, inputs, sample_time, substeps)
+    if is_stepped(rig):
+        return _move_in_steps(rig, inputs, sample_time, substeps)
+    return _move_exactly(rig, inputs, sample_time)
+
+
+def is_stepped(rig: Rig) -> bool:
+    """Whether the motion has no closed form and is stepped through time."""
+    return rig.stiffness_rate != 0 or any(not isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
 
 
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:

@@ -1,0 +1,104 @@
+"""What holds beside a random disturbance, which no search for effects can predict away."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, model_filter, tonal
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.evidence import Evidence
+from workbench.gap.finish import finished, ranked
+from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.outcome import Decision
+from workbench.gap.search import Search, one_more, spread_over_kinds
+from workbench.rig.rig import Rig
+
+NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
+SPREAD = 0.5  # of the missing force's level over records: forces of the rig's own follow the levels of the inputs
+
+
+def looks_random(evidence: Evidence) -> bool:
+    """Whether the missing force is about as strong in every record, whatever the level, and no single tone."""
+    ends = np.cumsum([record.n_samples for record in evidence.data.counted])[:-1]
+    forces = np.split(evidence.at_peaks[0].force, ends)
+    levels = np.array([np.sqrt(np.mean(force**2)) for force in forces])
+    if len(forces) < 2 or np.ptp(levels) > SPREAD * levels.mean():
+        return False
+    return min(tonal(force, evidence.data.counted[0].sample_time) for force in forces) < TONAL
+
+
+def decide_on_random(search: Search, start: Fit, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
+    """A random disturbance, alone or beside one effect, and all that was tried; None where it does not hold.
+
+    It takes much upon itself: where an effect explains the records without it, there is none.
+    """
+    alone = with_random(search, start, evidence)
+    if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
+        return None, []
+    rig = _rig_with(search, start)
+    beside = search.through(model_filter(evidence.model, rig, alone[1]))
+    cost = cost_of(rig, (), beside.data)
+    singles = spread_over_kinds(one_more(beside, start.effects, evidence, 0.2, 0.8, finalists=4), 1)
+    gaining = [f for f in singles[:3] if beside.surely_better(f, cost, f.n_parameters - start.n_parameters)]
+    if any(search.explains(finished(search, single)) for single in gaining):
+        return None, []
+    tried = [alone, *(with_random(search, single) for single in gaining)]
+    return _likeliest(search, tried), [found[0] for found in tried]
+
+
+def best_with_random(search: Search, candidates: Sequence[Fit]) -> Decision | None:
+    """The likeliest of the candidates beside a random disturbance that holds."""
+    return _likeliest(search, [with_random(search, candidate) for candidate in candidates])
+
+
+def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
+    """The likeliest that holds; one effect more must be worth its numbers."""
+    holding = [found for found in tried if found[1].holds]
+    if not holding:
+        return None
+    fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
+    worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
+    best, rivals = ranked(search, [found[0] for found in worth])
+    return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
+
+
+def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
+    return search.surely_better(candidate, simpler.cost, candidate.n_parameters - simpler.n_parameters)
+
+
+def with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> tuple[Fit, RandomForceFit]:
+    """The given effects and a random disturbance, each fitted beside the other.
+
+    Args:
+        evidence: of the rig with the given effects, where it is at hand.
+    """
+    rig = _rig_with(search, given)
+    found = _random_beside(search, given, rig, evidence or Evidence.of(rig, search.data, 20))
+    if given.effects and not found[1].holds and search.near(found[0], NEAR):
+        data = search.data.through(model_filter(Evidence.of(rig, search.data).model, rig, found[1]))
+        refitted = fit(search.rig, given.effects, data, iterations=8)
+        left = search.data.by_channel(search.data.residual(apply_all(search.rig, refitted.effects)))
+        again = replace(refitted, cost_by_channel=left)
+        rig = _rig_with(search, again)
+        found = _random_beside(search, again, rig, Evidence.of(rig, search.data, 20))
+    return found
+
+
+def _rig_with(search: Search, given: Fit) -> Rig:
+    return apply_all(search.rig, [e for e in given.effects if e.kind.name != "sensor_quantisation"])
+
+
+def _random_beside(search: Search, given: Fit, rig: Rig, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
+    found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.force_rms)
+    effect = Effect(
+        RANDOM_DISTURBANCE,
+        None,
+        {"at": found.at, "rms": found.rms},
+        {"at": found.at_std, "rms": found.rms_std},
+    )
+    combined = Fit(
+        (*given.effects, effect), found.cost, given.cost_by_channel, given.n_parameters + 2, "maximum likelihood"
+    )
+    return combined, found
