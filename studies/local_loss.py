@@ -20,7 +20,7 @@ from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 
 # The method was worked out on seeds below 1000.
-FIRST_SEED, CASES, FEWER = 5000, 10, 2
+FIRST_SEED, CASES, FEWER = 5000, 25, 5
 SHARE, WIDTH, LEVEL_DB, MODES = 0.2, 0.1, 40.0, 6
 LOWER_LEVELS = (20.0, 0.0)
 CHECKED = np.linspace(0.02, 0.98, 49)  # where the band of the stiffness is compared with the truth
