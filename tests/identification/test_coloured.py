@@ -5,11 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
 from workbench.identification.coloured import in_its_noise, noise_near
+from workbench.identification.driven import identify_driven
+from workbench.identification.long_records import identify_long
 from workbench.identification.order import identify
 from workbench.identification.refinement import refine
 from workbench.identification.synthesis import free_decay
+from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
 
 MODES = SampledModes([8.0, 30.0, 31.0], [0.01, 0.02, 0.012], [[1.0, 0.5, 0.7], [0.3, -0.8, 0.4]], [0.0, 1.0])
@@ -78,3 +82,45 @@ def test_noise_that_is_not_white_is_no_mode():
         noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(seed).standard_normal((2, 1400)), axis=1)[:, 200:]
         found = identify(replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std()))
         assert found.modes.n_modes == 3 and np.abs(found.modes.omega / MODES.omega - 1.0).max() < 0.002
+
+
+def within(normalised):
+    """Whether the squares of normalised errors may be those of unit normals, to one chance in a thousand each way."""
+    squares, size = float((normalised**2).sum()), normalised.size
+    return chi2.ppf(1e-3, size) < squares < chi2.isf(1e-3, size)
+
+
+def own_errors(found, truth):
+    errors = np.r_[found.modes.omega, found.modes.zeta] - truth
+    return errors / np.sqrt(np.diag(found.covariance))
+
+
+def test_long_records_say_their_errors_in_coloured_noise():
+    own = []
+    for seed in range(20):
+        noise = lfilter([1.0], [1.0, -0.9], np.random.default_rng(seed).standard_normal((2, 1400)), axis=1)[:, 200:]
+        record = replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std())
+        own.append(own_errors(identify_long([record], most_modes=3).refined, np.r_[MODES.omega, MODES.zeta]))
+    own = np.array(own)
+    # By mode, so that what is too wide for one does not make good what is too narrow for another.
+    assert all(within(own[:, [r, r + 3]]) for r in range(3))
+
+
+def test_driven_records_say_their_errors_in_coloured_noise():
+    """Two modes under a known force; noise that falls by 26 dB: one mode hears ten times what the other does."""
+    poles, seen = np.array([-0.15 + 10.0j, -0.5 + 60.0j]), np.array([[1.0, 0.8 + 0.1j], [0.5, -1.0]])
+    direct = np.array([0.02, -0.03])
+    own, feedthrough = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u = rng.standard_normal(600)
+        z = [lfilter([0.0, (m - 1.0) / p], [1.0, -m], u + 0j) for p, m in zip(poles, np.exp(0.02 * poles), strict=True)]
+        noise = lfilter([1.0], [1.0, -0.9], rng.standard_normal((2, 800)), axis=1)[:, 200:]
+        y = (seen @ np.array(z)).real + np.outer(direct, u) + 0.01 * noise / noise.std()
+        channels = (Channel("a", "velocity"), Channel("b", "velocity"))
+        record = Record(0.02, y, channels, u[None], (Channel("f", "force"),))
+        found = identify_driven(record, most_modes=2)
+        own.append(own_errors(found, np.r_[np.abs(poles), -poles.real / np.abs(poles)]))
+        feedthrough.append((found.feedthrough[:, 0] - direct) / found.feedthrough_std[:, 0])
+    own = np.array(own)
+    assert within(own[:, [0, 2]]) and within(own[:, [1, 3]]) and within(np.array(feedthrough))

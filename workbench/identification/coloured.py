@@ -108,6 +108,22 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> n
     return factors
 
 
+def heard_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.ndarray:
+    """Noise over its mean that the coefficient of a signal hears, (n_signals, n_outputs); 1 where it may be white.
+
+    Args:
+        signals: (n_samples, n_signals).
+        residual: (n_samples, n_outputs) what a fit leaves, over its standard deviation.
+        n_modes: taken out of it.
+    """
+    power, heard = (np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in (residual / np.sqrt(len(residual)), signals))
+    whole = heard.sum(axis=0)
+    along = (heard / np.where(whole > 0, whole, 1.0)).T @ power
+    # A constant hears what lies about zero.
+    along[whole <= 1e-20 * len(signals)] = power[: 2 * LEAST_BINS].mean(axis=0)
+    return np.where(_white(power, n_modes), 1.0, along)
+
+
 def _listens(away: np.ndarray) -> np.ndarray:
     """Power of t e^{λt}, over that at its own frequency."""
     return (1.0 + away**2) ** -2.0

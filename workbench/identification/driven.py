@@ -20,18 +20,10 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.signal import lfilter
 
+from workbench.identification.coloured import heard_along, noise_near
+from workbench.identification.fit_errors import errors, fixed_std, pole_covariance
 from workbench.identification.ibrahim import check_alike, normalised_shapes
-from workbench.identification.modal_fit import (
-    FALSE_ALARM,
-    MOST_DAMPED,
-    Fit,
-    Told,
-    covariance,
-    errors,
-    free_parameters,
-    moves,
-    tell,
-)
+from workbench.identification.modal_fit import FALSE_ALARM, MOST_DAMPED, Fit, Told, free_parameters, tell
 from workbench.identification.noise_levels import differ, variances
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
@@ -53,7 +45,7 @@ class Driven(StandardErrors):
 
     Attributes:
         modes: shapes of displacement, largest entry 1.
-        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
+        covariance: (2 n_modes, 2 n_modes) of (ω, ζ); in white noise the Cramér-Rao bound at the estimate.
         shape_std: (n_outputs, n_modes) standard error of the real part of each shape.
         participation: (n_modes, n_inputs) complex l_r, for c_r the shape as the outputs measure it, ψ_r λ_r^k with
             k = 0, 1, 2 for displacement, velocity, acceleration.
@@ -153,7 +145,7 @@ def identify_driven(
         false_alarm: chance that noise alone is taken for a mode.
 
     Returns:
-        `Driven`. Its standard errors hold where what is left is white noise of the sensors.
+        `Driven`. Its standard errors hold in noise of any smooth spectrum.
 
     Raises:
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
@@ -249,6 +241,25 @@ class _Inputs:
         self.weights = weights / np.sqrt((weights**2).mean(axis=0))
         self.values = self.weights * raw
         return True
+
+    def heard(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Noise over its mean that each mode, (n_outputs, n_modes), and each fixed column, (n_fixed, n_outputs), hears:
+        of each record as much as the mode swings in it."""
+        std = np.sqrt(variances(*self._left(fit)))
+        swings = np.column_stack([self._swing(pole, load) for pole, load in zip(fit.poles, fit.loads)])
+        near, beside, energy, power = [], [], [], []
+        for k, rows in enumerate(self.rows):
+            weights = np.ones(std.shape[1]) if self.weights is None else self.weights[rows.start]
+            left = fit.residual[rows] / std[k]
+            near.append(noise_near(fit.poles, left, self.dt))
+            beside.append(heard_along(self.fixed[rows], left, fit.poles.size))
+            energy.append(np.outer(weights**2, (np.abs(swings[rows]) ** 2).sum(axis=0)))
+            power.append(np.outer((self.fixed[rows] ** 2).sum(axis=0), weights**2))
+        return np.average(near, axis=0, weights=energy), np.average(beside, axis=0, weights=np.array(power) + 1e-300)
+
+    def _swing(self, pole: complex, load: np.ndarray) -> np.ndarray:
+        real, imaginary = self.answers(pole)
+        return (real + 1j * imaginary) @ load
 
     def _left(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         """Squares of what is left, records counted as they are, and their degrees of freedom."""
@@ -364,7 +375,8 @@ def _report(records: Sequence[Record], drive: _Inputs, told: Told) -> Driven:
         driven = (loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None])[:, :n_inputs]
         return np.concatenate([relative.real.ravel(), driven.real.ravel(), driven.imag.ravel()])
 
-    std = np.sqrt(np.diag(errors(fit, figures)))
+    heard, beside = drive.heard(fit)
+    std = np.sqrt(np.diag(errors(fit, figures, heard)))
     m = len(channels)
     shape_std = std[: m * n].reshape(m, n)
     shape_std[largest, each] = 0.0
@@ -373,10 +385,10 @@ def _report(records: Sequence[Record], drive: _Inputs, told: Told) -> Driven:
     direct_std = np.zeros((m, n_inputs))
     if drive.feedthrough:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
-        direct_std = _fixed_std(fit)[2 * n : 2 * n + n_inputs].T
+        direct_std = fixed_std(fit, heard, beside)[:n_inputs].T
     return Driven(
         modes=SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, records[0].positions),
-        covariance=frozen(pole_covariance(fit)),
+        covariance=frozen(pole_covariance(fit, heard)),
         shape_std=frozen(shape_std),
         participation=frozen(loads[:, :n_inputs], complex),
         participation_std=frozen(np.sqrt(0.5 * (real**2 + imaginary**2))),
@@ -392,27 +404,3 @@ def _report(records: Sequence[Record], drive: _Inputs, told: Told) -> Driven:
         output_channels=channels,
         input_channels=records[0].input_channels,
     )
-
-
-def pole_covariance(fit: Fit) -> np.ndarray:
-    """Of (ω, ζ), (2 n_modes, 2 n_modes): with λ = x + iy, dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
-    n, q = fit.poles.size, fit.loads.shape[1] + 1
-    free = free_parameters(fit)
-    real = np.searchsorted(free, q * np.arange(n))
-    at = np.r_[real, np.searchsorted(free, q * n + q * np.arange(n))]
-    x, y, omega = fit.poles.real, fit.poles.imag, np.abs(fit.poles)
-    jacobian = np.block(
-        [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
-    )
-    return jacobian @ covariance(fit)[np.ix_(at, at)] @ jacobian.T
-
-
-def _fixed_std(fit: Fit) -> np.ndarray:
-    """Standard errors of all coefficients, (n_columns, n_outputs)."""
-    bound, free, first, found = covariance(fit), free_parameters(fit), 0, []
-    for part in fit.parts:
-        drift = np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)[:, free])
-        own = np.diag(part.spread)[:, None] * fit.noise[first : first + part.residual.shape[1]] ** 2
-        first += part.residual.shape[1]
-        found.append(np.sqrt(own + np.einsum("ckj,kl,clj->cj", drift, bound, drift)))
-    return np.hstack(found)
