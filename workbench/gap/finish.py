@@ -12,6 +12,8 @@ from workbench.gap.search import Search
 
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
 NO_NEARER = 0.9
+TRIED = 2  # iterations at each other place, before the likeliest are chosen
+APART = 0.02  # of the length: nearer, a place is the same valley
 FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
@@ -38,7 +40,7 @@ def relocated(search: Search, candidate: Fit) -> Fit:
 
 
 def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tuple[Effect, ...]]:
-    """The set with effect i at the two likeliest other places, each at its likeliest strength, and mirrored."""
+    """The set with effect i at the two likeliest other places, and mirrored."""
     effect, length = effects[i], search.rig.modes.length
 
     def moved(at: float, factor: float = 1.0) -> tuple[Effect, ...]:
@@ -48,15 +50,16 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
         return (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
 
     strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name != "at"), None)
+    # where the structure moves less, the same effect takes more strength
     factors = FACTORS if strength is not None else (1.0,)
-    likeliest = []
+    tried = []
     for at in length * np.linspace(0.04, 0.96, 13):
-        # where the structure moves less, the same effect takes more strength
-        tried = [(cost_of(search.rig, moved(at, factor), search.first), at, factor) for factor in factors]
-        likeliest.append(min(tried))
-    likeliest.sort()
+        likeliest = min((moved(at, factor) for factor in factors), key=lambda s: cost_of(search.rig, s, search.first))
+        tried.append(fit(search.rig, likeliest, search.first, iterations=TRIED))
+    tried.sort(key=lambda f: f.cost)
+    elsewhere = [f for f in tried if abs(f.effects[i].values["at"] - effect.values["at"]) > APART * length]
     # the mirrored place is always worth a fit of its own, whatever its cost before it
-    return [*(moved(at, factor) for _, at, factor in likeliest[:2]), moved(length - effect.values["at"])]
+    return [*(f.effects for f in elsewhere[:2]), moved(length - effect.values["at"])]
 
 
 def simplest(search: Search, candidate: Fit) -> Fit:

@@ -77,6 +77,8 @@ class _Problem:
             for (_, p), z in zip(self.parameters, self.start, strict=True)
         ]
         self.steps = np.array(floor)
+        self.low = np.array([p.to_free(p.low) for _, p in self.parameters])
+        self.high = np.array([p.to_free(p.high) for _, p in self.parameters])
         # a believed value is one more measurement: of itself, by its own standard deviation
         self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
         self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
@@ -160,13 +162,11 @@ def fit(
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
         jacobian = problem.jacobian(free, residual)
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        normal = jacobian.T @ jacobian
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         improved: np.ndarray | None = None
         for _ in range(7):
-            step = -np.linalg.solve(normal + damping * np.diag(diagonal), gradient)
-            step = step + _bend(problem, free, residual, jacobian, normal + damping * np.diag(diagonal), step)
-            step = np.clip(step, -_LONGEST * _reach(problem), _LONGEST * _reach(problem))
+            step = _step(problem, free, residual, jacobian, normal + damping * np.diag(diagonal))
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
                 improved = trial
@@ -184,18 +184,39 @@ def fit(
     return _result(problem, free, residual, normal, status, falling)
 
 
-def _bend(problem: _Problem, free, residual, jacobian, damped, step) -> np.ndarray:
+def _step(problem: _Problem, free, residual, jacobian, damped) -> np.ndarray:
+    """The damped step, bent along its valley, no longer than is sensible, and inside the bounds.
+
+    A number that stands at a bound and would pass it stays there, and the others step without it.
+    """
+    moving = np.ones(free.size, bool)
+    step = np.zeros(free.size)
+    for _ in range(free.size):
+        among = np.ix_(moving, moving)
+        step[moving] = -np.linalg.solve(damped[among], jacobian[:, moving].T @ residual)
+        leaving = moving & (((free <= problem.low) & (step < 0)) | ((free >= problem.high) & (step > 0)))
+        if not leaving.any():
+            break
+        moving &= ~leaving
+        step[leaving] = 0.0
+    step = step + _bend(problem, free, residual, jacobian, damped, step, moving)
+    step = np.clip(step, -_LONGEST * _reach(problem), _LONGEST * _reach(problem))
+    return np.clip(free + step, problem.low, problem.high) - free
+
+
+def _bend(problem: _Problem, free, residual, jacobian, damped, step, moving) -> np.ndarray:
     """What the step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
 
     Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
     """
-    if step.size < 2:
-        return np.zeros_like(step)
+    turn = np.zeros_like(step)
+    if moving.sum() < 2:
+        return turn
     beside = problem.residual(free + BENT * step)
     if beside is None:
-        return np.zeros_like(step)
+        return turn
     curvature = 2.0 / BENT * ((beside - residual) / BENT - jacobian @ step)
-    turn = -0.5 * np.linalg.solve(damped, jacobian.T @ curvature)
+    turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], jacobian[:, moving].T @ curvature)
     return turn if 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step) else np.zeros_like(step)
 
 
