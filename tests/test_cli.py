@@ -100,6 +100,30 @@ def test_identify_reads_records_with_inputs_and_ambient_ones(tmp_path):
     assert abs(ambient["frequencies_hz"][0] * 2 * np.pi - abs(pole)) < 4 * ambient["frequencies_std_hz"][0] * 2 * np.pi
 
 
+def test_identify_reads_transfer_functions(tmp_path):
+    lines, omega, zeta = np.linspace(1.0, 30.0, 400), 2.0 * np.pi * np.array([8.0, 19.0]), 0.01
+    s = 2j * np.pi * lines
+    shapes = np.array([[1.0, 0.6], [0.5, -1.0], [-0.2, 0.3]])
+    h = shapes @ (s**2 / (s**2 + 2.0 * zeta * np.outer(omega, s) + omega[:, None] ** 2))
+    noise = np.random.default_rng(0).standard_normal((2, *h.shape))
+    path, found = tmp_path / "frf.npz", tmp_path / "found.json"
+    np.savez(path, frequency_hz=lines, H=h + 0.02 * (noise[0] + 1j * noise[1]))
+    result = run("identify", path, "--json", found)
+    assert result.exit_code == 0 and "transfer functions of 3 outputs and 1 input, 400 lines" in result.output
+    modes = json.loads(found.read_text())
+    scores = (np.array(modes["frequencies_hz"]) - [8.0, 19.0]) / modes["frequencies_std_hz"]
+    assert np.abs(scores).max() < 4.0 and modes["sensors"] == ["H 1", "H 2", "H 3"]
+    one = run("identify", path, "--outputs", "H 2", "--band-hz", 5, 12, "--json", found)
+    assert one.exit_code == 0 and len(json.loads(found.read_text())["frequencies_hz"]) == 1
+    for options, said in (
+        (("--start", 1.0), "leave --start and --ambient out"),
+        (("--inputs", "a"), "name no inputs"),
+        (("--outputs", "x"), "has no output 'x'"),
+    ):
+        refused = run("identify", path, *options)
+        assert refused.exit_code == 2 and said in " ".join(refused.output.split())
+
+
 def test_design_reports_the_works_of_section_5_8(rig, tmp_path):
     found = tmp_path / "design.json"
     result = run("design", rig, "--control", 4, "--weight", 20, "--final-time", 3000, "--json", found)

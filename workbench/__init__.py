@@ -16,8 +16,9 @@ _HOMES = {
     "structure.modes": ("Modes", "SampledModes", "mac"),
     "structure.modification": ("attach",),
     "records.record": ("Channel", "Record"),
-    "records.files": ("read_record", "write_record"),
+    "records.files": ("read_measured", "read_record", "write_record"),
     "records.transfer": ("impulse_record",),
+    "records.transfer_functions": ("TransferFunctions",),
     "rig.actuators": ("Actuator",),
     "rig.sensors": ("Sensor",),
     "rig.elements": (

@@ -201,21 +201,24 @@ def identify(
     inputs: Annotated[str, typer.Option(help="Names of measured inputs, with commas between: driven by them.")] = "",
     ambient: Annotated[bool, typer.Option("--ambient", help="Driven by unknown broadband forces all along.")] = False,
     outputs: Annotated[str, typer.Option(help="Names of the outputs to read, with commas between; else all.")] = "",
+    band_hz: Annotated[
+        tuple[float, float] | None, typer.Option(help="Lowest and highest line of transfer functions to fit.")
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Find the modes of ring-downs, or of driven records, each figure with its standard error.
+    """Find the modes of ring-downs, driven records or transfer functions, each figure with its standard error.
 
     Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """
-    from workbench.records.files import read_record
+    from workbench.records.files import read_measured
     from workbench.study.modes_told import HEADINGS, told_of
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
-    read = [read_record(path, sample_rate_hz=sample_rate_hz, inputs=_names(inputs)) for path in records]
+    read = [read_measured(path, sample_rate_hz=sample_rate_hz, inputs=_names(inputs)) for path in records]
     if outputs:
-        read = [record.only(_names(outputs)) for record in read]
-    told = told_of(read, start=start, n_modes=modes, ambient=ambient)
+        read = [measured.only(_names(outputs)) for measured in read]
+    told = told_of(read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz)
     shown = Table(box=None, pad_edge=False)
     for heading in HEADINGS:
         shown.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)

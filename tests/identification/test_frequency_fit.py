@@ -57,6 +57,40 @@ def test_modes_of_the_band_whatever_lies_beyond(quantity):
     assert 0.3 < (np.array(errors) ** 2).mean() < 2.2
 
 
+def test_errors_grow_where_what_is_left_is_louder():
+    """Noise ten times as loud about mode 3: by the bound of even noise its squared scores would average near 6."""
+    modes, h, channels = beam("acceleration")
+    h, scores = h[:, :1], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        std = 0.002 * np.abs(h).mean() * np.where(np.abs(F - 9.8) < 2.0, 10.0, 1.0)
+        measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+        found = identify_transfer(measured, F, channels=channels, most_modes=4)
+        r = int(np.argmin(np.abs(found.modes.omega - modes.omega[2])))
+        scores.append((found.modes.omega[r] - modes.omega[2]) / found.omega_std[r])
+        scores.append((found.modes.zeta[r] - 0.01) / found.zeta_std[r])
+    assert 0.1 < np.mean(np.square(scores)) < 3.3  # χ² of 8, one chance in a thousand either way
+
+
+def test_many_lines_are_fitted_band_after_band():
+    """The same cantilever on 2500 lines: what the bands say together, with modes at their edges found once."""
+    structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")
+    modes, lines = structure.modes(8), np.linspace(1.0, 60.0, 2500)
+    modes = type(modes)(modes.omega, np.full(8, 0.01), modes.shapes, modes.length, modes.essential)
+    sensors = [Sensor(f"y{k}", x, "acceleration") for k, x in enumerate(PLACES)]
+    h = state_space(modes, [Actuator("h1", 0.37)], sensors)(2j * np.pi * lines)
+    rng = np.random.default_rng(0)
+    h = h + 0.01 * np.abs(h).mean() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+    channels = tuple(Channel(s.name, "acceleration", at=s.at) for s in sensors)
+    found = identify_transfer(h, lines, channels=channels)
+    inside = modes.frequencies_hz[(modes.frequencies_hz > 1.0) & (modes.frequencies_hz < 60.0)]
+    rings = np.flatnonzero(found.modes.zeta < 0.05)
+    assert found.fitted.shape == (4, 1, 2500) and found.frequencies_hz.size == 2500
+    assert rings.size == inside.size
+    assert np.abs((found.modes.frequencies_hz[rings] - inside) / (found.omega_std[rings] / 2 / np.pi)).max() < 4.0
+    assert found.covariance.shape == (2 * found.modes.n_modes,) * 2
+
+
 def test_noise_from_coherence():
     """H1 of noisy averages against its own scatter over many trials."""
     rng, averages, trials = np.random.default_rng(0), 40, 3000

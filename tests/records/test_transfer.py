@@ -1,8 +1,11 @@
+import h5py
 import numpy as np
 import pytest
+import pyuff
 from scipy.io import savemat
 
 from workbench.records.file_error import RecordFileError
+from workbench.records.files import read_measured, read_record
 from workbench.records.record import Channel, Record
 from workbench.records.resample import decimate
 from workbench.records.transfer import impulse_record
@@ -52,3 +55,100 @@ def test_read_transfer(tmp_path):
     (tmp_path / "bad.mat").write_bytes(b"not a mat file")
     with pytest.raises(RecordFileError, match="cannot be read"):
         read_transfer(tmp_path / "bad.mat", positions=[0], quantity="acceleration")
+
+
+LINES = np.linspace(1.0, 40.0, 50)
+SPECTRA = np.random.default_rng(0).standard_normal((3, 2, 50)) * (1.0 + 0.5j)
+
+
+def save(path, arrays):
+    if path.suffix == ".mat":
+        savemat(path, arrays)
+    elif path.suffix == ".npz":
+        np.savez(path, **arrays)
+    else:
+        with h5py.File(path, "w") as file:
+            for name, values in arrays.items():
+                file[name] = values
+    return path
+
+
+@pytest.mark.parametrize("ending", [".mat", ".npz", ".h5"])
+@pytest.mark.parametrize(
+    ("arrays", "values", "names"),
+    [
+        ({"frequency_hz": LINES, "H": SPECTRA}, SPECTRA, ("H 1", "H 2", "H 3")),
+        ({"f": LINES, "H": SPECTRA[:, 0].T}, SPECTRA[:, :1], ("H 1", "H 2", "H 3")),
+        ({"omega": 2 * np.pi * LINES, "a": SPECTRA[0, 0], "b": SPECTRA[1, 0]}, SPECTRA[:2, :1], ("a", "b")),
+    ],
+)
+def test_arrays_of_transfer_functions_are_read_whichever_way_they_lie(tmp_path, ending, arrays, values, names):
+    found = read_measured(save(tmp_path / f"x{ending}", arrays))
+    np.testing.assert_allclose(found.values, values, rtol=1e-15)
+    np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-14)
+    assert found.output_names == names
+    np.testing.assert_array_equal(found.only(names[1:2]).values, found.values[1:2])
+
+
+def test_lines_up_to_half_the_sample_rate(tmp_path):
+    """As pydvma keeps them: the rate under `freq`, the number of samples beside it; or the rate given."""
+    told = save(tmp_path / "told.npz", {"yspec": SPECTRA[0].T, "freq": 200, "npts": 98})
+    bare = save(tmp_path / "bare.npz", {"yspec": SPECTRA[0].T})
+    for found in (read_measured(told), read_measured(bare, sample_rate_hz=200.0)):
+        np.testing.assert_allclose(found.frequencies_hz, np.linspace(0.0, 100.0, 50))
+    with pytest.raises(RecordFileError, match=r"complex.*give the sample rate"):
+        read_measured(bare)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "match"),
+    [
+        ({"f": LINES[:-1], "H": SPECTRA}, "no axis is as long"),
+        ({"f": LINES[:2], "H": SPECTRA[:2, :, :2]}, "which axis they run along cannot be told"),
+        ({"f": LINES, "w": LINES, "H": SPECTRA}, "two arrays of frequencies"),
+        ({"f": LINES, "H": SPECTRA, "G": SPECTRA}, "several complex arrays"),
+        ({"f": LINES[::-1], "H": SPECTRA}, "increase from line to line"),
+        ({"f": LINES, "H": SPECTRA, "positions": [0.0, 1.0]}, "2 places of 3 points"),
+    ],
+)
+def test_transfer_functions_that_cannot_be_read_as_meant_are_refused(tmp_path, arrays, match):
+    with pytest.raises(RecordFileError, match=match):
+        read_measured(save(tmp_path / "x.npz", arrays))
+
+
+def test_a_table_of_real_and_imaginary_parts(tmp_path):
+    path = tmp_path / "x.csv"
+    columns = [LINES, *(part(row) for row in SPECTRA[:2, 0] for part in (np.real, np.imag))]
+    np.savetxt(path, np.column_stack(columns), delimiter=",", comments="",
+               header="frequency [Hz],tip real,tip imag,root real,root imag")  # fmt: skip
+    found = read_measured(path)
+    np.testing.assert_allclose(found.values, SPECTRA[:2, :1], rtol=1e-15)
+    assert found.output_names == ("tip", "root")
+    with pytest.raises(RecordFileError, match=r"transfer functions.*identify_transfer"):
+        read_record(path)
+
+
+def save_58(path, pairs, function=4):
+    file = pyuff.UFF(str(path))
+    for output, reference, values in pairs:
+        file.write_sets(
+            pyuff.prepare_58(binary=0, func_type=function, rsp_node=output, rsp_dir=3, ref_node=reference, ref_dir=3,
+                             ordinate_spec_data_type=12, orddenom_spec_data_type=13, abscissa_spec_data_type=18,
+                             num_pts=LINES.size, abscissa_spacing=1, abscissa_min=LINES[0],
+                             abscissa_inc=LINES[1] - LINES[0], x=LINES, data=values, return_full_dict=False),
+            mode="add",
+        )  # fmt: skip
+    return path
+
+
+def test_universal_files_of_transfer_functions(tmp_path):
+    pairs = [(j + 1, i + 7, SPECTRA[j, i]) for j in range(3) for i in range(2)]
+    found = read_measured(save_58(tmp_path / "x.uff", pairs))
+    np.testing.assert_allclose(found.values, SPECTRA, rtol=1e-6)
+    np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-6)
+    assert [c.quantity for c in found.output_channels] == ["acceleration"] * 3
+    assert found.references == ("node 7 direction 3", "node 8 direction 3")
+    with pytest.raises(RecordFileError, match="lacks the transfer function from node 8 direction 3 to node 3"):
+        read_measured(save_58(tmp_path / "less.uff", pairs[:-1]))
+    with pytest.raises(RecordFileError, match="complex"):
+        read_measured(save_58(tmp_path / "other.uff", pairs[:1], function=9))

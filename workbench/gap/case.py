@@ -9,7 +9,7 @@ import numpy as np
 from workbench.gap.tables import CaseError, check_keys, count, number, numbers, profile, shown, table_of, tables, text
 from workbench.records.file_error import RecordFileError
 from workbench.records.limits import check_size
-from workbench.records.npz_file import load_arrays
+from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

@@ -6,20 +6,27 @@ for outputs that are the k-th time derivative of a displacement: D is what the m
 modes below it. Each mode is one shape and one participation of each reference, however many were struck or shaken.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from workbench.identification.driven import pole_covariance
 from workbench.identification.ibrahim import normalised_shapes
-from workbench.identification.modal_fit import FALSE_ALARM, MOST_DAMPED, errors, tell
+from workbench.identification.modal_fit import FALSE_ALARM, MOST_DAMPED, Fit, Told, basis_of, errors, tell
 from workbench.identification.standard_errors import StandardErrors
-from workbench.identification.synthesis import time_derivatives
+from workbench.identification.synthesis import TIME_DERIVATIVE, time_derivatives
 from workbench.records.record import Channel
 from workbench.structure.modes import SampledModes, frozen
 
+# Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
+MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
 MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
+# Widths beside a mode, and the chance that even noise is taken for uneven.
+DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,55 +91,114 @@ def identify_transfer(
 ) -> TransferModes:
     """The modes that measured transfer functions show, as many as there are, each with its standard error.
 
+    More than 1500 lines are fitted a band after another, each of which looks beyond its edges.
+
     Args:
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
             input; of receptance, mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
-        channels: one an output.
+        channels: one an output; where no quantity is told, the modes beyond the band may look like any motion.
         band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
         noise_std: standard error of real and imaginary part, of the shape of `transfer`: from repeated measurements,
-            or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output.
-        most_modes: where to stop at the latest.
+            or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, and standard
+            errors grow with what is left about each mode where that is louder than elsewhere.
+        most_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
 
     Raises:
         ValueError: shapes that do not fit, values that are no numbers, a band with too few lines, no mode.
     """
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
-    lines = _Lines(h, 2.0 * np.pi * f, time_derivatives(channels), noise)
-    told = tell(lines, most_modes=min(most_modes, f.size // 3), false_alarm=false_alarm)
-    fit = told.fit
-    inside = np.flatnonzero((fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1]))
-    n = inside.size
-    if n == 0:
+    n_bands, each_own = (1, 3) if f.size <= MOST_LINES else (-(-f.size // BAND), LINES_A_MODE)
+    found, share = [], f.size / n_bands
+    for k in range(n_bands):
+        first, last = round(k * share), round((k + 1) * share)
+        inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
+        edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
+        band = _Lines(
+            h[..., inside],
+            2.0 * np.pi * f[inside],
+            _residual_powers(channels),
+            None if noise is None else noise[..., inside],
+        )
+        told = tell(band, most_modes=min(most_modes, band.lines // each_own), false_alarm=false_alarm / n_bands)
+        found.append(_modes_of(band, told, channels, edges, f[first:last]))
+    whole = _together(found, channels) if n_bands > 1 else found[0]
+    if whole.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
             " averages"
         )
+    return whole
+
+
+def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
+    """The modes of a band between its edges; the fit at the lines shown."""
+    fit = told.fit
+    damped_hz = fit.poles.imag / (2.0 * np.pi)
+    within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
+    inside = np.flatnonzero(within & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
+    n = inside.size
     derivative = time_derivatives(channels)[:, None]
     poles, loads = fit.poles[inside], fit.loads[inside]
     seen = fit.amplitudes[:, inside] / poles**derivative
-    shapes, largest, each = normalised_shapes(seen), np.abs(seen).argmax(axis=0), np.arange(n)
+    largest, each = np.abs(seen).argmax(axis=0), np.arange(n)
 
     def relative(poles, loads, amplitudes):
         seen = amplitudes[:, inside] / poles[inside] ** derivative
         return (seen / seen[largest, each]).real.ravel()
 
-    std = np.sqrt(np.diag(errors(fit, relative))).reshape(len(channels), n)
-    std[largest, each] = 0.0
-    both = np.r_[inside, fit.poles.size + inside]
-    left = lines.unstacked(fit.residual if lines.weights is None else fit.residual / lines.weights)
+    std = np.zeros((len(channels), n))
+    covariance = np.zeros((2 * n, 2 * n))
+    if n:
+        std = np.sqrt(np.diag(errors(fit, relative))).reshape(len(channels), n)
+        std[largest, each] = 0.0
+        both = np.r_[inside, fit.poles.size + inside]
+        louder = np.sqrt(lines.louder_near(fit)[inside])
+        std, covariance = std * louder, pole_covariance(fit)[np.ix_(both, both)] * np.outer(*[np.tile(louder, 2)] * 2)
+    shapes = normalised_shapes(seen) if n else seen
+    at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     return TransferModes(
         modes=SampledModes(np.abs(poles), -poles.real / np.abs(poles), shapes, _places(channels)),
-        covariance=frozen(pole_covariance(fit)[np.ix_(both, both)]),
+        covariance=frozen(covariance),
         shape_std=frozen(std),
         participation=frozen(loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
         misfit=frozen(fit.noise),
         evidence=frozen(told.evidence[inside]),
         converged=fit.converged,
-        fitted=frozen(h - left, complex),
-        frequencies_hz=frozen(f),
+        fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
+        frequencies_hz=frozen(shown_hz),
     )
+
+
+def _together(found: Sequence[TransferModes], channels) -> TransferModes:
+    """The modes of all bands, each fitted in its own."""
+    each = [band.modes for band in found]
+    n = [modes.n_modes for modes in each]
+    covariance = block_diag(*(band.covariance for band in found))
+    first = np.concatenate([np.arange(k) + 2 * sum(n[:i]) for i, k in enumerate(n)]).astype(int)
+    both = np.r_[first, first + np.repeat(n, n)]
+    omega, zeta = (np.concatenate([getattr(modes, name) for modes in each]) for name in ("omega", "zeta"))
+    shapes = np.hstack([modes.shapes for modes in each])
+    share = np.array([band.frequencies_hz.size for band in found]) / sum(band.frequencies_hz.size for band in found)
+    return TransferModes(
+        modes=SampledModes(omega, zeta, shapes, _places(channels)),
+        covariance=frozen(covariance[np.ix_(both, both)]),
+        shape_std=frozen(np.hstack([band.shape_std for band in found])),
+        participation=frozen(np.vstack([band.participation for band in found]), complex),
+        misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
+        evidence=frozen(np.concatenate([band.evidence for band in found])),
+        converged=all(band.converged for band in found),
+        fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
+        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
+    )
+
+
+def _residual_powers(channels) -> list[int]:
+    """Of s, with what modes above and below the band leave in it."""
+    told = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in TIME_DERIVATIVE}
+    above = told or {0, 2}
+    return sorted({int(power) for k in above for power in (k, k - 2)})
 
 
 def _places(channels) -> np.ndarray:
@@ -147,8 +213,8 @@ def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
             f"transfer functions must have shape ({len(channels)} outputs, [n_references,] {f.size} frequencies); got"
             f" {np.shape(transfer)}. Is frequency the last axis?"
         )
-    if not np.isfinite(h).all() or not np.isfinite(f).all() or (np.diff(f) <= 0).any():
-        raise ValueError("transfer functions must be finite, at finite frequencies that increase; leave bad lines out")
+    if not np.isfinite(f).all() or (np.diff(f) <= 0).any():
+        raise ValueError("transfer functions need finite frequencies that increase; sort them, each once")
     noise = None if noise_std is None else np.asarray(noise_std, float).reshape(np.shape(transfer)).reshape(h.shape)
     if noise is not None and not ((noise > 0) & np.isfinite(noise)).all():
         raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
@@ -156,18 +222,21 @@ def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
     keep = (f >= low) & (f <= high) & (f > 0)
     if keep.sum() < 12:
         raise ValueError(f"{int(keep.sum())} lines lie between {low:g} and {high:g} Hz; a fit needs 12 or more")
+    bad = np.argwhere(~np.isfinite(h[:, :, keep]))
+    if len(bad):
+        j, _, line = bad[0]
+        raise ValueError(f"output {channels[j].name!r} is no number at {f[keep][line]:g} Hz; leave that line out")
     return h[:, :, keep], f[keep], None if noise is None else noise[:, :, keep]
 
 
 class _Lines:
     """Lines of a spectrum as a `modal_fit.Drive`: rows are real, then imaginary parts, reference by reference."""
 
-    def __init__(self, h: np.ndarray, omega: np.ndarray, derivative: np.ndarray, noise: np.ndarray | None) -> None:
+    def __init__(self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None) -> None:
         self.omega, (_, self.refs, self.lines) = omega, h.shape
         self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
         self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
         s = 1j * omega / omega[-1]
-        powers = sorted({int(p) for k in derivative for p in (k, k - 2)})
         self.fixed = self._stacked(np.array([self._of(i, s**p) for i in range(self.refs) for p in powers]))
         self.resolution = float(np.diff(omega).min())
         # A pole may leave the band: one close beyond it is no constant there. It counts among what is left out.
@@ -220,6 +289,37 @@ class _Lines:
         order = np.argsort(np.concatenate(strength))[::-1]
         beyond = np.r_[0.6 * self.omega[0], 0.9 * self.omega[0], np.array([1.05, 1.2, 1.5]) * self.omega[-1]]
         return np.r_[np.concatenate(found)[order[: 3 * PEAKS_A_RATE]], (-0.01 + 1j) * beyond]
+
+    def fitted(self, fit: Fit) -> np.ndarray:
+        """The model at the lines, (n_outputs, n_references, n_frequencies)."""
+        return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
+
+    def louder_near(self, fit: Fit) -> np.ndarray:
+        """What is left about each mode as the mode hears it, in power, over the mean of all lines, (n_modes,).
+
+        It is heard by swings a few widths beside the mode, each output as much as it shows the mode. 1 where that may
+        be noise alike at all lines.
+        """
+        residual, noise = fit.residual / fit.noise, fit.noise
+        found = np.ones(fit.poles.size)
+        if self.weights is not None:
+            return found  # told beforehand
+        basis = basis_of(self, fit)
+        for r, pole in enumerate(fit.poles):
+            shown = (np.abs(fit.amplitudes[:, r]) / noise) ** 2
+            width = max(abs(pole.real), 0.5 * self.resolution)
+            heard = []
+            for beside in pole.imag + width * DETUNED:
+                if self.omega[0] < beside < self.omega[-1]:
+                    x = np.hstack(self.answers(-width + 1j * beside))
+                    x -= basis @ (basis.T @ x)  # of the rest the amplitudes have taken the noise
+                    heard.append((x.T @ residual) ** 2 / (x**2).sum(axis=0)[:, None])
+            if not heard:
+                continue
+            power = np.mean(heard, axis=(0, 1)) @ shown / shown.sum()
+            degrees = np.size(heard) / shown.size * shown.sum() ** 2 / (shown**2).sum()
+            found[r] = power if power > chi2.isf(LOUDER, degrees) / degrees else 1.0
+        return found
 
     def colour(self, residual: np.ndarray, pole: complex) -> float:
         power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))

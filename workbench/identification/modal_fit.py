@@ -288,7 +288,7 @@ def _grown(drive: Drive, fit: Fit, limit: float, most_modes: int) -> Fit:
     refused: list[complex] = []
     while fit.poles.size < most_modes and len(refused) < MOST_REFUSALS:
         tries = [pole for pole in _to_try(drive, fit) if not _near(drive, pole, refused)]
-        basis, left = _basis(drive, fit), fit.residual / fit.noise
+        basis, left = basis_of(drive, fit), fit.residual / fit.noise
         scored = [(*_added(drive, basis, left, pole), pole) for pole in tries]
         if not scored:
             break
@@ -340,7 +340,8 @@ def _added(drive: Drive, basis: np.ndarray, left: np.ndarray, pole: complex) -> 
     return float((seen**2).sum()), load
 
 
-def _basis(drive: Drive, fit: Fit) -> np.ndarray:
+def basis_of(drive: Drive, fit: Fit) -> np.ndarray:
+    """Orthonormal columns (n_rows, n_columns) that span the swings of a fit and what is fixed beside them."""
     swings = []
     for pole, load in zip(fit.poles, fit.loads):
         real, imaginary = drive.answers(pole)
@@ -416,7 +417,7 @@ def errors(fit: Fit, figures: Callable[[np.ndarray, np.ndarray, np.ndarray], np.
     """
     n, p = fit.loads.shape
     free, noise = free_parameters(fit), fit.noise
-    root = np.linalg.cholesky(covariance(fit) + 0.0)
+    root = _root(covariance(fit))
     size = n * (p + 1)
     at = (fit.poles, fit.loads, fit.amplitudes)
     base = figures(*at)
@@ -430,7 +431,7 @@ def errors(fit: Fit, figures: Callable[[np.ndarray, np.ndarray, np.ndarray], np.
         changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
     first = 0
     for part in fit.parts:
-        spread = np.linalg.cholesky(part.spread[: 2 * n, : 2 * n])
+        spread = _root(part.spread[: 2 * n, : 2 * n])
         for j in range(part.residual.shape[1]):
             for column in spread.T:
                 a = np.zeros_like(fit.amplitudes)
@@ -444,3 +445,10 @@ def errors(fit: Fit, figures: Callable[[np.ndarray, np.ndarray, np.ndarray], np.
         found.append((above - below) / 2e-3)
     jacobian = np.array(found).reshape(len(changes), base.size)
     return jacobian.T @ jacobian
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """R with R R^T = matrix, which round-off may have made singular."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

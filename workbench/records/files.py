@@ -12,7 +12,10 @@ from workbench.records.assembly import legible, record_of
 from workbench.records.checksum import KEY, checksum
 from workbench.records.file_error import RecordFileError, unreadable
 from workbench.records.limits import check_size
+from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
+from workbench.records.transfer_assembly import complex_columns, holds_transfer, transfer_of
+from workbench.records.transfer_functions import TransferFunctions
 
 FORMATS = {
     ".csv": csv_file,
@@ -35,6 +38,31 @@ def read_record(path: str | Path, *, sample_rate_hz: float | None = None, inputs
         inputs: names of the signals that went in, where the file does not say.
 
     Raises:
+        RecordFileError: naming file, channel and row, and what would be right; transfer functions.
+    """
+    found = read_measured(path, sample_rate_hz=sample_rate_hz, inputs=inputs)
+    if isinstance(found, TransferFunctions):
+        raise RecordFileError(
+            f"{path} is complex: it holds transfer functions, no record. Their modes are found by `workbench identify`,"
+            " or by read_measured and identify_transfer"
+        )
+    return found
+
+
+def read_measured(
+    path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = ()
+) -> Record | TransferFunctions:
+    """Read what a file holds: a record, or transfer functions where it is complex.
+
+    Transfer functions are complex arrays of MAT, NPZ or HDF5, shape ([n_outputs, [n_references,]] n_frequencies) with
+    the axes in any order, beside their lines (`frequency_hz`, `f`, ..., or `omega`) or a sample rate; data sets 58 of
+    UFF of the function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`.
+
+    Args:
+        path, inputs: as `read_record`.
+        sample_rate_hz: where the file itself tells no time, or no lines: they then go from zero to half of it.
+
+    Raises:
         RecordFileError: naming file, channel and row, and what would be right.
     """
     path = Path(path)
@@ -45,11 +73,21 @@ def read_record(path: str | Path, *, sample_rate_hz: float | None = None, inputs
         raise RecordFileError(f"{path} is empty")
     check_size(path)
     try:
-        time, signals, header = module.read(path)
+        if module is csv_file:
+            time, signals, header = csv_file.read(path)
+            arrays = complex_columns(signals)
+        else:
+            arrays = module.arrays(path)
+            if not holds_transfer(arrays):
+                time, signals, header = signals_of(path, arrays)
     except RecordFileError:
         raise
     except Exception as error:  # every reader of another's file has its own ways to fail
         raise unreadable(path, error) from error
+    if holds_transfer(arrays):
+        if inputs:
+            raise RecordFileError(f"{path} holds transfer functions, which name no inputs; leave them out")
+        return transfer_of(path, arrays, sample_rate_hz=sample_rate_hz)
     return record_of(path, time, signals, header, sample_rate_hz=sample_rate_hz, inputs=inputs)
 
 

@@ -9,12 +9,12 @@ import numpy as np
 from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
 from workbench.records.limits import check_counts
-from workbench.records.named_arrays import HEADER, Signals, numbered, signals_of
+from workbench.records.named_arrays import HEADER, numbered
 
 
-def read(path: Path) -> Signals:
-    """(time or None, signals by name, header text or None)."""
-    return signals_of(path, load_confined(__name__, path))
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """What the file holds, by name."""
+    return load_confined(__name__, path)
 
 
 def load(path: Path) -> dict[str, np.ndarray]:

@@ -9,15 +9,10 @@ import numpy as np
 
 from workbench.records.file_error import RecordFileError, unreadable
 from workbench.records.limits import check_counts
-from workbench.records.named_arrays import HEADER, Signals, signals_of
+from workbench.records.named_arrays import HEADER
 
 
-def read(path: Path) -> Signals:
-    """(time or None, signals by name, header text or None)."""
-    return signals_of(path, load_arrays(path))
-
-
-def load_arrays(path: Path) -> dict[str, np.ndarray]:
+def arrays(path: Path) -> dict[str, np.ndarray]:
     """The arrays of an archive, after a look at how large they are.
 
     Raises:
@@ -30,8 +25,8 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
         if len(set(names)) != len(names):
             raise RecordFileError(f"{path} is damaged: it holds an array twice")
         check_counts(path, len(members), sum(member.file_size for member in members) // 8)
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: np.asarray(arrays[name]) for name in arrays.files}
+        with np.load(path, allow_pickle=False) as held:
+            return {name: np.asarray(held[name]) for name in held.files}
     except RecordFileError:
         raise
     except Exception as error:  # damaged archives fail in many ways
@@ -40,6 +35,6 @@ def load_arrays(path: Path) -> dict[str, np.ndarray]:
 
 def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
     """Write all arrays and the header as text."""
-    arrays: dict[str, Any] = {"t": time, **signals, HEADER: np.array(json.dumps(header))}
+    held: dict[str, Any] = {"t": time, **signals, HEADER: np.array(json.dumps(header))}
     with path.open("wb") as file:
-        np.savez(file, **arrays)
+        np.savez(file, **held)

@@ -8,19 +8,21 @@ import pyuff
 
 from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
-from workbench.records.named_arrays import HEADER, Signals, signals_of
+from workbench.records.named_arrays import HEADER
+from workbench.records.transfer_assembly import TOLD
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}
 QUANTITIES = {code: name for name, code in TYPES.items()}
 LINE = 80
+TRANSFER = 4  # func_type of the format
 MARK = b"    -1"
 OURS = ('{"kind"', '"kind":', '"name":')
 
 
-def read(path: Path) -> Signals:
-    """(time or None, signals by name, header or None)."""
-    return signals_of(path, load_confined(__name__, path))
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """What the file holds, by name."""
+    return load_confined(__name__, path)
 
 
 def load(path: Path) -> dict[str, np.ndarray]:
@@ -32,13 +34,16 @@ def load(path: Path) -> dict[str, np.ndarray]:
     sets = [s for s in sets if s.get("type") == 58]
     if not sets:
         raise RecordFileError(f"{path} holds no data set 58")
+    transfer = [s for s in sets if s["func_type"] == TRANSFER]
+    if transfer:
+        return _transfer(path, transfer)
     arrays: dict[str, np.ndarray] = {}
     channels, record = [], None
     for number, entry in enumerate(sets, start=1):
         where = f"{path}, data set {number}"
         data = np.asarray(entry["data"])
         if np.iscomplexobj(data):
-            raise RecordFileError(f"{where} is complex: is it a transfer function?")
+            raise RecordFileError(f"{where} is complex, and says not that it is a transfer function (function type 4)")
         if data.size != entry["num_pts"]:
             raise RecordFileError(f"{where} holds {data.size} samples and says {entry['num_pts']}: it is damaged")
         facts = _facts(where, entry)
@@ -56,6 +61,33 @@ def load(path: Path) -> dict[str, np.ndarray]:
         raise RecordFileError(f"{path} is damaged: its description of the record is missing")
     header = (record or {}) | {"channels": channels}
     return arrays | {HEADER: np.array(json.dumps(header))}
+
+
+def _transfer(path: Path, sets: list[dict]) -> dict[str, np.ndarray]:
+    """All pairs of response and reference as one array, with their lines and names."""
+    lines = np.asarray(sets[0]["x"], float)
+    found: dict[tuple[str, str], np.ndarray] = {}
+    outputs: dict[str, str] = {}
+    for number, entry in enumerate(sets, start=1):
+        where, x = f"{path}, transfer function {number}", np.asarray(entry["x"], float)
+        data = np.asarray(entry["data"], complex)
+        if x.shape != lines.shape or data.shape != lines.shape or np.abs(x - lines).max() > 1e-6 * np.abs(lines).max():
+            raise RecordFileError(f"{where} has other lines than the first; keep those of one measurement")
+        pair = (f"node {entry['rsp_node']} direction {entry['rsp_dir']}",
+                f"node {entry['ref_node']} direction {entry['ref_dir']}")  # fmt: skip
+        if pair in found:
+            raise RecordFileError(f"{where}: a second one from {pair[1]} to {pair[0]}; keep one of them")
+        found[pair] = data
+        outputs[pair[0]] = QUANTITIES.get(entry["ordinate_spec_data_type"], "")
+    references = list(dict.fromkeys(pair[1] for pair in found))
+    for pair in ((output, reference) for output in outputs for reference in references):
+        if pair not in found:
+            raise RecordFileError(
+                f"{path} lacks the transfer function from {pair[1]} to {pair[0]}; the others are there"
+            )
+    values = np.array([[found[output, reference] for reference in references] for output in outputs])
+    told = {"outputs": [{"name": n, "quantity": q} for n, q in outputs.items()], "references": references}
+    return {"frequency_hz": lines, "transfer": values, TOLD: np.array(json.dumps(told))}
 
 
 def as_stored(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Modes found in records, told in lines, a table and JSON: what `workbench identify` says."""
+"""Modes found in what was measured, told in lines, a table and JSON: what `workbench identify` says."""
 
 import math
 from collections.abc import Sequence
@@ -9,14 +9,17 @@ import numpy as np
 from workbench.identification.ailments import check_fit
 from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
+from workbench.identification.frequency_fit import TransferModes, identify_transfer
 from workbench.identification.proportional import ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
-from workbench.records.record import Record
+from workbench.records.record import Channel, Record
+from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.modes import SampledModes
 
 TURN = 2.0 * math.pi
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 UNLIKELY, MOST_MODES = 0.01, 40
+BROAD = 0.1  # damping ratio
 
 
 @dataclass(frozen=True)
@@ -24,7 +27,7 @@ class ModesTold:
     """What is to be said.
 
     Attributes:
-        heading: of what records.
+        heading: of what.
         rows: one a mode, under `HEADINGS`; figures to the second digit of their standard errors.
         lines: all else.
         content: for JSON.
@@ -37,19 +40,41 @@ class ModesTold:
 
 
 def told_of(
-    records: Sequence[Record], *, start: float | None = None, n_modes: int | None = None, ambient: bool = False
+    measured: Sequence[Record | TransferFunctions],
+    *,
+    start: float | None = None,
+    n_modes: int | None = None,
+    ambient: bool = False,
+    band_hz: tuple[float, float] | None = None,
 ) -> ModesTold:
-    """The modes of records: driven where inputs move, by unknown forces with `ambient`, else free decays.
+    """The modes of transfer functions, or of records: driven where inputs move, by unknown forces with `ambient`, else
+    free decays.
 
     Args:
-        records: of the same sensors at one rate.
+        measured: records of the same sensors at one rate; or transfer functions, alone.
         start: read from then on, s.
-        n_modes: as many as are to be found; in driven records, at most.
+        n_modes: as many as are to be found; in driven records and transfer functions, at most.
         ambient: whether unknown broadband forces drive the record all along.
+        band_hz: lowest and highest line to fit, of transfer functions.
 
     Raises:
-        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`; ambient records that are two or have inputs.
+        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_transfer`; ambient records that are
+            two or have inputs; options that belong to the other kind.
     """
+    transfer = [one for one in measured if isinstance(one, TransferFunctions)]
+    if transfer:
+        if len(measured) > 1:
+            raise ValueError(f"transfer functions are identified alone; got {len(measured)} files: give one")
+        if start is not None or ambient:
+            raise ValueError("transfer functions have no time: leave --start and --ambient out; --band-hz sets a band")
+        one, most = transfer[0], MOST_MODES if n_modes is None else n_modes
+        found = identify_transfer(
+            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, most_modes=most
+        )
+        return of_transfer(found, one)
+    if band_hz is not None:
+        raise ValueError("--band-hz is for transfer functions; a record has none: resample it, or take all its modes")
+    records = [one for one in measured if isinstance(one, Record)]
     if not ambient and not any(record.inputs.any() for record in records):
         return of_ring_down(ring_down(records, start=start, n_modes=n_modes))
     if start is not None:
@@ -81,7 +106,7 @@ def of_ring_down(told: RingDown) -> ModesTold:
         lines.append("the refinement did not settle: ask for other --modes, or a later --start")
     damping = told.proportional
     content = {
-        **_content(told.records, found),
+        **_content(told.records[0].output_channels, found),
         "start": [record.start_time for record in told.records],
         "remarks": told.remarks,
         "depends_on_amplitude": by_amplitude,
@@ -105,7 +130,7 @@ def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
     lines = [] if found.converged else ["the search did not settle: ask for other --modes"]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
-        **_content(records, found),
+        **_content(records[0].output_channels, found),
         "inputs": found.state_space.input_labels,
         "state_space": {"A": a, "B": b, "C": c, "D": d},
         "noise_std": found.noise_std,
@@ -117,17 +142,44 @@ def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
 def of_ambient(found: AmbientModes, record: Record) -> ModesTold:
     """A record under unknown broadband forces."""
     lines = [f"standard errors from {found.n_blocks} blocks of the record, each left out in turn"]
-    return _told([record], found, lines, _content([record], found))
+    return _told([record], found, lines, _content(record.output_channels, found))
+
+
+def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
+    """Transfer functions."""
+    lines = [] if found.converged else ["the search did not settle: ask for other --modes, or a narrower --band-hz"]
+    broad = np.flatnonzero(found.modes.zeta > BROAD)
+    if broad.size:
+        lines.append(
+            f"modes {', '.join(str(r + 1) for r in broad)}: too broad to ring; what no mode explains may look like that"
+        )
+    band = found.frequencies_hz
+    outputs, inputs = found.modes.positions.size, len(measured.references)
+    heading = f"transfer functions of {_counted(outputs, 'output')} and {_counted(inputs, 'input')}"
+    heading += f", {band.size} lines from {band[0]:.6g} to {band[-1]:.6g} Hz"
+    content = {
+        **_content(measured.output_channels, found),
+        "references": measured.references,
+        "participation_real": found.participation.real,
+        "participation_imag": found.participation.imag,
+        "misfit": found.misfit,
+        "converged": found.converged,
+    }
+    return ModesTold(heading, tuple(_rows(found.modes, found.omega_std, found.zeta_std)), tuple(lines), content)
 
 
 def _told(records: Sequence[Record], found, lines: Sequence[str], content: dict) -> ModesTold:
     first = records[0]
     samples = sum(record.n_samples for record in records)
     of = f" in {len(records)} records" if len(records) > 1 else ""
-    sensors = f"{first.n_outputs} sensor{'s' * (first.n_outputs > 1)}"
+    sensors = _counted(first.n_outputs, "sensor")
     since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
     heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
     return ModesTold(heading, tuple(_rows(found.modes, found.omega_std, found.zeta_std)), tuple(lines), content)
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number > 1)}"
 
 
 def _rows(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray):
@@ -138,11 +190,11 @@ def _rows(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray):
         yield str(r + 1), *frequency, *damping, f"{straight[r]:.4f}"
 
 
-def _content(records: Sequence[Record], found) -> dict:
+def _content(channels: Sequence[Channel], found) -> dict:
     modes = found.modes
     return {
-        "sensors": records[0].output_names,
-        "positions": [channel.at for channel in records[0].output_channels],
+        "sensors": [channel.name for channel in channels],
+        "positions": [channel.at for channel in channels],
         "frequencies_hz": modes.frequencies_hz,
         "frequencies_std_hz": found.omega_std / TURN,
         "damping_ratios": modes.zeta,
