@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from workbench.gap.disturbance import _followed
+from workbench.gap.disturbance import followed
 
 N = 2000
 
@@ -21,7 +21,7 @@ def record():
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])
 def test_what_follows_nothing(record, memory):
     force = lfilter([1.0], [1.0, -memory], np.random.default_rng(1).normal(size=N))
-    assert _followed(force, *record) < 0.1
+    assert followed(force, *record) < 0.1
 
 
 @pytest.mark.parametrize("law", [lambda w, v: 1.0 / (6.0 - w) ** 2, lambda w, v: -v * np.abs(v), lambda w, v: w**3])
@@ -29,9 +29,9 @@ def test_what_follows_the_motion(record, law):
     inputs, motion = record
     force = law(*np.clip(motion, -4.0, 4.0))
     noise = 0.5 * force.std() * np.random.default_rng(2).normal(size=N)
-    assert _followed(force + noise, inputs, motion) > 0.5
+    assert followed(force + noise, inputs, motion) > 0.5
 
 
 def test_what_follows_the_inputs_without_delay(record):
     inputs, motion = record
-    assert _followed(inputs[0] + 0.1 * motion[0], inputs, np.zeros_like(motion)) > 0.5
+    assert followed(inputs[0] + 0.1 * motion[0], inputs, np.zeros_like(motion)) > 0.5

@@ -46,6 +46,16 @@ def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(ri
     assert values["stiffness"] == pytest.approx(400.0, rel=0.05)
 
 
+def test_a_number_comes_back_from_its_bound(rig, measured):
+    data = measured(LOSS.apply(rig, None, {"at": 1.2, "width": 0.33, "loss": 0.05}))
+    # a fit from the narrow side overshoots to the widest loss there may be
+    found = fit(rig, (Effect(LOSS, None, {"at": 1.3, "width": 0.4, "loss": 0.03}),), data, iterations=20)
+    values, spread = found.effects[0].values, found.effects[0].deviations
+    assert found.cost < 1.02
+    assert values["at"] == pytest.approx(1.2, abs=4 * spread["at"] + 1e-4)
+    assert values["width"] == pytest.approx(0.33, abs=4 * spread["width"])
+
+
 def test_a_local_loss_stays_on_the_structure(rig):
     softened = LOSS.apply(rig, None, {"at": 0.11, "width": 0.2, "loss": 0.1})
     assert softened.modes.omega[0] < rig.modes.omega[0]

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, model_filter, tonal
+from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
@@ -16,17 +16,23 @@ from workbench.gap.search import Search, one_more, spread_over_kinds
 from workbench.rig.rig import Rig
 
 NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
-SPREAD = 0.5  # of the missing force's level over records: forces of the rig's own follow the levels of the inputs
+SPREAD = 0.5  # of the missing force's level over records: most forces of the rig's own follow the level of the inputs
+FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
 
 def looks_random(evidence: Evidence) -> bool:
-    """Whether the missing force is about as strong in every record, whatever the level, and no single tone."""
-    ends = np.cumsum([record.n_samples for record in evidence.data.counted])[:-1]
-    forces = np.split(evidence.at_peaks[0].force, ends)
+    """Whether the missing force is as strong in every record, follows little that the rig does, and is no tone."""
+    records, place = evidence.data.counted, evidence.at_peaks[0]
+    forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
     levels = np.array([np.sqrt(np.mean(force**2)) for force in forces])
     if len(forces) < 2 or np.ptp(levels) > SPREAD * levels.mean():
         return False
-    return min(tonal(force, evidence.data.counted[0].sample_time) for force in forces) < TONAL
+    if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
+        return False
+    shape = evidence.rig.modes.phi(place.at)[0]
+    motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in evidence.motions]
+    each = zip(forces, records, motions, strict=True)
+    return max(followed(force, record.inputs, motion) for force, record, motion in each) < FOLLOWS
 
 
 def decide_on_random(search: Search, start: Fit, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:

@@ -119,7 +119,7 @@ def fit_random_force(
         chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
         rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
         follows=max(
-            _followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
+            followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
             for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
         ),
         tonal=min(tonal(force, data.counted[0].sample_time) for force in forces),
@@ -146,7 +146,7 @@ def _power(memory: float, stages: int) -> float:
     return float(solve_discrete_lyapunov(a, drive)[0, 0])
 
 
-def _followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:
+def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:
     """Share of the force that the inputs and the motion they cause account for, chance taken off.
 
     The motion (2, n_samples), displacement and velocity at the force, is the model's without the force: that of the

@@ -1,0 +1,64 @@
+"""A random disturbance is told from forces that the rig makes itself, and hides no effect beside it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from workbench.gap.beside_random import looks_random
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.evidence import Evidence
+from workbench.gap.prediction import FitData
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CoulombFriction
+
+LEVELS = (0.1, 0.4, 1.6)
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(actuators=(Actuator("F", 0.45), Actuator("wind", 1.3)))
+
+
+@pytest.fixture(scope="module")
+def records(rig, record_of):
+    """Records at three levels, with a random force at the second place that the rig is not told of."""
+
+    def make(real, rms: float):
+        rng, made = np.random.default_rng(5), []
+        for level in LEVELS:
+            command = level * np.repeat(rng.normal(size=150), 10)
+            wind = lfilter([1.0], [1.0, -0.8], rng.normal(size=command.size))
+            record = record_of(real, np.array([command, rms * wind / wind.std()]), rng, name=str(level), substeps=8)
+            known = replace(record, inputs=record.inputs[:1], input_channels=record.input_channels[:1])
+            made.append(known)
+        return made
+
+    return make
+
+
+def evidence(rig, records):
+    return Evidence.of(rig, FitData(tuple(records), np.array([s.noise_std for s in rig.sensors])))
+
+
+def test_only_what_keeps_its_level_looks_random(rig, records):
+    told = replace(rig, actuators=rig.actuators[:1])
+    assert looks_random(evidence(told, records(rig, 0.05)))
+    gripped = replace(rig, elements=(CoulombFriction(1.3, 0.05, 1e-3),))
+    assert not looks_random(evidence(told, records(gripped, 0.0)))
+    stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.05})
+    assert not looks_random(evidence(told, records(stiffer, 0.0)))
+
+
+@pytest.mark.slow
+def test_a_weak_effect_beside_it_is_found(rig, records):
+    told = replace(rig, actuators=rig.actuators[:1])
+    alone = diagnose(told, records(rig, 0.05))
+    assert [effect.label for effect in alone.effects] == ["random_disturbance"]
+    stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.002})
+    both = diagnose(told, records(stiffer, 0.05))
+    assert sorted(effect.label for effect in both.effects) == ["modulus_error", "random_disturbance"]
+    factor = next(e.values["factor"] for e in both.effects if "factor" in e.values)
+    assert factor == pytest.approx(1.002, abs=5e-4)
