@@ -23,7 +23,9 @@ from scipy.signal import lfilter
 from workbench.identification.coloured import heard_along, noise_near
 from workbench.identification.fit_errors import errors, fixed_std, pole_covariance
 from workbench.identification.ibrahim import check_alike, normalised_shapes
-from workbench.identification.modal_fit import FALSE_ALARM, MOST_DAMPED, Fit, Told, free_parameters, tell
+from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED
+from workbench.identification.modal_count import Told, tell
+from workbench.identification.modal_fit import Fit, free_parameters
 from workbench.identification.noise_levels import differ, variances
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.identification import modal_fit
 from workbench.identification.modal_fit import Fit, Part, free_parameters, moves, normal
 
 Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -18,7 +17,9 @@ Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 def covariance(fit: Fit, heard: np.ndarray | float = 1.0) -> np.ndarray:
     """Of the free unknowns; `heard` is κ, (n_outputs, n_modes)."""
-    bound = modal_fit.covariance(fit)
+    h = normal(fit, fit.noise)[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
+    bound = np.linalg.pinv(h * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
     if np.all(heard == 1.0):
         return bound
     loud = tuple(
@@ -49,16 +50,15 @@ def errors(fit: Fit, figures: Figures, heard: np.ndarray) -> np.ndarray:
     n, p = fit.loads.shape
     free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.loads, fit.amplitudes)
     drift = np.concatenate([-np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)) for part in fit.parts], axis=2)
-    values, vectors = np.linalg.eigh(covariance(fit, heard))
     changes, output = [], 0
-    for column in (vectors * np.sqrt(np.maximum(values, 0.0))).T:
+    for column in _root(covariance(fit, heard)).T:
         whole = np.zeros(2 * size)
         whole[free] = column
         step = (whole[:size] + 1j * whole[size:]).reshape(n, p + 1)
         c = np.einsum("ckj,k->cj", drift, whole)
         changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
     for part, rows in _by_part(fit, heard):
-        spread = np.linalg.cholesky(part.spread[: 2 * n, : 2 * n])
+        spread = _root(part.spread[: 2 * n, : 2 * n])
         for loud in np.sqrt(rows):
             for column in (np.tile(loud, 2)[:, None] * spread).T:
                 a = np.zeros_like(fit.amplitudes)
@@ -101,3 +101,10 @@ def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:
     """κ^½ of each column of a part, 1 for those that are fixed, (n_columns, n_outputs)."""
     swings = np.tile(np.sqrt(rows).T, (2, 1))
     return np.vstack([swings, np.ones((part.coefficients.shape[0] - len(swings), len(rows)))])
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    """R with R R^T = matrix, which modes that are hardly told apart may have made singular."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
+    return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

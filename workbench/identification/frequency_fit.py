@@ -14,9 +14,11 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from workbench.identification.driven import pole_covariance
+from workbench.identification.fit_errors import errors, pole_covariance
 from workbench.identification.ibrahim import normalised_shapes
-from workbench.identification.modal_fit import FALSE_ALARM, MOST_DAMPED, Fit, Told, basis_of, errors, tell
+from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED
+from workbench.identification.modal_count import Told, basis_of, tell
+from workbench.identification.modal_fit import Fit
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import TIME_DERIVATIVE, time_derivatives
 from workbench.records.record import Channel
@@ -151,11 +153,11 @@ def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, floa
     std = np.zeros((len(channels), n))
     covariance = np.zeros((2 * n, 2 * n))
     if n:
-        std = np.sqrt(np.diag(errors(fit, relative))).reshape(len(channels), n)
+        heard = np.tile(lines.louder_near(fit), (len(channels), 1))
+        std = np.sqrt(np.diag(errors(fit, relative, heard))).reshape(len(channels), n)
         std[largest, each] = 0.0
         both = np.r_[inside, fit.poles.size + inside]
-        louder = np.sqrt(lines.louder_near(fit)[inside])
-        std, covariance = std * louder, pole_covariance(fit)[np.ix_(both, both)] * np.outer(*[np.tile(louder, 2)] * 2)
+        covariance = pole_covariance(fit, heard)[np.ix_(both, both)]
     shapes = normalised_shapes(seen) if n else seen
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     return TransferModes(
