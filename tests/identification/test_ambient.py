@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 from scipy.linalg import expm
-from scipy.stats import t as student
+from scipy.signal import lfilter
 
 from workbench.identification.ambient import ambient_decays, identify_ambient
+from workbench.identification.whittle import Spectrum, Swing, posed, started
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import mac
 
@@ -32,9 +33,8 @@ def driven(seed, *, n_samples=12_000, sample_time=0.05, quantity="velocity", noi
     return Record(sample_time, y, tuple(Channel(f"y{i + 1}", quantity) for i in range(N)), name="driven")
 
 
-@pytest.mark.parametrize("quantity", ["displacement", "velocity"])
-def test_modes_and_shapes_within_their_errors(quantity):
-    found = identify_ambient(driven(0, quantity=quantity))
+def test_modes_and_shapes_within_their_errors():
+    found = identify_ambient(driven(0, quantity="displacement"))
     assert found.modes.n_modes == N
     assert (np.abs(found.modes.omega - OMEGA) < 4 * found.omega_std).all()
     assert (np.abs(found.modes.zeta - ZETA) < 4 * found.zeta_std).all()
@@ -56,12 +56,13 @@ def test_correlations_are_those_of_the_closed_form():
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say():
-    """480 intervals of 95 %: more than 93 % and less than 98 % hold, by Student's t of the jackknife."""
+    """1200 intervals of 95 %: more than 93 % and less than 97 % hold."""
     apart = []
-    for seed in range(80):
-        found = identify_ambient(driven(100 + seed), n_modes=N)
+    for seed in range(200):
+        found = identify_ambient(driven(100 + seed))
+        assert found.modes.n_modes == N
         apart.append(np.r_[(found.modes.omega - OMEGA) / found.omega_std, (found.modes.zeta - ZETA) / found.zeta_std])
-    assert 0.93 < (np.abs(apart) < student.ppf(0.975, 19)).mean() < 0.98
+    assert 0.93 < (np.abs(apart) < 1.96).mean() < 0.97
 
 
 def test_too_short_a_record_is_refused():
@@ -69,3 +70,57 @@ def test_too_short_a_record_is_refused():
         ambient_decays(driven(2, n_samples=1000), longest=5.0)
     with pytest.raises(ValueError, match="no output 'y9'"):
         ambient_decays(driven(2, n_samples=4000), references=["y9"])
+
+
+def test_a_spectrum_is_the_transform_of_its_correlations():
+    z = np.exp(1j * np.linspace(0.05, 3.0, 40))
+    swing = Swing(-0.2 + 0.9j, np.array([1.0, 0.5 - 0.2j]), np.array([0.3 + 0.1j, -0.2j]))
+    k = np.arange(1, 400)
+    correlations = np.real(np.outer(swing.shape, swing.drive)[:, :, None] * np.exp(0.5 * swing.pole * k))
+    half = np.einsum("ijk,kl->lij", correlations, z[None] ** -k[:, None].astype(float))
+    assert np.allclose(swing.spectrum(z, 0.5), half + half.conj().swapaxes(1, 2), atol=1e-12)
+
+
+def test_the_slope_of_the_likelihood_is_its_difference():
+    """Every unknown of two modes and a background that slopes, moved by a little either way."""
+    rng = np.random.default_rng(0)
+    spectrum = Spectrum(rng.standard_normal((2, 300)) + 1j * rng.standard_normal((2, 300)), 0.01, 0.5, 1.0)
+    shapes = rng.standard_normal((2, 2)) + 0.1j * rng.standard_normal((2, 2))
+    swings = [started(spectrum, pole, shape) for pole, shape in zip((-0.06 + 1.2j, -0.09 + 1.6j), shapes, strict=True)]
+    task, swings = posed(spectrum, swings, [], swings)
+    background = task.start(swings)
+    _, slope = task.scores(swings, background)
+    for a, step in enumerate(1e-6 * np.eye(slope.size)):
+        above, below = (task.cost(*task.moved(swings, background, way * step)) for way in (1.0, -1.0))
+        assert slope[a] == pytest.approx((below - above) / 2e-6, rel=1e-4, abs=1e-4)
+
+
+def test_errors_are_little_above_the_closed_form():
+    """One mode, one sensor, no noise: S ∝ 1/(σ² + δ²), so that F = T/2π ∫ (∂ ln S)² dδ = T/σ, for ω_d as for σ.
+
+    That what drives it may have to do with what else is there, a background that slopes, a taper and a band that ends
+    cost up to half of it.
+    """
+    omega, zeta, dt, n = 6.0, 0.02, 0.1, 20_000
+    pole = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
+    force = np.random.default_rng(0).standard_normal(n + 2000)
+    swing = lfilter([1.0], [1.0, -np.exp(pole * dt)], force + 0j)[2000:].imag
+    found = identify_ambient(Record(dt, swing[None], (Channel("y", "displacement"),)))
+    least = np.sqrt(zeta * omega / (n * dt))
+    assert found.modes.n_modes == 1
+    assert 1.0 < found.omega_std[0] / least < 1.5 and 1.0 < found.zeta_std[0] * omega / least < 1.5
+    assert abs(found.modes.omega[0] - omega) < 3.0 * least and abs(found.modes.zeta[0] - zeta) < 3.0 * least / omega
+
+
+def test_a_weak_mode_beside_strong_ones_is_found():
+    """Its accelerations have a thousandth of the power of those of the others, and a tenth of it is noise."""
+    omega, zeta = np.array([2.0, 12.0, 31.0]), np.array([0.015, 0.015, 0.015])
+    rng, n, dt = np.random.default_rng(0), 30_000, 0.05
+    poles = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
+    swings = [lfilter([1.0], [1.0, -np.exp(p * dt)], rng.standard_normal(n) + 0j) for p in poles]
+    y = np.array([[0.06, 1.0, 0.8], [0.05, -0.6, 0.9], [0.03, 0.5, -1.0]]) @ np.imag(swings)
+    y = y + 0.01 * y.std() * rng.standard_normal(y.shape)
+    found = identify_ambient(Record(dt, y, tuple(Channel(f"a{j}", "acceleration") for j in range(3))))
+    assert found.modes.n_modes == 3
+    assert (np.abs(found.modes.omega - omega) < 4 * found.omega_std).all()
+    assert (np.abs(found.modes.zeta - zeta) < 4 * found.zeta_std).all()

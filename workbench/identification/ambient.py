@@ -5,29 +5,35 @@ structure does when let go (NExT: James, Carne & Lauffer, SAND92-1666),
 
     R_ij(τ) = E y_i(t + τ) y_j(t) = Re Σ_r φ_ir c_jr e^{λ_r τ},
 
-so that all that reads free decays reads them. Their errors are neither white nor independent of lag. Standard errors
-come from the record itself: R is a mean over blocks of t, and the modes are found anew with each block left out
-(delete-one jackknife, Efron & Tibshirani 1993, ch. 11).
+so that all that reads free decays reads them. Their errors are neither white nor independent of lag, so they only say
+where to look: how many modes there are, and how large they are, the likelihood of the spectrum decides (`whittle`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import ndtri
+from scipy.stats import chi2
 
 from workbench.identification.ibrahim import normalised_shapes, stacked_delays
-from workbench.identification.identified import MOST_DAMPED, SAME_SHAPE
-from workbench.identification.refinement import Refined, refine
+from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE
+from workbench.identification.projection import project
 from workbench.identification.stabilisation import real_modes, stabilise
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
+from workbench.identification.whittle import Spectrum, Swing, bands, fit_band, fit_bands, started
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen, mac
 
 MOST_REFERENCES = 4
+# A record is so many times as long as its longest lag, twice.
 BLOCKS = 20
 HIGHEST_ORDER = 20
+# Combinations of outputs whose spectrum is looked at.
+MOST_DIRECTIONS = 4
+# Of a search without a mode: one that ends too soon says that the mode is missed more than it is.
+FEW_STEPS = 15
 # Lags are kept while their energy is so many times that of the errors.
 ABOVE_ERRORS = 4.0
 LEAST_LAGS = 64
@@ -41,19 +47,21 @@ class AmbientModes(StandardErrors):
 
     Attributes:
         modes: shapes of displacement, largest entry 1.
-        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), by the jackknife.
-        n_blocks: left out one by one.
-        decays: the correlation functions they were read from, one record a reference.
+        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
+        evidence: (n_modes,) twice the log likelihood ratio of the record with and without each mode.
+        limit: what a mode fitted to noise alone exceeds with the chance of a false alarm.
+        decays: the correlation functions where they were looked for, one record a reference.
     """
 
     modes: SampledModes
     covariance: np.ndarray
-    n_blocks: int
+    evidence: np.ndarray
+    limit: float
     decays: tuple[Record, ...]
 
     def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-        """Confidence intervals of ω and of ζ, (2, n_modes) each, by Student's t of n_blocks - 1."""
-        return self._within(float(student.ppf(0.5 * (1.0 + level), self.n_blocks - 1)))
+        """Confidence intervals of ω and of ζ, (2, n_modes) each."""
+        return self._within(float(ndtri(0.5 * (1.0 + level))))
 
 
 def ambient_decays(
@@ -86,74 +94,142 @@ def identify_ambient(
     n_modes: int | None = None,
     longest: float | None = None,
     references: Sequence[str] | None = None,
+    false_alarm: float = FALSE_ALARM,
 ) -> AmbientModes:
     """The modes of a structure under unknown broadband forces, each with its standard error.
 
     Args:
         record: long: each twentieth of it is to be much longer than a mode takes to decay.
-        n_modes: unless given, those that stay in a stabilisation diagram and whose frequency is sure to 1 %.
+        n_modes: unless given, those that the likelihood misses and whose frequency is sure to 1 %.
         longest: lag, s, as in `ambient_decays`.
         references: names of outputs, as in `ambient_decays`.
+        false_alarm: chance that noise alone is taken for a mode.
 
     Raises:
         ValueError: as `ambient_decays`, or no mode found.
     """
     lags, rows = _lags(record, longest, references)
-    blocks = _correlations(record, lags, rows, BLOCKS)
-    whole = blocks.sum(axis=0)
-    decays = _as_records(record, whole / record.n_samples, rows)
+    most = lags if longest is not None else record.n_samples // (2 * BLOCKS)
+    sums = _correlations(record, most, rows, 1)[0] / record.n_samples
+    decays = _as_records(record, sums[:, :, :lags], rows)
     if n_modes is None:
-        highest = min(HIGHEST_ORDER, lags // 8)
-        start = real_modes(stabilise(decays, orders=range(2, highest + 1))).modes
+        starts = [_that_stay(decays)]
+        if most > lags:
+            longer = _that_stay(_as_records(record, sums, rows))
+            away = np.abs(np.subtract.outer(longer.poles.imag, starts[0].poles.imag))
+            new = (away > np.abs(starts[0].poles.real)).all(axis=1)
+            starts.append(longer.select(list(np.flatnonzero(new))))
+        search = _Search(record, starts, false_alarm)
+        search.grow()
+        while search.poles.size and search.prune():
+            pass
     else:
-        start = stacked_delays(decays, n_modes=n_modes)
-    if start.n_modes == 0:
-        raise ValueError(f"record {record.name!r} holds no mode that stays from order to order; measure longer")
-    count = record.n_samples * (BLOCKS - 1) / BLOCKS
-    without = [_as_records(record, (whole - block) / count, rows) for block in blocks]
-    while True:
-        refined = refine(decays, start)
-        found = _over_references(refined, record)
-        covariance = _jackknife(without, found)
-        std = np.sqrt(np.diag(covariance)[: found.n_modes])
-        unsure = (std > LEAST_SURE * found.omega) | (found.zeta <= 0) | (found.zeta > MOST_DAMPED)
-        unsure |= _split(refined, found, std)
-        if n_modes is not None or found.n_modes == 1 or not unsure.any():
-            return AmbientModes(found, frozen(covariance), BLOCKS, decays)
-        worst = int(np.argmax(np.where(unsure, std / found.omega, 0.0)))
-        start = found.select([r for r in range(found.n_modes) if r != worst])
+        search = _Search(record, [stacked_delays(decays, n_modes=n_modes)], false_alarm)
+        search.settle(search.tries)
+    if search.poles.size == 0:
+        raise ValueError(f"record {record.name!r} holds no mode that rises above its noise; measure longer")
+    return search.report(decays)
 
 
-def _over_references(refined: Refined, record: Record) -> SampledModes:
-    """The modes, each with the shape that all references agree on best: one of them may stand at a node."""
-    both = np.stack(refined.amplitudes)  # (n_references, n_outputs, n_modes)
-    shapes = np.stack([np.linalg.svd(both[:, :, r].T)[0][:, 0] for r in range(both.shape[2])], axis=1)
-    derivative = time_derivatives(record.output_channels)[:, None]
-    return replace(refined.modes, shapes=normalised_shapes(shapes / refined.modes.poles**derivative))
+def _that_stay(decays: Sequence[Record]) -> SampledModes:
+    """What stays in a stabilisation diagram: of long lags, which show weak modes; of short ones, which show damped."""
+    return real_modes(stabilise(decays, orders=range(2, min(HIGHEST_ORDER, decays[0].n_samples // 8) + 1))).modes
 
 
-def _split(refined: Refined, found: SampledModes, std: np.ndarray) -> np.ndarray:
-    """Which modes have the shape of a stronger one and its band, as far as that is known."""
-    size = np.linalg.norm(np.vstack(refined.amplitudes), axis=0)
-    poles = found.poles
-    band = np.abs(poles.real) + 3.0 * std
-    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band[:, None] + band
-    alike = mac(found.shapes, found.shapes) > SAME_SHAPE
-    return (near & alike & (size[:, None] < size)).any(axis=1)
+class _Search:
+    """Modes so far, by the bands of the spectrum that they are fitted in."""
+
+    def __init__(self, record: Record, starts: Sequence[SampledModes], false_alarm: float) -> None:
+        self.record, size = record, record.outputs.std(axis=1)[:, None]
+        spectrum = Spectrum.of(record.outputs / size, record.sample_time)
+        derivative = time_derivatives(record.output_channels)[:, None]
+        poles = np.concatenate([start.poles for start in starts])
+        seen = np.hstack([start.shapes * start.poles**derivative / size for start in starts])
+        seen = seen / np.linalg.norm(seen, axis=0)
+        directions = np.linalg.svd(np.hstack([seen.real, seen.imag]))[0][:, :MOST_DIRECTIONS]
+        self.spectrum = spectrum.along(directions)
+        # A mode is its pole and two vectors, of which one has no scale, chosen among all lines.
+        self.limit = float(chi2.isf(false_alarm / spectrum.values.shape[1], 4 * directions.shape[1]))
+        self.tries = [started(self.spectrum, *pair) for pair in zip(poles, (directions.T @ seen).T, strict=True)]
+        self.settle([])
+
+    def grow(self) -> None:
+        """Take in what makes the record more likely than noise would, the strongest first."""
+        swings: list[Swing] = []
+        for swing in sorted(self.tries, key=lambda swing: -swing.height):
+            group = next(g for g in bands(self.spectrum, [s.pole for s in [*swings, swing]]) if len(swings) in g)
+            known, others = [swings[r] for r in group if r < len(swings)], np.setdiff1d(np.arange(len(swings)), group)
+            beside = [swings[r] for r in others]
+            try:
+                found = fit_band(self.spectrum, [*known, swing], beside)
+                without = fit_band(self.spectrum, known, beside, [*known, swing], FEW_STEPS)
+            except np.linalg.LinAlgError:
+                continue
+            if 2.0 * (without.cost - found.cost) > self.limit:
+                swings = [*beside, *found.swings]
+        self.settle(swings)
+
+    def settle(self, swings: list[Swing]) -> None:
+        """All bands fitted, and how much less likely the record is without each mode."""
+        self.swings, fitted = list(swings), fit_bands(self.spectrum, swings) if swings else []
+        self.variance, self.evidence = np.zeros((2, len(swings), 2, len(swings))), np.zeros(len(swings))
+        for group, band in fitted:
+            for r, swing in zip(group, band.swings, strict=True):
+                self.swings[r] = swing
+        for group, band in fitted:
+            n, others = len(group), [swing for r, swing in enumerate(self.swings) if r not in group]
+            self.variance[np.ix_([0, 1], group, [0, 1], group)] = band.covariance.reshape(2, n, 2, n)
+            for k, r in enumerate(group):
+                rest = [swing for i, swing in enumerate(band.swings) if i != k]
+                without = fit_band(self.spectrum, rest, others, band.swings, FEW_STEPS)
+                self.evidence[r] = 2.0 * (without.cost - band.cost)
+
+    @property
+    def poles(self) -> np.ndarray:
+        return np.array([swing.pole for swing in self.swings])
+
+    def covariance(self) -> np.ndarray:
+        """Of (ω, ζ): with λ = x + iy, dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
+        x, y, omega = self.poles.real, self.poles.imag, np.abs(self.poles)
+        by_omega = np.hstack([np.diag(x / omega), np.diag(y / omega)])
+        by_zeta = np.hstack([np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)])
+        jacobian = np.vstack([by_omega, by_zeta])
+        return jacobian @ self.variance.reshape(2 * omega.size, -1) @ jacobian.T
+
+    def prune(self) -> bool:
+        """Put out what is no mode, the least likely first; whether any went."""
+        n, omega = self.poles.size, np.abs(self.poles)
+        std = np.sqrt(np.diag(self.covariance())[:n])
+        out = (self.evidence < self.limit) | (std > LEAST_SURE * omega) | (-self.poles.real > MOST_DAMPED * omega)
+        out |= self._split(std)
+        if not out.any():
+            return False
+        worst = int(np.argmin(np.where(out, self.evidence, np.inf)))
+        self.settle([swing for r, swing in enumerate(self.swings) if r != worst])
+        return True
+
+    def _split(self, std: np.ndarray) -> np.ndarray:
+        """Which modes have the shape of a more likely one and its band, as far as that is known."""
+        shapes = np.array([swing.shape for swing in self.swings]).T
+        band = np.abs(self.poles.real) + 3.0 * std
+        near = np.abs(np.subtract.outer(self.poles.imag, self.poles.imag)) < band[:, None] + band
+        alike = mac(shapes, shapes) > SAME_SHAPE
+        return (near & alike & (self.evidence[:, None] < self.evidence)).any(axis=1)
+
+    def report(self, decays: tuple[Record, ...]) -> AmbientModes:
+        order = np.argsort(np.abs(self.poles))
+        poles, both = self.poles[order], np.r_[order, order + order.size]
+        omega = np.abs(poles)
+        modes = SampledModes(omega, -poles.real / omega, _shapes(decays, poles), self.record.positions)
+        covariance = frozen(self.covariance()[np.ix_(both, both)])
+        return AmbientModes(modes, covariance, frozen(self.evidence[order]), self.limit, decays)
 
 
-def _jackknife(without: Sequence[tuple[Record, ...]], found: SampledModes) -> np.ndarray:
-    """Covariance of (ω, ζ) from what is found with each block left out.
-
-    Products y(t + τ) y(t) of neighbouring blocks still have something in common: their covariance counts where it adds.
-    """
-    each = [refine(decays, found).modes for decays in without]
-    draws = np.array([np.r_[modes.omega, modes.zeta] for modes in each])
-    apart = draws - draws.mean(axis=0)
-    alone = (apart**2).sum(axis=0)
-    shared = 2.0 * (apart[1:] * apart[:-1]).sum(axis=0)
-    more = np.sqrt(1.0 + np.maximum(shared, 0.0) / np.maximum(alone, 1e-300))
-    return (len(draws) - 1) / len(draws) * apart.T @ apart * np.outer(more, more)
+def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:
+    """Shapes (n_outputs, n_modes) that all references agree on best: one of them may stand at a node."""
+    both = np.stack([project(decay, poles, False).complex_amplitudes for decay in decays])
+    shapes = np.stack([np.linalg.svd(both[:, :, r].T)[0][:, 0] for r in range(poles.size)], axis=1)
+    return normalised_shapes(shapes / poles ** time_derivatives(decays[0].output_channels)[:, None])
 
 
 def _lags(record: Record, longest: float | None, references: Sequence[str] | None) -> tuple[int, list[int]]:

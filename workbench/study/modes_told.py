@@ -141,7 +141,7 @@ def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
 
 def of_ambient(found: AmbientModes, record: Record) -> ModesTold:
     """A record under unknown broadband forces."""
-    lines = [f"standard errors from {found.n_blocks} blocks of the record, each left out in turn"]
+    lines = ["modes and standard errors by the likelihood of the spectrum"]
     return _told([record], found, lines, _content(record.output_channels, found))
 
 
