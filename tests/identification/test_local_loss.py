@@ -8,7 +8,8 @@ from workbench.identification.distributions import Basis
 from workbench.identification.local_loss import WIDTHS, find_loss, scan
 from workbench.identification.order import identify
 from workbench.identification.sensitivity import LocalLoss
-from workbench.identification.structure_fit import Task
+from workbench.identification.structure_problem import Problem
+from workbench.identification.structure_task import Task
 from workbench.identification.synthesis import free_decay
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
@@ -85,7 +86,7 @@ def test_nothing_is_found_where_nothing_is_lost(kind):
 
 def test_the_first_look_points_at_the_place():
     task = Task.of(measured("beam", lost=0.02, centre=0.4), NOMINAL["beam"], known_mass=[(0.5, 1.0)])
-    problem = task.problem(Basis.polynomial(2), Basis.polynomial(3))
+    problem = Problem.of(task, Basis.polynomial(2), Basis.polynomial(3))
     places, gains = scan(problem, problem.fit())
     assert abs(places[np.argmax(gains[WIDTHS.index(0.1)])] - 0.4) < 0.05
 
@@ -97,9 +98,8 @@ def beside_the_end():
 
 
 def test_an_edge_that_passes_the_end_comes_back(beside_the_end):
-    problem = Task.of(beside_the_end, NOMINAL["beam"], known_mass=[(0.5, 1.0)]).problem(
-        Basis.polynomial(2), Basis.polynomial(3)
-    )
+    task = Task.of(beside_the_end, NOMINAL["beam"], known_mass=[(0.5, 1.0)])
+    problem = Problem.of(task, Basis.polynomial(2), Basis.polynomial(3))
     from_truth = problem.fit(loss=LocalLoss(0.2, 0.92, 0.1))
     from_beyond = problem.fit(loss=LocalLoss(0.2, 0.98, 0.2))
     assert from_beyond.chi2 == pytest.approx(from_truth.chi2, abs=0.1)

@@ -6,7 +6,8 @@ from scipy.stats import binom
 
 from workbench.identification.distributions import Basis
 from workbench.identification.refinement import bound
-from workbench.identification.structure_fit import GaussianPrior, choose_structure, fit_structure
+from workbench.identification.structure_fit import choose_structure, fit_structure
+from workbench.identification.structure_task import GaussianPrior
 from workbench.identification.synthesis import free_decay, struck
 from workbench.structure.member import Bar, Beam
 

@@ -20,9 +20,12 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.distributions import Basis
+from workbench.identification.fitted_structure import FittedStructure
 from workbench.identification.refinement import Refined
 from workbench.identification.sensitivity import LocalLoss, SeriesStructure
-from workbench.identification.structure_fit import MOST_TERMS, FittedStructure, Problem, Task, choose, with_spare_terms
+from workbench.identification.structure_fit import MOST_TERMS, choose, with_spare_terms
+from workbench.identification.structure_problem import Problem
+from workbench.identification.structure_task import Task
 from workbench.structure.member import Bar, Beam
 
 FALSE_ALARM = 0.01
@@ -104,14 +107,14 @@ def find_loss(
     terms = sorted(mass_terms), sorted(stiffness_terms)
     if not (terms[0] and terms[1]):
         raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
-    first = _from_anywhere(task.problem(*(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
+    first = _from_anywhere(Problem.of(task, *(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
     lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
     fewer = 0
     for _ in range(MOST_LOOKS):
         if lossy.explains or fewer >= max(lossy.n_terms):
             break
         at_least = (max(n - fewer, few[0]) for n, few in zip(lossy.n_terms, terms, strict=True))
-        again = _from_anywhere(task.problem(*(basis(n) for n in at_least)), lossy)
+        again = _from_anywhere(Problem.of(task, *(basis(n) for n in at_least)), lossy)
         if again.criterion < lossy.criterion - 1.0:
             lossy, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
         else:
@@ -133,7 +136,7 @@ def _smooth(task: Task, basis, terms, lossy: FittedStructure, limit: float) -> F
     """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
 
     def alike(*n_terms: int) -> FittedStructure:
-        return task.problem(*(basis(n) for n in n_terms)).fit(lossy)
+        return Problem.of(task, *(basis(n) for n in n_terms)).fit(lossy)
 
     same = alike(*lossy.n_terms)
     if same.chi2 - lossy.chi2 <= limit:
