@@ -5,7 +5,7 @@ from workbench.identification.order import identify
 from workbench.identification.refinement import bound, refine
 from workbench.identification.synthesis import free_decay
 from workbench.records.record import Channel, Record
-from workbench.structure.modes import SampledModes
+from workbench.structure.modes import SampledModes, mac
 
 
 @pytest.fixture(scope="module")
@@ -62,3 +62,14 @@ def test_a_mode_that_shifts_as_it_decays_is_no_crowd_of_modes():
     for frequency in (18.0, 52.0):
         assert np.abs(found.frequencies_hz - frequency).min() < 0.01 * frequency
     assert found.n_modes <= 6
+
+
+def test_crowded_modes_at_two_sensors_are_two():
+    """Shapes of two sensors agree to 0.95 in one pair of modes of twenty, by chance; these do, and are far apart."""
+    shapes = np.array([[1.0, 0.9j, 0.5], [0.6, 0.75j, -0.8]])
+    truth = SampledModes(2 * np.pi * np.array([4.0, 4.08, 9.0]), [0.012, 0.014, 0.015], shapes, [0.0, 1.0])
+    assert 0.95 < mac(truth.shapes, truth.shapes)[0, 1] < 0.99
+    record = free_decay(truth, sample_time=0.02, n_samples=1000, noise_std=0.002, seed=0)
+    found, limit = identify(record).modes, bound(truth, record, noise_std=0.002)
+    assert found.n_modes == 3
+    assert (np.abs(found.omega - truth.omega) < 4 * limit.omega_std).all()
