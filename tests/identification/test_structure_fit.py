@@ -6,10 +6,13 @@ from scipy.stats import binom
 
 from workbench.identification.distributions import Basis
 from workbench.identification.refinement import bound
+from workbench.identification.ring_down import ring_down
 from workbench.identification.structure_fit import choose_structure, fit_structure
 from workbench.identification.structure_task import GaussianPrior
 from workbench.identification.synthesis import free_decay, struck
+from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
+from workbench.structure.supports import End, PointMass
 
 X = np.linspace(0.02, 1.98, 9)
 SENSORS = np.linspace(0.1, 1.93, 10)
@@ -138,3 +141,44 @@ def test_refusals():
         fit_structure(unplaced, nominal, mass=one, stiffness=one, known_mass=[(1.0, 1.8)])
     with pytest.raises(ValueError, match="a prior needs a positive standard deviation"):
         GaussianPrior(0.0, 1.0)
+
+
+def test_a_beam_on_springs_with_a_mass_from_its_ring_down():
+    """A record with noise (40 dB) to modes, mass, stiffness and eigenfunctions; wrong ends do not explain it."""
+
+    def known(mass, stiffness, *ends, parts=()):
+        return Beam(length=2.0, mass_per_length=mass, bending_stiffness=stiffness, left=ends[0], right=ends[1],
+                    damping=ModalDamping(0.008), attachments=parts)  # fmt: skip
+
+    def heavy(x):
+        return 1.5 + 0.15 * x
+
+    def stiff(x):
+        return 30.0 - 9.0 * np.sin(np.pi * x / 2.0) ** 2
+
+    ends, parts = (End(3e4, 50.0), End(2e4)), (PointMass(at=1.3, mass=0.25),)
+    truth = known(heavy, stiff, *ends, parts=parts).modes(6)
+    window = {"sample_time": 0.4 / truth.frequencies_hz[-1], "n_samples": 1500, "quantity": "acceleration"}
+    decay = struck(truth, at=0.77, positions=np.linspace(0.05, 1.95, 10))
+    level = np.sqrt((free_decay(decay, **window).outputs ** 2).mean())
+    told = ring_down(free_decay(decay, noise_std=0.01 * level, seed=1, **window))
+    assert told.modes.n_modes == 6 and not any(told.remarks)
+    assert np.abs((told.modes.omega - truth.omega) / told.refined.omega_std).max() < 4.0
+    found = choose_structure(
+        told.refined,
+        known(1.5, 30.0, *ends, parts=parts),
+        known_mass=[(0.1, heavy(0.1))],
+        mass_terms=[3],
+        stiffness_terms=[7],
+    )
+    assert found.explains
+    for profile, exact in ((found.mass, heavy), (found.stiffness, stiff)):
+        low, high = profile.band(X)
+        assert ((low <= exact(X)) & (exact(X) <= high)).mean() > 0.7
+        assert np.abs(profile(X) / exact(X) - 1.0).max() < 0.02
+    own = found.structure.modes(6).phi(X)
+    assert np.abs(np.abs(own) - np.abs(truth.phi(X))).max() < 2e-3 * np.abs(own).max()
+    hinged = known(1.5, 30.0, "hinged", "hinged")
+    assert not choose_structure(
+        told.refined, hinged, known_mass=[(0.1, 1.515)], mass_terms=[3], stiffness_terms=[4]
+    ).explains

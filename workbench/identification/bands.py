@@ -70,7 +70,7 @@ def eigenfunction_bands(
     """Confidence bands of the eigenfunctions that `eigenfunctions` draws through refined shapes.
 
     They hold what noise does to real shapes. What a spline misses between the sensors is not in them: see that it is
-    less, by a spline of another degree or more sensors.
+    less, by a spline of another degree, more sensors, or the eigenfunctions of `choose_structure(...).structure`.
 
     Args:
         refined: from `refine` or `identify(...).refined`, at placed sensors.

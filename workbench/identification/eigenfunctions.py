@@ -143,6 +143,8 @@ def eigenfunctions(
         sampled: shapes of displacement, (n_outputs, n_modes).
         length: m.
         mass_per_length: kg/m, where known; without it and without `driven_at` the shapes keep ∫ φ_r² dx = length.
+            It knows no point masses and a spline no kinks: of a structure with attachments, or known ends that are
+            springs, take the eigenfunctions of `choose_structure(...).structure`.
         driven_at: x0 of a unit blow at t = 0 that `sampled` answers, m.
         ends: what the supports hold at zero.
         degree: of the splines, odd; chosen mode by mode as in `best_degrees` unless given.

@@ -92,7 +92,7 @@ def choose(
     basis = basis or partial(Basis.legendre, length=task.nominal.length)
     tried: dict[tuple[int, int], FittedStructure | None] = {}
     best: FittedStructure | None = None
-    at, ahead, reason = (0, 0), 3, "no number of terms was given"
+    at, ahead, exhausted, reason = (0, 0), 3, False, "no number of terms was given"
     while True:
         for i in range(at[0], min(at[0] + ahead, len(mass_terms))):
             for j in range(at[1], min(at[1] + ahead, len(stiffness_terms))):
@@ -112,9 +112,9 @@ def choose(
         better, best, at = good[least] is not best, good[least], least
         if better:
             continue
-        if best.explains or ahead > 3 or not exhaust:
+        if best.explains or exhausted or not exhaust:
             return with_spare_terms(best, task, basis)
-        ahead = len(mass_terms) + len(stiffness_terms)
+        ahead, exhausted = len(mass_terms) + len(stiffness_terms), True
 
 
 def with_spare_terms(chosen: FittedStructure, task: Task, basis: Callable[[int], Basis]) -> FittedStructure:
