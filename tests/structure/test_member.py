@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scipy.optimize import brentq
-from scipy.special import j0, j1, jn_zeros
+from scipy.special import j0, j1, jn_zeros, y0, y1
 
 from workbench.structure.damping import ProportionalDamping, ViscousDamping
 from workbench.structure.member import Bar, Beam
@@ -272,3 +272,32 @@ def test_mass_just_short_of_the_tip(left, distance):
     bending = at_tip.omega > 0
     found = beside.omega[bending] / at_tip.omega[bending] - 1.0
     np.testing.assert_allclose(found, (mass * shape * slope)[bending] * distance, rtol=2e-3)
+
+
+def pointed(*attachments):
+    taper = {"mass_per_length": lambda x: 2 * (1 - x), "axial_stiffness": lambda x: 2 * (1 - x)}
+    return Bar(length=1.0, left="fixed", right="free", attachments=attachments, **taper)
+
+
+@pytest.mark.parametrize("distance", [0.1, 1e-3, 5e-5])
+def test_a_spring_beside_a_tip_closed_form(distance):
+    """J0 on the side of the tip, and J0 and Y0 on the other, meet at the spring."""
+    stiffness = 2.0
+
+    def unbalanced(omega):
+        z = omega * distance
+        other = j0(z) * y0(omega) - j0(omega) * y0(z)
+        slope = -j1(z) * y0(omega) + j0(omega) * y1(z)
+        return 2 * z * (j1(z) * other + slope * j0(z)) - stiffness * j0(z) * other
+
+    omega = pointed(PointSpring(1.0 - distance, stiffness)).modes(6, tolerance=1e-8).omega
+    exact = [brentq(unbalanced, w * (1 - 1e-3), w * (1 + 1e-3), xtol=1e-13) for w in omega]
+    np.testing.assert_allclose(omega, exact, rtol=1e-8)
+
+
+def test_nothing_stands_on_a_tip():
+    with pytest.raises(ValueError, match="stands on a tip"):
+        pointed(PointSpring(1.0, 2.0))
+    with pytest.raises(ValueError, match="stands on a tip"):
+        pointed(PointMass(1.0 - 1e-7, 0.1))
+    assert pointed(PointDamper(1.0, 0.1)).modes(2).omega.size == 2

@@ -19,6 +19,8 @@ MOST_FUNCTIONS = 2400
 MANY_SEGMENTS, MOST_SEGMENTS = 200, 600  # so many carry a mode at a low degree; more would take minutes and gigabytes
 THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
 NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or another stands there
+TIP = 1e-9  # of the stiffness at midspan: an end that is no stiffer ends in a point
+CROWDING, COARSEST = 4.0, 0.25  # from segment to segment towards a tip, and the widest of them, of the length
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
@@ -73,7 +75,7 @@ class _Member:
         for part in self.attachments:
             # a node at an attachment keeps its kink out of the polynomials
             if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
-                nodes = np.sort(np.r_[nodes, part.at])
+                nodes = np.sort(np.r_[nodes, part.at, self._graded(part.at, stiffness)])
         if nodes.size > MOST_SEGMENTS:
             raise ValueError(
                 f"the profiles and attachments of the structure make {nodes.size - 1} segments; at most"
@@ -86,6 +88,20 @@ class _Member:
             nodes = np.unique(np.concatenate([np.linspace(a, b, pieces + 1) for a, b in zip(nodes, nodes[1:])]))
             degree = int(np.ceil(1.7 * n_modes / pieces)) + 12 + extra // pieces
         return Segments(nodes, min(degree, HIGHEST_DEGREE), continuity)
+
+    def _graded(self, at: float, stiffness: Profile) -> list[float]:
+        """Nodes that crowd towards an attachment beside an end that is a tip: the motion there is all but singular."""
+        graded = []
+        for tip, inward in ((0.0, 1.0), (self.length, -1.0)):
+            away = abs(at - tip)
+            while self._is_tip(tip, stiffness) and away < COARSEST * self.length / CROWDING:
+                away *= CROWDING
+                graded.append(tip + inward * away)
+        return graded
+
+    def _is_tip(self, end: float, stiffness: Profile) -> bool:
+        """Whether the stiffness vanishes at an end."""
+        return bool(stiffness(np.array([end]))[0] <= TIP * stiffness(np.array([0.5 * self.length]))[0])
 
     def _thinnest(self, continuity: int) -> float:
         return THINNEST[continuity] * self.length
@@ -236,7 +252,8 @@ class Bar(_Member):
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
 
     Raises:
-        ValueError: a profile that is not positive, an end of unknown name, an attachment outside.
+        ValueError: a profile that is not positive, an end of unknown name, an attachment outside, a spring or mass on a
+            tip, where the stiffness vanishes.
     """
 
     axial_stiffness: Profile
@@ -257,6 +274,14 @@ class Bar(_Member):
 
     def __post_init__(self) -> None:
         self._prepare(("fixed", "free"), "axial_stiffness")
+        for part in self.attachments:
+            end = 0.0 if part.at < 0.5 * self.length else self.length
+            on_end = abs(part.at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)
+            if on_end and self._is_tip(end, self.axial_stiffness):
+                raise ValueError(
+                    f"{part} stands on a tip: axial_stiffness vanishes at x = {end:g}, where a point force moves the"
+                    " bar without bound; attach it further in, or give the tip some stiffness"
+                )
 
     def modes(self, n_modes: int, *, tolerance: float = 1e-10) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, resolved to `tolerance` in their highest derivative."""
