@@ -57,6 +57,9 @@ def test_a_weak_effect_beside_it_is_found(rig, records):
     told = replace(rig, actuators=rig.actuators[:1])
     alone = diagnose(told, records(rig, 0.05))
     assert [effect.label for effect in alone.effects] == ["random_disturbance"]
+    (wind,) = alone.effects
+    assert wind.values["at"] == pytest.approx(1.3, abs=0.01)
+    assert wind.values["rms"] == pytest.approx(0.05, rel=0.05)
     stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.002})
     both = diagnose(told, records(stiffer, 0.05))
     assert sorted(effect.label for effect in both.effects) == ["modulus_error", "random_disturbance"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.gap.beside_nominal import decide_beside_nominal, decide_with_figures_freed
-from workbench.gap.beside_random import decide_on_random, looks_random
+from workbench.gap.beside_random import decide_on_random
 from workbench.gap.decide import decide, decide_on_pairs
 from workbench.gap.disturbance import RandomForceFit
 from workbench.gap.effects.catalogue import CATALOGUE
@@ -113,9 +113,7 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     if free_nominal and not search.explains(start):
         found, singles = decide_with_figures_freed(search, start)
     else:
-        found, singles = None, []
-        if not search.explains(start) and looks_random(evidence):
-            found, singles = decide_on_random(search, start, evidence)
+        found, singles = (None, []) if search.explains(start) else decide_on_random(search, evidence)
         if found is None:
             singles = one_more(search, (), evidence, 0.05, 0.45, finalists=8)
             found = decide(search, start, singles) or decide_on_pairs(search, start, singles)

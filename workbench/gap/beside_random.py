@@ -35,28 +35,46 @@ def looks_random(evidence: Evidence) -> bool:
     return max(followed(force, record.inputs, motion) for force, record, motion in each) < FOLLOWS
 
 
-def decide_on_random(search: Search, start: Fit, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
+def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
     """A random disturbance, alone or beside one effect, and all that was tried; None where it does not hold.
 
     It takes much upon itself: where an effect explains the records without it, there is none.
     """
-    alone = with_random(search, start, evidence)
+    search, evidence = _heard(search, (), evidence)
+    if not looks_random(evidence):
+        return None, []
+    left = search.data.by_channel(search.data.residual(search.rig))
+    alone = with_random(search, Fit((), float(left.mean()), left, 0, "nothing added"), evidence)
     if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
         return None, []
-    rig = _rig_with(search, start)
-    beside = search.through(model_filter(evidence.model, rig, alone[1]))
-    cost = cost_of(rig, (), beside.data)
-    singles = spread_over_kinds(one_more(beside, start.effects, evidence, 0.2, 0.8, finalists=4), 1)
-    gaining = [f for f in singles[:3] if beside.surely_better(f, cost, f.n_parameters - start.n_parameters)]
+    beside = search.through(model_filter(evidence.model, search.rig, alone[1]))
+    cost = cost_of(search.rig, (), beside.data)
+    singles = spread_over_kinds(one_more(beside, (), evidence, 0.2, 0.8, finalists=4), 1)
+    gaining = [f for f in singles[:3] if beside.surely_better(f, cost, f.n_parameters)]
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]
     return _likeliest(search, tried), [found[0] for found in tried]
 
 
-def best_with_random(search: Search, candidates: Sequence[Fit]) -> Decision | None:
-    """The likeliest of the candidates beside a random disturbance that holds."""
-    return _likeliest(search, [with_random(search, candidate) for candidate in candidates])
+def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decision | None:
+    """The given effects beside a random disturbance, where one holds.
+
+    Args:
+        evidence: of the rig with the given effects.
+    """
+    search, evidence = _heard(search, given.effects, evidence)
+    return _likeliest(search, [with_random(search, given, evidence)]) if looks_random(evidence) else None
+
+
+def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
+    """The search and its evidence without the sensors that clip."""
+    hearing = search.hearing()
+    names = {sensor.name for sensor in hearing.rig.sensors}
+    deaf = {sensor.name for sensor in search.rig.sensors} - names
+    if not deaf or any(effect.target in deaf for effect in effects):
+        return search, evidence
+    return hearing, Evidence.of(apply_all(hearing.rig, effects), hearing.data, 20)
 
 
 def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
@@ -80,30 +98,23 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
     Args:
         evidence: of the rig with the given effects, where it is at hand.
     """
-    rig = _rig_with(search, given)
-    found = _random_beside(search, given, rig, evidence or Evidence.of(rig, search.data, 20))
+    rig = apply_all(search.rig, given.effects)
+    evidence = evidence or Evidence.of(rig, search.data, 20)
+    found = _random_beside(search, given, rig, evidence)
     if given.effects and not found[1].holds and search.near(found[0], NEAR):
-        data = search.data.through(model_filter(Evidence.of(rig, search.data).model, rig, found[1]))
+        data = search.data.through(model_filter(evidence.model, rig, found[1]))
         refitted = fit(search.rig, given.effects, data, iterations=8)
         left = search.data.by_channel(search.data.residual(apply_all(search.rig, refitted.effects)))
         again = replace(refitted, cost_by_channel=left)
-        rig = _rig_with(search, again)
+        rig = apply_all(search.rig, again.effects)
         found = _random_beside(search, again, rig, Evidence.of(rig, search.data, 20))
     return found
 
 
-def _rig_with(search: Search, given: Fit) -> Rig:
-    return apply_all(search.rig, [e for e in given.effects if e.kind.name != "sensor_quantisation"])
-
-
 def _random_beside(search: Search, given: Fit, rig: Rig, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
     found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.force_rms)
-    effect = Effect(
-        RANDOM_DISTURBANCE,
-        None,
-        {"at": found.at, "rms": found.rms},
-        {"at": found.at_std, "rms": found.rms_std},
-    )
+    rms, rms_std = found.seen_rms
+    effect = Effect(RANDOM_DISTURBANCE, None, {"at": found.at, "rms": rms}, {"at": found.at_std, "rms": rms_std})
     combined = Fit(
         (*given.effects, effect), found.cost, given.cost_by_channel, given.n_parameters + 2, "maximum likelihood"
     )

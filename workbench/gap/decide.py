@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from workbench.gap.beside_random import NEAR, best_with_random, looks_random
+from workbench.gap.beside_random import NEAR, decide_with_random
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, ranked, relocated, simplest
@@ -46,7 +46,7 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
     for i, first in enumerate(firsts):
         begin = 0.5 + 0.4 * i / len(firsts)
         evidence = Evidence.of(apply_all(search.rig, first.effects), search.data, 20)
-        beside = best_with_random(search, [first]) if looks_random(evidence) else None
+        beside = decide_with_random(search, first, evidence)
         if beside is not None:
             return beside
         step = 0.4 / len(firsts)

@@ -32,12 +32,13 @@ class RandomForceFit:
     """A random force at x with the same strength and colour in every record.
 
     Attributes:
-        at, rms: m, N.
-        at_std, rms_std: standard deviations.
+        at: m.
+        rms: of the process, N; its part above what the structure answers to is a guess.
+        at_std: standard deviation, m.
         memory, stages: colour of the force; see `force_filter`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
         chi2_by_record: (n_records,) mean squares of the whitened residual.
-        rms_by_record: (n_records,) of the smoothed force, N.
+        rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records tell.
         follows: largest share of the force that the inputs and the motion of its record account for.
         tonal: least share of the force of a record that one sinusoid accounts for.
     """
@@ -45,7 +46,6 @@ class RandomForceFit:
     at: float
     rms: float
     at_std: float
-    rms_std: float
     memory: float
     stages: int
     cost: float
@@ -53,6 +53,14 @@ class RandomForceFit:
     rms_by_record: np.ndarray
     follows: float
     tonal: float
+
+    @property
+    def seen_rms(self) -> tuple[float, float]:
+        """Rms over all records of the force that acted, N, and the standard deviation of that, from their scatter."""
+        power = self.rms_by_record**2
+        rms = float(np.sqrt(power.mean()))
+        scatter = float(power.std(ddof=1)) if power.size > 1 else float(power[0])
+        return rms, scatter / (2.0 * rms * np.sqrt(power.size))
 
     @property
     def holds(self) -> bool:
@@ -105,14 +113,10 @@ def fit_random_force(
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
     forces = [smoothed_states(kalman, r)[2 * rig.modes.n_modes] for r in residuals]
-    deviations = [
-        _deviation(lambda p: loss(p, stages, residuals), found.x, j, step) for j, step in ((0, 2e-3), (1, 2e-2))
-    ]
     return RandomForceFit(
         at=float(x * length),
         rms=float(np.exp(log_rms)),
-        at_std=deviations[0] * length,
-        rms_std=deviations[1] * float(np.exp(log_rms)),
+        at_std=_deviation(lambda p: loss(p, stages, residuals), found.x, 0, 2e-3) * length,
         memory=memory,
         stages=stages,
         cost=float((found.fun - noise_part) / n_values),

@@ -49,6 +49,11 @@ class FitData:
         """The same yardstick on some of the records."""
         return replace(self, records=tuple(r for r in self.records if r.name in names))
 
+    def of_outputs(self, names: tuple[str, ...]) -> "FitData":
+        """The same yardstick on some of the outputs."""
+        kept = [self.records[0].output_names.index(name) for name in names]
+        return replace(self, records=tuple(r.only(names) for r in self.records), noise=self.noise[kept])
+
     def stepped(self, substeps: int) -> "FitData":
         """The same yardstick with other substeps."""
         return replace(self, substeps=substeps)

@@ -78,6 +78,17 @@ class Search:
         quick, first = self.quick.through(whitener), self.first.through(whitener)
         return replace(self, data=self.data.through(whitener), quick=quick, first=first)
 
+    def hearing(self) -> "Search":
+        """The same search without the sensors that clip: what they do not show would pass for a force."""
+        kept = [j for j, sensor in enumerate(self.rig.sensors) if not np.isfinite(sensor.limit)]
+        if not kept or len(kept) == len(self.rig.sensors):
+            return self
+        sensors = tuple(self.rig.sensors[j] for j in kept)
+        names = tuple(sensor.name for sensor in sensors)
+        data, quick, first = (data.of_outputs(names) for data in (self.data, self.quick, self.first))
+        rig = replace(self.rig, sensors=sensors)
+        return replace(self, rig=rig, data=data, quick=quick, first=first, nominal=self.nominal[:, kept])
+
     def beside(self, figures: Effect) -> "Search":
         """The same search beside believed figures, which give way to every candidate to first order."""
 
