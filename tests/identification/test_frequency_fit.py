@@ -57,6 +57,18 @@ def test_modes_of_the_band_whatever_lies_beyond(quantity):
     assert 0.3 < (np.array(errors) ** 2).mean() < 2.2
 
 
+def test_noise_told_in_any_unit_counts_between_lines_alone():
+    """Times a thousand it hid every mode."""
+    _, h, channels = beam("acceleration")
+    measured, std = (each[:, :1, ::4] for each in noisy(h, 0, 0.1))
+    told = [identify_transfer(measured, F[::4], channels=channels, noise_std=k * std) for k in (1e-3, 1.0, 1e3)]
+    assert told[1].modes.n_modes == 3
+    for other, k in ((told[0], 1e-3), (told[2], 1e3)):
+        assert np.allclose(other.modes.omega, told[1].modes.omega, rtol=1e-10)
+        assert np.allclose(other.omega_std, told[1].omega_std, rtol=1e-6)
+        assert np.allclose(k * other.misfit, told[1].misfit, rtol=1e-6)
+
+
 def test_errors_grow_where_what_is_left_is_louder():
     """Noise ten times as loud about mode 3: by the bound of even noise its squared scores would average near 6."""
     modes, h, channels = beam("acceleration")

@@ -45,8 +45,8 @@ def _grown(drive: Drive, fit: Fit, limit: float, most_modes: int) -> Fit:
     refused: list[complex] = []
     while fit.poles.size < most_modes and len(refused) < MOST_REFUSALS:
         tries = [pole for pole in _to_try(drive, fit) if not _near(drive, pole, refused)]
-        basis, left = basis_of(drive, fit), fit.residual / fit.noise
-        scored = [(*_added(drive, basis, left, pole), pole) for pole in tries]
+        bases, left = _bases(drive, fit), fit.residual / fit.noise
+        scored = [(*_added(drive, bases, left, pole), pole) for pole in tries]
         if not scored:
             break
         strength, load, pole = max(scored, key=lambda item: item[0])
@@ -77,33 +77,48 @@ def _near(drive: Drive, pole: complex, others: Sequence[complex]) -> bool:
     return any(abs(pole.imag - o.imag) < max(drive.resolution, 0.5 * abs(o.real)) for o in others)
 
 
-def _added(drive: Drive, basis: np.ndarray, left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
+def _added(drive: Drive, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
     """χ² by which one more pole lowers the misfit, each output answering each drive as it likes; the loads it wants.
 
     Of its answer only what stands off the basis of the columns there already is new.
     """
     real, imaginary = drive.answers(pole)
-    columns, size = np.hstack([real, imaginary]), real.shape[1]
+    columns, size, strength, wanted = np.hstack([real, imaginary]), real.shape[1], 0.0, []
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    apart = columns / scale - basis @ (basis.T @ (columns / scale))
-    if drive.weights is not None:
-        left = left * drive.weights
-    u, s, vt = np.linalg.svd(apart, full_matrices=False)
-    good = s > 1e-4 * max(s[0], 1e-3)
-    seen = u.T[good] @ left
-    c = (vt.T[:, good] / s[good]) @ seen / scale[:, None]
+    together = [left] if drive.weights is None else np.hsplit(left, left.shape[1])
+    for weights, basis, rest in zip(_weights(drive), bases, together, strict=True):
+        weighted = weights * columns / scale
+        apart = weighted - basis @ (basis.T @ weighted)
+        u, s, vt = np.linalg.svd(apart, full_matrices=False)
+        good = s > 1e-4 * max(s[0], 1e-3)
+        seen = u.T[good] @ rest
+        wanted.append((vt.T[:, good] / s[good]) @ seen / scale[:, None])
+        strength += float((seen**2).sum())
+    c = np.hstack(wanted)
     heard = np.hypot(scale[:size], scale[size:])
     load = np.linalg.svd((c[:size] - 1j * c[size:]) * heard[:, None])[0][:, 0] / heard
-    return float((seen**2).sum()), load
+    return strength, load
 
 
-def basis_of(drive: Drive, fit: Fit) -> np.ndarray:
-    """Orthonormal columns (n_rows, n_columns) that span the swings of a fit and what is fixed beside them."""
+def _bases(drive: Drive, fit: Fit) -> list[np.ndarray]:
+    """What `basis_of` says, as the outputs weigh it: one for each, or one for all of equal weights."""
+    return [basis_of(drive, fit, weights) for weights in _weights(drive)]
+
+
+def _weights(drive: Drive) -> list[np.ndarray]:
+    """Of each output (n_rows, 1), in units of their mean; of all together where they are the same in all rows."""
+    if drive.weights is None:
+        return [np.ones((1, 1))]
+    return list((drive.weights / np.sqrt((drive.weights**2).mean(axis=0))).T[:, :, None])
+
+
+def basis_of(drive: Drive, fit: Fit, weights: np.ndarray | float = 1.0) -> np.ndarray:
+    """Orthonormal columns (n_rows, n_columns) that span the swings of a fit and what is fixed beside them, weighted."""
     swings = []
     for pole, load in zip(fit.poles, fit.loads):
         real, imaginary = drive.answers(pole)
         swings += [real @ load.real - imaginary @ load.imag, real @ load.imag + imaginary @ load.real]
-    phi = np.column_stack([*swings, drive.fixed]) if swings else drive.fixed
+    phi = weights * (np.column_stack([*swings, drive.fixed]) if swings else drive.fixed)
     return np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))[0]
 
 
