@@ -12,6 +12,7 @@ from workbench.gap.fit import Fit
 from workbench.gap.outcome import Decision
 from workbench.gap.search import Search, one_more, spread_over_kinds
 
+TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
 FAR_BEHIND = 2.0  # finer steps bring no set this many times as costly as another to the noise floor before it
 
 
@@ -43,6 +44,7 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
     """The best few single effects, each with a second one or a random disturbance, until a pair explains."""
     firsts = spread_over_kinds(singles, 2)[:5]
     pairs: list[Fit] = []
+    ended: list[Fit] = []
     for i, first in enumerate(firsts):
         begin = 0.5 + 0.4 * i / len(firsts)
         evidence = Evidence.of(apply_all(search.rig, first.effects), search.data, 20)
@@ -52,12 +54,21 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
         step = 0.4 / len(firsts)
         pairs += one_more(search, first.effects, evidence, begin, begin + step, finalists=3 if i else 5)
         pairs.sort(key=lambda f: f.cost)
-        best = finished(search, pairs[0])
-        if not search.explains(best) and search.near(best, 0.2 * NEAR):
-            best = relocated(search, best)
-        if search.explains(best):
-            return _of_pairs(search, start, [best, *pairs])
-    return _of_pairs(search, start, _exchanged(search, pairs))
+        for pair in [p for p in pairs[:TRIED_FURTHER] if p not in ended]:
+            best = _to_its_end(search, pair)
+            ended += [pair, best]
+            if search.explains(best):
+                return _of_pairs(search, start, [best, *pairs], ended)
+            pairs = sorted((*pairs, best), key=lambda f: f.cost) if best.cost < pair.cost else pairs
+    return _of_pairs(search, start, _exchanged(search, pairs), ended)
+
+
+def _to_its_end(search: Search, pair: Fit) -> Fit:
+    """The pair with finer steps, and from other places where little is left."""
+    best = finished(search, pair)
+    if not search.explains(best) and search.near(best, 0.2 * NEAR):
+        best = relocated(search, best)
+    return best
 
 
 def _exchanged(search: Search, pairs: list[Fit]) -> list[Fit]:
@@ -81,14 +92,15 @@ def unexplained(start: Fit, best: Fit, rivals) -> Decision:
     return Decision("part" if closed > 0.5 else "unknown", best, rivals=rivals)
 
 
-def _of_pairs(search: Search, start: Fit, pairs: list[Fit]) -> Decision:
+def _of_pairs(search: Search, start: Fit, pairs: list[Fit], done: list[Fit]) -> Decision:
+    """What the pairs say; those that are done with need no other places."""
     distinct: dict[tuple, Fit] = {}
     for candidate in pairs:
         distinct.setdefault(candidate.key, candidate)
     ended = sorted(_ended(search, list(distinct.values())[:4]), key=lambda f: f.cost)
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
-        ended[:2] = search.side_by_side(relocated, ended[:2])
+        ended = [f if f in done else relocated(search, f) for f in ended[:2]] + ended[2:]
         explaining = [f for f in ended if search.explains(f)]
     if explaining:
         best, rivals = ranked(search, [simplest(search, f) for f in explaining])
