@@ -88,7 +88,9 @@ var workbench = (function () {
       });
       Object.keys(named).forEach(function (label) {
         var mark = named[label], entry = html("button", { type: "button", title: "hide or show" }, box);
-        html("i", {}, entry).style.background = ink(mark.colour || mark.colours[0]);
+        var swatch = html("i", {}, entry);
+        swatch.style.background = ink(mark.colour || mark.colours[0]);
+        if (mark.alpha) swatch.style.opacity = mark.alpha;
         entry.appendChild(document.createTextNode(label));
         entry.addEventListener("click", function () {
           of.forEach(function (panel) { panel.off[label] = !panel.off[label]; paint(panel); });
