@@ -3,8 +3,10 @@ import pytest
 
 from workbench.identification.eigenfunctions import KnownEnds, best_degrees, eigenfunctions, interpolating_spline
 from workbench.identification.synthesis import struck
+from workbench.identification.unseen import missed_kernel
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
+from workbench.structure.supports import PointMass
 
 X = np.linspace(0.0, 2.0, 101)
 
@@ -68,6 +70,42 @@ def test_scaled_by_a_blow_without_knowing_the_mass():
     found = eigenfunctions(struck(modes, at=1.63, positions=positions), length=2.0, driven_at=1.63, ends=ends)
     assert np.abs(np.abs(found.phi(X)) - np.abs(modes.phi(X))).max() < 1e-4
     assert found.essential == modes.essential
+
+
+def test_scaled_by_a_mass_distribution_and_what_is_attached():
+    """A third of the mass sits at the tip; without it the first shape is 30 % too large."""
+    tip = PointMass(at=2.0, mass=0.5, rotary_inertia=0.01)
+    modes = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=3.0, left="clamped", right="free", attachments=[tip]
+    ).modes(3)
+    positions = np.linspace(0.1, 2.0, 20)
+    sampled = SampledModes(modes.omega, modes.zeta, modes.phi(positions), positions)
+    ends = KnownEnds.of("beam", length=2.0, left="clamped")
+    found = eigenfunctions(sampled, length=2.0, mass_per_length=1.0, point_masses=[tip], ends=ends)
+    assert np.abs(np.abs(found.phi(X)) - np.abs(modes.phi(X))).max() < 1e-4
+    with pytest.raises(ValueError, match="beside a mass distribution"):
+        eigenfunctions(sampled, length=2.0, point_masses=[tip], ends=ends)
+    with pytest.raises(ValueError, match="lies outside the structure"):
+        eigenfunctions(sampled, length=2.0, mass_per_length=1.0, point_masses=[PointMass(2.5, 0.5)], ends=ends)
+
+
+@pytest.mark.parametrize("derivative", [0, 1])
+@pytest.mark.parametrize("right", ["free", None])
+def test_what_a_spline_misses_by_its_peano_kernel(derivative, right):
+    """Of sin 2x, whose fourth derivative is known, what the ends hold taken into account."""
+    positions, x = np.linspace(0.1, 1.8, 9), np.linspace(0.0, 2.0, 11)
+    ends = KnownEnds.of("beam", length=2.0, left="clamped", right=right)
+    spline = interpolating_spline(positions, length=2.0, ends=ends, degree=5)
+
+    def sine(x, k):
+        return 2.0**k * np.sin(2.0 * np.asarray(x) + k * np.pi / 2.0)
+
+    held = np.array([float(sine(at, d)) for at, d in spline.conditions])
+    drawn = spline.matrix(x, derivative) @ sine(positions, 0) + spline.of_held(x, derivative) @ held
+    kernel = missed_kernel(spline, x, positions, 2.0, derivative)
+    u = (np.arange(kernel.shape[1]) + 0.5) * 2.0 / kernel.shape[1]
+    missed = kernel @ sine(u, 4) * np.sqrt(2.0 / u.size)
+    assert np.abs(missed - (sine(x, derivative) - drawn)).max() < 0.02 * np.abs(missed).max()
 
 
 def test_default_degree_follows_the_mode():

@@ -15,6 +15,7 @@ from scipy.interpolate import BSpline
 from workbench.identification.ibrahim import normalised_shapes
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
+from workbench.structure.supports import PointMass
 
 # In section 4.4 each two degrees more cut the error of the lowest eigenfunctions by ten, and that of the highest, which
 # swing too fast for their sensors, is made worse at the ends. So every mode takes the degree that best foretells each
@@ -73,17 +74,25 @@ class Spline:
         knots: (n_functions + degree + 1,) of the B-splines, m.
         degree: odd.
         weights: (n_functions, n_sensors): coefficients = weights @ values.
+        conditions: what the ends hold at zero, (x, derivative) each.
+        held_weights: (n_functions, n_conditions): what the coefficients would gain by what the ends held instead.
     """
 
     knots: np.ndarray
     degree: int
     weights: np.ndarray = field(repr=False)
+    conditions: tuple[tuple[float, int], ...] = ()
+    held_weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)), repr=False)
 
     def matrix(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Values (or derivatives) at x per value at each sensor, (n_points, n_sensors)."""
         if derivative > self.degree:
             return np.zeros((np.size(x), self.weights.shape[1]))
         return BSpline(self.knots, self.weights, self.degree)(np.atleast_1d(x), derivative)
+
+    def of_held(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
+        """What the values at x would gain by what the ends held instead of zero, (n_points, n_conditions)."""
+        return BSpline(self.knots, self.held_weights, self.degree)(np.atleast_1d(x), derivative)
 
 
 def interpolating_spline(
@@ -118,9 +127,11 @@ def interpolating_spline(
     unit = np.eye(n_functions)
     basis = BSpline(knots, unit, degree)
     rows = [basis(at_sensors[read])] + [basis(at, d)[None] * length**d for at, d in conditions]
-    targets = np.zeros((n_functions, at_sensors.size))
-    targets[np.arange(read.sum()), np.flatnonzero(read)] = 1.0
-    return Spline(frozen(knots), degree, frozen(np.linalg.solve(np.vstack(rows), targets)))
+    inverse = np.linalg.inv(np.vstack(rows))
+    weights = np.zeros((n_functions, at_sensors.size))
+    weights[:, read] = inverse[:, : read.sum()]
+    powers = float(length) ** np.array([d for _, d in conditions])
+    return Spline(frozen(knots), degree, frozen(weights), tuple(conditions), frozen(inverse[:, read.sum() :] * powers))
 
 
 def eigenfunctions(
@@ -128,6 +139,7 @@ def eigenfunctions(
     *,
     length: float,
     mass_per_length: ProfileLike | None = None,
+    point_masses: Sequence[PointMass] = (),
     driven_at: float | None = None,
     ends: KnownEnds = KnownEnds(),
     degree: int | None = None,
@@ -135,31 +147,36 @@ def eigenfunctions(
 ) -> Modes:
     """`Modes` from `SampledModes`: real parts of the shapes, interpolated and scaled.
 
-    The scale comes from one of two things. A known mass distribution gives ∫ m φ_r² dx = 1. A unit blow at x0, with
-    shapes that carry the amplitude s_r of the decay it leaves (`amplitudes`), gives φ_r(x) φ_r(x0) = i s_r(x) ω_dr, so
-    φ_r(x) = i s_r(x) ω_dr / (i s_r(x0) ω_dr)^½ without any knowledge of the mass.
+    The scale comes from one of two things. A known mass distribution gives ∫ m φ_r² dx + Σ_k M_k φ_r(x_k)² = 1. A unit
+    blow at x0, with shapes that carry the amplitude s_r of the decay it leaves (`amplitudes`), gives
+    φ_r(x) φ_r(x0) = i s_r(x) ω_dr, so φ_r(x) = i s_r(x) ω_dr / (i s_r(x0) ω_dr)^½ without any knowledge of the mass.
 
     Args:
         sampled: shapes of displacement, (n_outputs, n_modes).
         length: m.
         mass_per_length: kg/m, where known; without it and without `driven_at` the shapes keep ∫ φ_r² dx = length.
-            It knows no point masses and a spline no kinks: of a structure with attachments, or known ends that are
-            springs, take the eigenfunctions of `choose_structure(...).structure`.
+        point_masses: what is attached, kg; left out, a heavy one makes every shape wrong in size by as much as 30 %.
         driven_at: x0 of a unit blow at t = 0 that `sampled` answers, m.
-        ends: what the supports hold at zero.
+        ends: what the supports hold at zero; it is believed. Of an end on springs only what it holds is known.
         degree: of the splines, odd; chosen mode by mode as in `best_degrees` unless given.
         covariance: of (ω, ζ), carried along where `refine` gave one.
 
+    A spline knows nothing between and beyond its sensors; how far off it may be there says `eigenfunction_bands`. Where
+    that is too far, take the eigenfunctions of `choose_structure(...).structure`, which know springs and masses.
+
     Raises:
-        ValueError: as `interpolating_spline`; both ways of scaling at once; a blow at a node of a mode.
+        ValueError: as `interpolating_spline`; both ways of scaling at once; point masses outside, or
+            without a mass distribution; a blow at a node of a mode.
     """
     if mass_per_length is not None and driven_at is not None:
         raise ValueError("modes are scaled by the mass distribution or by a driving point, not by both; give one")
     splines = Splines.through(sampled, length=length, ends=ends, degree=degree)
     if driven_at is None:
         values = normalised_shapes(sampled.shapes).real
-        density = as_profile(1.0 / length if mass_per_length is None else mass_per_length)
-        values = values / np.sqrt(splines.weighted_squares(values, density, length))
+        inertia = inertia_of(mass_per_length, point_masses, length)
+        for spline, those in splines.groups:
+            mass = mass_matrix(spline, inertia, length)
+            values[:, those] /= np.sqrt(np.einsum("jr,jk,kr->r", values[:, those], mass, values[:, those]))
     else:
         values = _scaled_by_blow(sampled, splines, driven_at)
     values = frozen(values)
@@ -224,12 +241,43 @@ class Splines:
             result[:, modes] = spline.matrix(x, derivative) @ values[:, modes]
         return result
 
-    def weighted_squares(self, values: np.ndarray, density: Profile, length: float) -> np.ndarray:
-        """∫ density φ_r² dx, (n_modes,)."""
-        breaks = [b for b in density.breaks if 0 < b < length]
-        knots = np.concatenate([*(spline.knots for spline, _ in self.groups), breaks])
-        x, weights = quadrature(knots, max(spline.degree for spline, _ in self.groups))
-        return (weights * density(x)) @ self(values, x) ** 2
+
+@dataclass(frozen=True)
+class Inertia:
+    """What scales an eigenfunction: mass along the structure and at points."""
+
+    density: Profile
+    point_masses: tuple[PointMass, ...] = ()
+
+    def weighed(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
+        """Places, their weights, and whether it is the value or the slope whose square they weigh."""
+        breaks = [b for b in self.density.breaks if 0 < b < length]
+        x, weights = quadrature(np.concatenate([spline.knots, breaks]), spline.degree)
+        at = np.array([point.at for point in self.point_masses])
+        return [
+            (x, weights * self.density(x), 0),
+            (at, np.array([point.mass for point in self.point_masses]), 0),
+            (at, np.array([point.rotary_inertia for point in self.point_masses]), 1),
+        ]
+
+
+def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[PointMass], length: float) -> Inertia:
+    """As `eigenfunctions` takes them; without a mass, what gives ∫ φ_r² dx = length."""
+    if mass_per_length is None and len(point_masses):
+        raise ValueError("point masses count beside a mass distribution; give mass_per_length too")
+    for point in point_masses:
+        if not 0.0 <= point.at <= length:
+            raise ValueError(f"the point mass at x = {point.at:g} lies outside the structure, 0 to {length:g}")
+    return Inertia(as_profile(1.0 / length if mass_per_length is None else mass_per_length), tuple(point_masses))
+
+
+def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
+    """M of v^T M v = ∫ m φ² dx + Σ M_k φ(x_k)² for φ through values v at the sensors, (n_sensors, n_sensors)."""
+    found = np.zeros((spline.weights.shape[1],) * 2)
+    for x, weights, derivative in inertia.weighed(spline, length):
+        along = spline.matrix(x, derivative)
+        found += along.T @ (weights[:, None] * along)
+    return found
 
 
 def quadrature(knots: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
