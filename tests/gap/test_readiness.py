@@ -1,9 +1,11 @@
 """What records could tell before a fit: an actuator at rest hides its faults; nothing else on this rig is hidden."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from workbench.gap.check import readiness
+from workbench.gap.check import check_modes, readiness
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Kind
 from workbench.gap.evidence import Evidence
@@ -45,3 +47,15 @@ def test_two_effects_that_do_the_same_are_told_to_be_alike(rig, data):
     twin = Kind(**{**vars(gain), "name": "another_gain"})
     found = readiness(Evidence.of(rig, data), catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE)))
     assert found.alike == (("actuator_gain[F1]", "another_gain[F1]", pytest.approx(1.0)),)
+
+
+def test_modes_changed_behind_the_back_of_their_structure_are_refused(rig):
+    check_modes(rig)
+    modes = rig.modes
+    sharper = replace(modes, omega=modes.omega * np.array([1.0, 1.01, *[1.0] * (modes.n_modes - 2)]))
+    with pytest.raises(ValueError, match=r"mode 2 .* structure=None"):
+        check_modes(replace(rig, modes=sharper))
+    with pytest.raises(ValueError, match=r"mode 1 .* damped"):
+        check_modes(replace(rig, modes=replace(modes, damping=1.5 * modes.damping)))
+    check_modes(replace(rig, modes=sharper, structure=None))
+    check_modes(replace(rig, modes=modes.select(slice(3))))

@@ -43,8 +43,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     search, evidence = _heard(search, (), evidence)
     if not looks_random(evidence):
         return None, []
-    left = search.data.by_channel(search.data.residual(search.rig))
-    alone = with_random(search, Fit((), float(left.mean()), left, 0, "nothing added"), evidence)
+    alone = with_random(search, _nothing(search), evidence)
     if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
         return None, []
     beside = search.through(model_filter(evidence.model, search.rig, alone[1]))
@@ -64,7 +63,14 @@ def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decisi
         evidence: of the rig with the given effects.
     """
     search, evidence = _heard(search, given.effects, evidence)
-    return _likeliest(search, [with_random(search, given, evidence)]) if looks_random(evidence) else None
+    if not looks_random(evidence):
+        return None
+    return _likeliest(search, [with_random(search, given, evidence), with_random(search, _nothing(search))])
+
+
+def _nothing(search: Search) -> Fit:
+    left = search.data.by_channel(search.data.residual(search.rig))
+    return Fit((), float(left.mean()), left, 0, "nothing added")
 
 
 def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.structural import RESOLUTION
 from workbench.gap.evidence import Evidence
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -18,6 +19,7 @@ SEEN = 25.0  # of chi-squared: five standard deviations
 TURNED = -0.95
 STUCK = 0.5
 THINNING = 3
+STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
 DECADES = (1e2, 1e-2, 1e4, 1e-4)
 
 
@@ -74,6 +76,35 @@ def check_records(rig: Rig, records: Sequence[Record]) -> None:
         raise RecordsError(
             f"output {name!r} reads with the wrong sign: its correlation with the model is"
             f" {np.array(signs)[:, turned[0]].mean():.2f} in every record; turn it round"
+        )
+
+
+def check_modes(rig: Rig) -> None:
+    """Refuse modes that are not those of the structure behind them.
+
+    Effects of the structure are solved anew on it: what was changed on the modes alone would be lost in them.
+
+    Raises:
+        ValueError: a natural frequency or a damping that the structure does not have.
+    """
+    if rig.structure is None:
+        return
+    modes, own = rig.modes, rig.structure.modes(rig.modes.n_modes, tolerance=RESOLUTION)
+    remedy = "; take the structure's own modes, or structure=None for modes of your own"
+    off = np.abs(modes.omega - own.omega) > STRAY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
+    if off.any():
+        r = int(np.argmax(off))
+        raise ValueError(
+            f"mode {r + 1} of the rig has {modes.frequencies_hz[r]:.6g} Hz, that of its structure"
+            f" {own.frequencies_hz[r]:.6g} Hz{remedy}"
+        )
+    damping, expected = np.diag(modes.damping), np.diag(own.damping)
+    off = np.abs(damping - expected) > MISJUDGED * np.maximum(expected, expected.max() / own.n_modes**2)
+    if off.any():
+        r = int(np.argmax(off))
+        raise ValueError(
+            f"mode {r + 1} of the rig is damped by {damping[r]:.4g} rad/s, that of its structure by"
+            f" {expected[r]:.4g} rad/s{remedy}"
         )
 
 

@@ -54,21 +54,22 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
         step = 0.4 / len(firsts)
         pairs += one_more(search, first.effects, evidence, begin, begin + step, finalists=3 if i else 5)
         pairs.sort(key=lambda f: f.cost)
-        for pair in [p for p in pairs[:TRIED_FURTHER] if p not in ended]:
-            best = _to_its_end(search, pair)
-            ended += [pair, best]
-            if search.explains(best):
-                return _of_pairs(search, start, [best, *pairs], ended)
-            pairs = sorted((*pairs, best), key=lambda f: f.cost) if best.cost < pair.cost else pairs
+        fresh = [pair for pair in pairs[:TRIED_FURTHER] if pair not in ended]
+        taken = _to_their_ends(search, fresh)
+        ended += [*fresh, *taken]
+        pairs = sorted((*taken, *pairs), key=lambda f: f.cost)
+        if any(search.explains(pair) for pair in taken):
+            return _of_pairs(search, start, pairs, ended)
     return _of_pairs(search, start, _exchanged(search, pairs), ended)
 
 
-def _to_its_end(search: Search, pair: Fit) -> Fit:
-    """The pair with finer steps, and from other places where little is left."""
-    best = finished(search, pair)
-    if not search.explains(best) and search.near(best, 0.2 * NEAR):
-        best = relocated(search, best)
-    return best
+def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
+    """The pairs with finer steps, and from other places where little is left and none explains the records yet."""
+    ended = search.side_by_side(finished, pairs)
+    if any(search.explains(pair) for pair in ended):
+        return ended
+    near = [pair for pair in ended if search.near(pair, 0.2 * NEAR)]
+    return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
 
 
 def _exchanged(search: Search, pairs: list[Fit]) -> list[Fit]:
@@ -100,7 +101,8 @@ def _of_pairs(search: Search, start: Fit, pairs: list[Fit], done: list[Fit]) -> 
     ended = sorted(_ended(search, list(distinct.values())[:4]), key=lambda f: f.cost)
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
-        ended = [f if f in done else relocated(search, f) for f in ended[:2]] + ended[2:]
+        fresh = [f for f in ended[:2] if f not in done]
+        ended = [*search.side_by_side(relocated, fresh), *(f for f in ended if f not in fresh)]
         explaining = [f for f in ended if search.explains(f)]
     if explaining:
         best, rivals = ranked(search, [simplest(search, f) for f in explaining])

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from threadpoolctl import threadpool_limits
 
 from workbench.gap.attribute import Attribution, attribute
-from workbench.gap.check import check_records, readiness
+from workbench.gap.check import check_modes, check_records, readiness
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Kind, apply_all
 from workbench.gap.experiment import Experiment, next_experiment
@@ -48,12 +48,14 @@ def diagnose(
         free_nominal: fit the nominal frequencies, damping and modal mass along with every candidate from the first.
 
     Raises:
-        ValueError: records that do not fit the rig or cannot be of it, or sensors without noise_std.
+        ValueError: records that do not fit the rig or cannot be of it, modes that are not those of its structure, or
+            sensors without noise_std.
     """
     for record in (*records, *validation):
         _check(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
+    check_modes(rig)
     check_records(rig, records)
     # the threads of the search and those of the linear algebra would wait for one another
     with threadpool_limits(1, user_api="blas"):
