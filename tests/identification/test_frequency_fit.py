@@ -84,6 +84,22 @@ def test_errors_grow_where_what_is_left_is_louder():
     assert 0.1 < np.mean(np.square(scores)) < 3.3  # χ² of 8, one chance in a thousand either way
 
 
+def test_noise_that_goes_with_the_size_needs_not_be_told():
+    """As if even it gave twenty modes too many, one beside another about each peak."""
+    modes, h, channels = beam("acceleration")
+    h, scores = h[:, :1, ::2], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        std = 0.02 * np.abs(h) + 1e-4 * np.abs(h).mean()
+        measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+        found = identify_transfer(measured, F[::2], channels=channels)
+        assert found.modes.n_modes == 3
+        scores += [(found.modes.omega - modes.omega[1:4]) / found.omega_std, (found.modes.zeta - 0.01) / found.zeta_std]
+    assert 0.27 < np.mean(np.square(scores)) < 2.35  # χ² of 18, one chance in a thousand either way
+    rms = np.sqrt((np.abs(measured - h) ** 2).mean(axis=(1, 2)) / 2.0)
+    assert np.allclose(found.misfit, rms, rtol=0.1)  # in the unit of the outputs
+
+
 def test_many_lines_are_fitted_band_after_band():
     """The same cantilever on 2500 lines: what the bands say together, with modes at their edges found once."""
     structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")

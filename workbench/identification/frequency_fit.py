@@ -17,7 +17,8 @@ from scipy.stats import chi2
 from workbench.identification.fit_errors import errors, pole_covariance
 from workbench.identification.ibrahim import normalised_shapes
 from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED
-from workbench.identification.modal_count import Told, basis_of, tell
+from workbench.identification.line_noise import noise_with_size
+from workbench.identification.modal_count import Told, bases_of, tell, weights_of
 from workbench.identification.modal_fit import Fit
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import TIME_DERIVATIVE, time_derivatives
@@ -27,6 +28,8 @@ from workbench.structure.modes import SampledModes, frozen
 # Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
 MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
 MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
+# Modes by which the noise of the lines is first told, how often it is told, and how far off it may be (rms of log).
+STRONGEST, REWEIGHTED, ALIKE = 4, 2, 0.2
 # Widths beside a mode, and the chance that even noise is taken for uneven.
 DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
 
@@ -102,8 +105,9 @@ def identify_transfer(
         channels: one an output; where no quantity is told, the modes beyond the band may look like any motion.
         band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
         noise_std: standard error of real and imaginary part, of the shape of `transfer`: from repeated measurements,
-            or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, and standard
-            errors grow with what is left about each mode where that is louder than elsewhere.
+            or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, or to go with
+            its size in part where neighbouring lines differ so (`line_noise`), and standard errors grow with what is
+            left about each mode where that is louder than elsewhere.
         most_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
 
@@ -117,14 +121,15 @@ def identify_transfer(
         first, last = round(k * share), round((k + 1) * share)
         inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
-        band = _Lines(
+        told = _told(
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
             None if noise is None else noise[..., inside],
+            most_modes=min(most_modes, f[inside].size // each_own),
+            false_alarm=false_alarm / n_bands,
         )
-        told = tell(band, most_modes=min(most_modes, band.lines // each_own), false_alarm=false_alarm / n_bands)
-        found.append(_modes_of(band, told, channels, edges, f[first:last]))
+        found.append(_modes_of(*told, channels, edges, f[first:last]))
     whole = _together(found, channels) if n_bands > 1 else found[0]
     if whole.modes.n_modes == 0:
         raise ValueError(
@@ -132,6 +137,27 @@ def identify_transfer(
             " averages"
         )
     return whole
+
+
+def _told(h, omega, powers, noise, **how) -> tuple["_Lines", Told]:
+    """The modes of a band; where no noise is told, its course along the lines by what the strongest modes leave."""
+    lines = _Lines(h, omega, powers, noise)
+    if noise is not None:
+        return lines, tell(lines, **how)
+    told = tell(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
+    for _ in range(REWEIGHTED):
+        guessed = noise_with_size(lines.left(told.fit), lines.fitted(told.fit))
+        if guessed is None or (lines.guessed and _much_as(guessed, noise)):
+            break
+        noise = guessed
+        lines = _Lines(h, omega, powers, guessed, guessed=True)
+        told = tell(lines, **how)
+    return (lines, told) if lines.guessed else (lines, tell(lines, **how))
+
+
+def _much_as(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether noise runs along the lines of each output as another does, but for its size."""
+    return bool(np.log(one / other).std(axis=(1, 2)).max() < ALIKE)
 
 
 def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
@@ -165,7 +191,7 @@ def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, floa
         covariance=frozen(covariance),
         shape_std=frozen(std),
         participation=frozen(loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
-        misfit=frozen(fit.noise),
+        misfit=frozen(lines.misfit(fit)),
         evidence=frozen(told.evidence[inside]),
         converged=fit.converged,
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
@@ -234,7 +260,10 @@ def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
 class _Lines:
     """Lines of a spectrum as a `modal_fit.Drive`: rows are real, then imaginary parts, reference by reference."""
 
-    def __init__(self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None) -> None:
+    def __init__(
+        self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, guessed=False
+    ) -> None:
+        self.guessed = guessed
         self.omega, (_, self.refs, self.lines) = omega, h.shape
         self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
         self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
@@ -296,6 +325,17 @@ class _Lines:
         """The model at the lines, (n_outputs, n_references, n_frequencies)."""
         return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
 
+    def left(self, fit: Fit) -> np.ndarray:
+        """What the model leaves at the lines, (n_outputs, n_references, n_frequencies)."""
+        return self.unstacked(fit.residual / (1.0 if self.weights is None else self.weights))
+
+    def misfit(self, fit: Fit) -> np.ndarray:
+        """Rms of what is left of each output, (n_outputs,), in units of the noise where that was told."""
+        if not self.guessed:
+            return fit.noise
+        raw = fit.residual / self.weights
+        return fit.noise * np.sqrt((raw**2).sum(axis=0) / (fit.residual**2).sum(axis=0))
+
     def louder_near(self, fit: Fit) -> np.ndarray:
         """What is left about each mode as the mode hears it, in power, over the mean of all lines, (n_modes,).
 
@@ -304,18 +344,22 @@ class _Lines:
         """
         residual, noise = fit.residual / fit.noise, fit.noise
         found = np.ones(fit.poles.size)
-        if self.weights is not None:
-            return found  # told beforehand
-        basis = basis_of(self, fit)
+        if self.weights is not None and not self.guessed:
+            return found
+        bases, weights = bases_of(self, fit), weights_of(self)
         for r, pole in enumerate(fit.poles):
             shown = (np.abs(fit.amplitudes[:, r]) / noise) ** 2
             width = max(abs(pole.real), 0.5 * self.resolution)
             heard = []
             for beside in pole.imag + width * DETUNED:
                 if self.omega[0] < beside < self.omega[-1]:
-                    x = np.hstack(self.answers(-width + 1j * beside))
-                    x -= basis @ (basis.T @ x)  # of the rest the amplitudes have taken the noise
-                    heard.append((x.T @ residual) ** 2 / (x**2).sum(axis=0)[:, None])
+                    columns = np.hstack(self.answers(-width + 1j * beside))
+                    power = []
+                    for basis, weight, rest in zip(bases, weights, np.split(residual, len(bases), axis=1), strict=True):
+                        # of the rest the amplitudes have taken the noise
+                        x = weight * columns - basis @ (basis.T @ (weight * columns))
+                        power.append((x.T @ rest) ** 2 / (x**2).sum(axis=0)[:, None])
+                    heard.append(np.hstack(power))
             if not heard:
                 continue
             power = np.mean(heard, axis=(0, 1)) @ shown / shown.sum()

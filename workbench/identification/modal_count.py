@@ -16,11 +16,19 @@ MOST_ROUNDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Told:
-    """Modes told from noise: the fit, the evidence of each mode, and the limit noise alone exceeds by false alarm."""
+    """Modes told from noise.
+
+    Attributes:
+        fit: of them all.
+        evidence: (n_modes,) χ² of each.
+        limit: what noise alone exceeds by false alarm.
+        full: whether more might be there, the most modes being taken.
+    """
 
     fit: Fit
     evidence: np.ndarray
     limit: float
+    full: bool
 
 
 def tell(drive: Drive, *, most_modes: int, false_alarm: float = FALSE_ALARM) -> Told:
@@ -28,24 +36,25 @@ def tell(drive: Drive, *, most_modes: int, false_alarm: float = FALSE_ALARM) -> 
     outputs, drives = drive.values.shape[1], drive.answers((-0.1 + 0.5j) * drive.highest)[0].shape[1]
     limit = float(chi2.isf(false_alarm / drive.cells, 2 * (outputs + drives)))
     fit = projected(drive, np.zeros(0, complex), np.zeros((0, drives), complex))
+    full = False
     for _ in range(MOST_ROUNDS):
         grown = _grown(drive, fit, limit, most_modes)
         kept = _pruned(drive, settled(drive, grown), limit)
         ended = kept.poles.size <= fit.poles.size or kept.poles.size == grown.poles.size
-        fit = kept
+        fit, full = kept, grown.poles.size >= most_modes
         if ended:
             break
     order = np.argsort(np.abs(fit.poles))
     evidence = np.array([_evidence(fit, r) for r in order])
     fit = replace(projected(drive, fit.poles[order], fit.loads[order]), converged=fit.converged, steps=fit.steps)
-    return Told(fit, evidence, limit)
+    return Told(fit, evidence, limit, full)
 
 
 def _grown(drive: Drive, fit: Fit, limit: float, most_modes: int) -> Fit:
     refused: list[complex] = []
     while fit.poles.size < most_modes and len(refused) < MOST_REFUSALS:
         tries = [pole for pole in _to_try(drive, fit) if not _near(drive, pole, refused)]
-        bases, left = _bases(drive, fit), fit.residual / fit.noise
+        bases, left = bases_of(drive, fit), fit.residual / fit.noise
         scored = [(*_added(drive, bases, left, pole), pole) for pole in tries]
         if not scored:
             break
@@ -86,7 +95,7 @@ def _added(drive: Drive, bases: list[np.ndarray], left: np.ndarray, pole: comple
     columns, size, strength, wanted = np.hstack([real, imaginary]), real.shape[1], 0.0, []
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     together = [left] if drive.weights is None else np.hsplit(left, left.shape[1])
-    for weights, basis, rest in zip(_weights(drive), bases, together, strict=True):
+    for weights, basis, rest in zip(weights_of(drive), bases, together, strict=True):
         weighted = weights * columns / scale
         apart = weighted - basis @ (basis.T @ weighted)
         u, s, vt = np.linalg.svd(apart, full_matrices=False)
@@ -100,12 +109,12 @@ def _added(drive: Drive, bases: list[np.ndarray], left: np.ndarray, pole: comple
     return strength, load
 
 
-def _bases(drive: Drive, fit: Fit) -> list[np.ndarray]:
+def bases_of(drive: Drive, fit: Fit) -> list[np.ndarray]:
     """What `basis_of` says, as the outputs weigh it: one for each, or one for all of equal weights."""
-    return [basis_of(drive, fit, weights) for weights in _weights(drive)]
+    return [basis_of(drive, fit, weights) for weights in weights_of(drive)]
 
 
-def _weights(drive: Drive) -> list[np.ndarray]:
+def weights_of(drive: Drive) -> list[np.ndarray]:
     """Of each output (n_rows, 1), in units of their mean; of all together where they are the same in all rows."""
     if drive.weights is None:
         return [np.ones((1, 1))]
