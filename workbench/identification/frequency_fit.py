@@ -47,6 +47,8 @@ class TransferModes(StandardErrors):
             none was stated, of real and imaginary part each, in the unit of the output.
         evidence: (n_modes,) χ² of each mode in what is left.
         converged: whether the search ended because the step was small.
+        full_hz: bands (lowest, highest line) in which the search stopped at the most modes it might take: what it left
+            there is no noise, and what it found is not all, or is no modes but points that disagree.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
     """
@@ -58,6 +60,7 @@ class TransferModes(StandardErrors):
     misfit: np.ndarray
     evidence: np.ndarray
     converged: bool
+    full_hz: tuple[tuple[float, float], ...]
     fitted: np.ndarray = field(repr=False)
     frequencies_hz: np.ndarray = field(repr=False)
 
@@ -194,6 +197,7 @@ def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, floa
         misfit=frozen(lines.misfit(fit)),
         evidence=frozen(told.evidence[inside]),
         converged=fit.converged,
+        full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if told.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
     )
@@ -217,6 +221,7 @@ def _together(found: Sequence[TransferModes], channels) -> TransferModes:
         misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
         evidence=frozen(np.concatenate([band.evidence for band in found])),
         converged=all(band.converged for band in found),
+        full_hz=tuple(full for band in found for full in band.full_hz),
         fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
         frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
     )

@@ -20,6 +20,7 @@ TURN = 2.0 * math.pi
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 UNLIKELY, MOST_MODES = 0.01, 40
 BROAD = 0.1  # damping ratio
+AGREED = 0.8  # phase collinearity below which points do not swing together
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,23 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
         lines.append(
             f"modes {', '.join(str(r + 1) for r in broad)}: too broad to ring; what no mode explains may look like that"
         )
+    at, apart = found.modes.frequencies_hz, found.modes.phase_collinearity < AGREED
+    doubtful = np.zeros(at.size, bool)
+    for low, high in found.full_hz:
+        here = (at >= low) & (at <= high)
+        doubtful |= here & apart
+        lines.append(
+            f"between {low:.6g} and {high:.6g} Hz the search stopped at its limit of modes, what is left is no noise:"
+            f" of {here.sum()} modes there {(here & apart).sum()} are not told, their points do not swing together;"
+            " points measured one after another, or on a structure that changes, disagree like that: leave that band"
+            " out by --band-hz, or take more --modes"
+        )
+    uneasy = np.flatnonzero(apart & ~doubtful)
+    if uneasy.size:
+        lines.append(
+            f"modes {', '.join(str(r + 1) for r in uneasy)}: their points do not swing together; either damping couples"
+            " close modes, or points measured one after another disagree and these are parts of fewer modes"
+        )
     band = found.frequencies_hz
     outputs, inputs = found.modes.positions.size, len(measured.references)
     heading = f"transfer functions of {_counted(outputs, 'output')} and {_counted(inputs, 'input')}"
@@ -163,9 +181,12 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
         "participation_real": found.participation.real,
         "participation_imag": found.participation.imag,
         "misfit": found.misfit,
+        "doubtful": doubtful,
+        "full_hz": found.full_hz,
         "converged": found.converged,
     }
-    return ModesTold(heading, tuple(_rows(found.modes, found.omega_std, found.zeta_std)), tuple(lines), content)
+    rows = [row for row, doubt in zip(_rows(found.modes, found.omega_std, found.zeta_std), doubtful) if not doubt]
+    return ModesTold(heading, tuple(rows), tuple(lines), content)
 
 
 def _told(records: Sequence[Record], found, lines: Sequence[str], content: dict) -> ModesTold:
