@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from workbench.gap.disturbance import followed
+from workbench.gap.disturbance import _power, followed
 
 N = 2000
 
@@ -35,3 +35,10 @@ def test_what_follows_the_motion(record, law):
 def test_what_follows_the_inputs_without_delay(record):
     inputs, motion = record
     assert followed(inputs[0] + 0.1 * motion[0], inputs, np.zeros_like(motion)) > 0.5
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3])
+@pytest.mark.parametrize("memory", [0.0, 0.6, 0.95])
+def test_power_of_a_colour(stages, memory):
+    impulse = lfilter([1.0], np.poly([memory] * stages), np.eye(1, N)[0])
+    assert _power(memory, stages) == pytest.approx((impulse**2).sum(), rel=1e-9)
