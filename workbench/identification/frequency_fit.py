@@ -148,11 +148,12 @@ def _told(h, omega, powers, noise, **how) -> tuple["_Lines", Told]:
     if noise is not None:
         return lines, tell(lines, **how)
     told = tell(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
+    before: np.ndarray | None = None
     for _ in range(REWEIGHTED):
         guessed = noise_with_size(lines.left(told.fit), lines.fitted(told.fit))
-        if guessed is None or (lines.guessed and _much_as(guessed, noise)):
+        if guessed is None or (before is not None and _much_as(guessed, before)):
             break
-        noise = guessed
+        before = guessed
         lines = _Lines(h, omega, powers, guessed, guessed=True)
         told = tell(lines, **how)
     return (lines, told) if lines.guessed else (lines, tell(lines, **how))
