@@ -217,7 +217,9 @@ def _bend(problem: _Problem, free, residual, jacobian, damped, step, moving) -> 
         return turn
     curvature = 2.0 / BENT * ((beside - residual) / BENT - jacobian @ step)
     turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], jacobian[:, moving].T @ curvature)
-    return turn if 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step) else np.zeros_like(step)
+    with np.errstate(over="ignore"):
+        small = 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step)
+    return turn if small else np.zeros_like(step)
 
 
 _LONGEST = 1.0
