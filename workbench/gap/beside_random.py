@@ -76,8 +76,7 @@ def _nothing(search: Search) -> Fit:
 def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
     """The search and its evidence without the sensors that clip."""
     hearing = search.hearing()
-    names = {sensor.name for sensor in hearing.rig.sensors}
-    deaf = {sensor.name for sensor in search.rig.sensors} - names
+    deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in hearing.rig.sensors}
     if not deaf or any(effect.target in deaf for effect in effects):
         return search, evidence
     return hearing, Evidence.of(apply_all(hearing.rig, effects), hearing.data, 20)

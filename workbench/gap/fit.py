@@ -109,7 +109,7 @@ class _Problem:
             step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name == "at" else self.steps[j]
             moved = free.copy()
             moved[j] += step
-            if parameter.to_free(parameter.high) < moved[j]:
+            if self.high[j] < moved[j]:
                 moved[j] = free[j] - step
             beside = self.residual(moved, coarsely=coarsely)
             if beside is None:
@@ -162,11 +162,11 @@ def fit(
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
         jacobian = problem.jacobian(free, residual)
-        normal = jacobian.T @ jacobian
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         improved: np.ndarray | None = None
         for _ in range(7):
-            step = _step(problem, free, residual, jacobian, normal + damping * np.diag(diagonal))
+            step = _step(problem, free, residual, jacobian, gradient, normal + damping * np.diag(diagonal))
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
                 improved = trial
@@ -184,7 +184,7 @@ def fit(
     return _result(problem, free, residual, normal, status, falling)
 
 
-def _step(problem: _Problem, free, residual, jacobian, damped) -> np.ndarray:
+def _step(problem: _Problem, free, residual, jacobian, gradient, damped) -> np.ndarray:
     """The damped step, bent along its valley, no longer than is sensible, and inside the bounds.
 
     A number that stands at a bound and would pass it stays there, and the others step without it.
@@ -193,14 +193,15 @@ def _step(problem: _Problem, free, residual, jacobian, damped) -> np.ndarray:
     step = np.zeros(free.size)
     for _ in range(free.size):
         among = np.ix_(moving, moving)
-        step[moving] = -np.linalg.solve(damped[among], jacobian[:, moving].T @ residual)
+        step[moving] = -np.linalg.solve(damped[among], gradient[moving])
         leaving = moving & (((free <= problem.low) & (step < 0)) | ((free >= problem.high) & (step > 0)))
         if not leaving.any():
             break
         moving &= ~leaving
         step[leaving] = 0.0
     step = step + _bend(problem, free, residual, jacobian, damped, step, moving)
-    step = np.clip(step, -_LONGEST * _reach(problem), _LONGEST * _reach(problem))
+    reach = _reach(problem)
+    step = np.clip(step, -reach, reach)
     return np.clip(free + step, problem.low, problem.high) - free
 
 
@@ -220,9 +221,6 @@ def _bend(problem: _Problem, free, residual, jacobian, damped, step, moving) -> 
     with np.errstate(over="ignore"):
         small = 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step)
     return turn if small else np.zeros_like(step)
-
-
-_LONGEST = 1.0
 
 
 def _reach(problem: _Problem) -> np.ndarray:
