@@ -188,6 +188,24 @@ def test_two_point_elements_and_linear_ones_agree_with_the_structure():
     assert np.abs(a - b).max() < 2e-4 * np.abs(b).max()
 
 
+@pytest.mark.parametrize("parts", [2, 3])
+@pytest.mark.parametrize(
+    "law",
+    [
+        lambda share: CubicSpring(4.7, 40.0 * share),
+        lambda share: OneSidedStop(4.7, 30.0 * share, 0.2),
+        lambda share: Clearance(4.7, 30.0 * share, 0.2),
+        lambda share: CoulombFriction(4.7, 0.3 * share, 0.002),
+        lambda share: BoucWen(4.7, 20.0 * share, 0.02),
+    ],
+)
+def test_elements_at_one_place_do_what_one_of_their_strength_does(law, parts):
+    u = drive()
+    one = simulate(rig((law(1.0),)), u, sample_time=DT).outputs
+    several = simulate(rig((law(1.0 / parts),) * parts), u, sample_time=DT).outputs
+    np.testing.assert_allclose(several, one, atol=1e-8 * np.abs(one).max())
+
+
 def test_accelerations_where_damping_couples_the_modes_and_a_law_is_not_linear():
     damped = rig((CubicSpring(4.0, 50.0),), modes=beam(attachments=(PointDamper(3.0, 0.2),)).modes(6))
     beside = rig((CubicSpring(4.0, 50.0), LinearDamper(3.0, 0.2)))

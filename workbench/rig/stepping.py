@@ -12,6 +12,8 @@ import numpy as np
 from numba import njit
 
 LINEAR_SPRING, LINEAR_DAMPER, CUBIC, CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(8)
+SETTLED = 1e-10  # of a force: what is left between it and its law
+FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
 
 
 @njit(cache=True, nogil=True)
@@ -22,7 +24,7 @@ def user_law(w, v, p):
 
 @njit(cache=True, nogil=True)
 def propagators(omega, c, h, out):
-    """Fill out (n_modes, 2, 4): q and q' after h from (q, q', force at start, force at end), force linear between."""
+    """Fill out (2, 4, n_modes): q and q' after h from (q, q', force at start, force at end), force linear between."""
     for r in range(omega.size):
         w = omega[r]
         half = 0.5 * c[r]
@@ -32,17 +34,17 @@ def propagators(omega, c, h, out):
         l1, l2 = -half + root, -half - root
         spread = l1 - l2
         e1, e2 = np.exp(l1 * h), np.exp(l2 * h)
-        out[r, 0, 0] = ((l1 * e2 - l2 * e1) / spread).real
-        out[r, 0, 1] = ((e1 - e2) / spread).real
-        out[r, 1, 0] = (l1 * l2 * (e2 - e1) / spread).real
-        out[r, 1, 1] = ((l1 * e1 - l2 * e2) / spread).real
+        out[0, 0, r] = ((l1 * e2 - l2 * e1) / spread).real
+        out[0, 1, r] = ((e1 - e2) / spread).real
+        out[1, 0, r] = (l1 * l2 * (e2 - e1) / spread).real
+        out[1, 1, r] = ((l1 * e1 - l2 * e2) / spread).real
         # p_k = ∫ e^{λ(h-s)} ds and m_k = ∫ e^{λ(h-s)} s/h ds
         p1, m1 = _moments(l1, h, e1)
         p2, m2 = _moments(l2, h, e2)
-        out[r, 0, 2] = ((p1 - m1 - p2 + m2) / spread).real
-        out[r, 0, 3] = ((m1 - m2) / spread).real
-        out[r, 1, 2] = ((l1 * (p1 - m1) - l2 * (p2 - m2)) / spread).real
-        out[r, 1, 3] = ((l1 * m1 - l2 * m2) / spread).real
+        out[0, 2, r] = ((p1 - m1 - p2 + m2) / spread).real
+        out[0, 3, r] = ((m1 - m2) / spread).real
+        out[1, 2, r] = ((l1 * (p1 - m1) - l2 * (p2 - m2)) / spread).real
+        out[1, 3, r] = ((l1 * m1 - l2 * m2) / spread).real
 
 
 @njit(cache=True, nogil=True)
@@ -72,42 +74,44 @@ def _yield_update(z, dw, limit):
 
 
 @njit(cache=True, nogil=True)
-def element_force(kind, p, w, v, z, w_old):
-    """The force of an element, and its derivatives with respect to w and v."""
+def element_force(kind, parameters, i, w, v, z, w_old):
+    """The force of element i, and its derivatives with respect to w and v."""
+    a, b = parameters[i, 0], parameters[i, 1]
     if kind == LINEAR_SPRING:
-        return -p[0] * w, -p[0], 0.0
+        return -a * w, -a, 0.0
     if kind == LINEAR_DAMPER:
-        return -p[0] * v, 0.0, -p[0]
+        return -a * v, 0.0, -a
     if kind == CUBIC:
-        return -p[0] * w * w * w, -3.0 * p[0] * w * w, 0.0
+        return -a * w * w * w, -3.0 * a * w * w, 0.0
     if kind == CLEARANCE:
-        if w > p[1]:
-            return -p[0] * (w - p[1]), -p[0], 0.0
-        if w < -p[1]:
-            return -p[0] * (w + p[1]), -p[0], 0.0
+        if w > b:
+            return -a * (w - b), -a, 0.0
+        if w < -b:
+            return -a * (w + b), -a, 0.0
         return 0.0, 0.0, 0.0
     if kind == ONE_SIDED:
-        return (-p[0] * (w - p[1]), -p[0], 0.0) if w > p[1] else (0.0, 0.0, 0.0)
+        return (-a * (w - b), -a, 0.0) if w > b else (0.0, 0.0, 0.0)
     if kind == FRICTION:
-        level = math.tanh(v / p[1])
-        return -p[0] * level, 0.0, -p[0] / p[1] * (1.0 - level * level)
+        level = math.tanh(v / b)
+        return -a * level, 0.0, -a / b * (1.0 - level * level)
     if kind == BOUC_WEN:
-        pulled, slope = _yield_update(z, w - w_old, p[1])
-        return -p[0] * pulled, -p[0] * slope, 0.0
+        pulled, slope = _yield_update(z, w - w_old, b)
+        return -a * pulled, -a * slope, 0.0
+    p = parameters[i]
     force = user_law(w, v, p)
     dw, dv = 1e-6 * abs(w) + 1e-12, 1e-6 * abs(v) + 1e-12
     return force, (user_law(w + dw, v, p) - force) / dw, (user_law(w, v + dv, p) - force) / dv
 
 
 @njit(cache=True, nogil=True)
-def solve_element(kind, p, w0, v0, aw, av, z, w_old, start):
-    """The force f with f = law(w0 + aw f, v0 + av f)."""
+def solve_element(kind, parameters, i, w0, v0, aw, av, z, w_old, start):
+    """The force f of element i with f = law(w0 + aw f, v0 + av f): Newton, safeguarded by bisection."""
     f = start
     low, high = -math.inf, math.inf
     for _ in range(40):
-        value, by_w, by_v = element_force(kind, p, w0 + aw * f, v0 + av * f, z, w_old)
+        value, by_w, by_v = element_force(kind, parameters, i, w0 + aw * f, v0 + av * f, z, w_old)
         g = f - value
-        if abs(g) <= 1e-10 * (abs(f) + abs(value)) + 1e-300:
+        if abs(g) <= _close(f, value):
             break
         if g > 0:
             high = f
@@ -127,6 +131,77 @@ def solve_element(kind, p, w0, v0, aw, av, z, w_old, start):
 
 
 @njit(cache=True, nogil=True)
+def solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, f, g):
+    """The forces f and g of two elements that obey their laws, by Newton from f and g, and whether it settled."""
+    for _ in range(6):
+        w, v = w_free[0] + aw[0, 0] * f + aw[0, 1] * g, v_free[0] + av[0, 0] * f + av[0, 1] * g
+        law_f, f_w, f_v = element_force(kinds[0], parameters, 0, w, v, z[0], w_old[0])
+        w, v = w_free[1] + aw[1, 0] * f + aw[1, 1] * g, v_free[1] + av[1, 0] * f + av[1, 1] * g
+        law_g, g_w, g_v = element_force(kinds[1], parameters, 1, w, v, z[1], w_old[1])
+        off_f, off_g = law_f - f, law_g - g
+        if abs(off_f) <= _close(law_f, f) and abs(off_g) <= _close(law_g, g):
+            return f, g, True
+        ff, fg = 1.0 - f_w * aw[0, 0] - f_v * av[0, 0], -f_w * aw[0, 1] - f_v * av[0, 1]
+        gf, gg = -g_w * aw[1, 0] - g_v * av[1, 0], 1.0 - g_w * aw[1, 1] - g_v * av[1, 1]
+        determinant = ff * gg - fg * gf
+        # laws that resist the motion make ff and gg at least 1; others may have several answers
+        if not (ff > 0.1 and gg > 0.1 and determinant > 0.01):
+            break
+        f += (gg * off_f - fg * off_g) / determinant
+        g += (ff * off_g - gf * off_f) / determinant
+    return f, g, False
+
+
+@njit(cache=True, nogil=True)
+def _close(one, other):
+    return SETTLED * (abs(one) + abs(other)) + 1e-300
+
+
+@njit(cache=True, nogil=True)
+def solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, force):
+    """Fill the forces of all elements from what they are, one after the other until none moves."""
+    for _ in range(12):
+        largest = 0.0
+        for i in range(kinds.size):
+            w0, v0 = w_free[i], v_free[i]
+            for j in range(kinds.size):
+                if j != i:
+                    w0 += aw[i, j] * force[j]
+                    v0 += av[i, j] * force[j]
+            f = solve_element(kinds[i], parameters, i, w0, v0, aw[i, i], av[i, i], z[i], w_old[i], force[i])
+            largest = max(largest, abs(f - force[i]) / (abs(f) + 1e-30))
+            force[i] = f
+        if largest < SETTLED:
+            break
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, coupling, out):
+    """Fill the modal forces (n_modes,) of what acts all along, or couples the modes."""
+    n = q.size
+    out[:] = 0.0
+    if stretch != 0.0:
+        tension = 0.0
+        for r in range(n):
+            for s in range(n):
+                out[r] += stretching[r, s] * q[s]
+            tension += q[r] * out[r]
+        for r in range(n):
+            out[r] *= -stretch * tension
+    for g in range(drag_weights.size):
+        speed = 0.0
+        for r in range(n):
+            speed += drag_shapes[g, r] * v[r]
+        push = -drag_weights[g] * abs(speed) * speed
+        for r in range(n):
+            out[r] += drag_shapes[g, r] * push
+    if coupling.size > 0:
+        for r in range(n):
+            for s in range(n):
+                out[r] -= coupling[r, s] * v[s]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
 def step_record(
     omega,
     c,
@@ -152,15 +227,15 @@ def step_record(
     forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
     stretching (n_modes, n_modes); drag_shapes (n_points, n_modes); shapes (n_elements, n_modes).
     """
-    n, n_samples, n_elements = omega.size, q_out.shape[1], kinds.size
+    n, n_samples, n_elements, n_inputs = omega.size, q_out.shape[1], kinds.size, forces.shape[0]
     h = dt / n_sub
-    e = np.empty((n, 2, 4))
+    e = np.empty((2, 4, n))
     propagators(omega, c, h, e)
     q, v, base_q, base_v = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    old, new, spread = np.zeros(n), np.zeros(n), np.zeros(n)
-    spread_old, drive = np.zeros(n), np.zeros(n)
-    point, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
-    w_free, v_free = np.zeros(n_elements), np.zeros(n_elements)
+    old, new, spread, drive = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    into = np.ascontiguousarray(participation.T)
+    point, earlier = np.zeros(n_elements), np.zeros(n_elements)
+    w_free, v_free, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
     distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
     changed = np.empty(n)
@@ -176,8 +251,8 @@ def step_record(
                     aw[i, j] = 0.0
                     av[i, j] = 0.0
                     for r in range(n):
-                        aw[i, j] += shapes[i, r] * e[r, 0, 3] * shapes[j, r]
-                        av[i, j] += shapes[i, r] * e[r, 1, 3] * shapes[j, r]
+                        aw[i, j] += shapes[i, r] * e[0, 3, r] * shapes[j, r]
+                        av[i, j] += shapes[i, r] * e[1, 3, r] * shapes[j, r]
         for r in range(n):
             q_out[r, k] = q[r]
             v_out[r, k] = v[r]
@@ -186,89 +261,54 @@ def step_record(
             break
         for sub in range(n_sub):
             for r in range(n):
-                total = 0.0
-                for j in range(participation.shape[1]):
-                    total += participation[r, j] * forces[j, k * n_sub + sub]
-                drive[r] = total
-                base_q[r] = e[r, 0, 0] * q[r] + e[r, 0, 1] * v[r] + e[r, 0, 2] * old[r]
-                base_v[r] = e[r, 1, 0] * q[r] + e[r, 1, 1] * v[r] + e[r, 1, 2] * old[r]
-                base_q[r] += (e[r, 0, 2] + e[r, 0, 3]) * total
-                base_v[r] += (e[r, 1, 2] + e[r, 1, 3]) * total
-            passes = 2 if distributed else 1
-            for sweep in range(passes):
-                if n_elements == 1:
-                    w0, v0 = 0.0, 0.0
-                    for r in range(n):
-                        w0 += shapes[0, r] * (base_q[r] + e[r, 0, 3] * spread[r])
-                        v0 += shapes[0, r] * (base_v[r] + e[r, 1, 3] * spread[r])
-                    point[0] = solve_element(
-                        kinds[0], parameters[0], w0, v0, aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
-                    )
-                else:
-                    for i in range(n_elements):
-                        w0, v0 = 0.0, 0.0
-                        for r in range(n):
-                            w0 += shapes[i, r] * (base_q[r] + e[r, 0, 3] * spread[r])
-                            v0 += shapes[i, r] * (base_v[r] + e[r, 1, 3] * spread[r])
-                        w_free[i], v_free[i] = w0, v0
-                    for _ in range(12 if n_elements > 1 else 0):
-                        largest = 0.0
-                        for i in range(n_elements):
-                            w0, v0 = w_free[i], v_free[i]
-                            for j in range(n_elements):
-                                if j != i:
-                                    w0 += aw[i, j] * point[j]
-                                    v0 += av[i, j] * point[j]
-                            f = solve_element(
-                                kinds[i], parameters[i], w0, v0, aw[i, i], av[i, i], z[i], w_old[i], point[i]
-                            )
-                            largest = max(largest, abs(f - point[i]) / (abs(f) + 1e-30))
-                            point[i] = f
-                        if largest < 1e-10:
-                            break
+                drive[r] = 0.0
+            for j in range(n_inputs):
+                force = forces[j, k * n_sub + sub]
                 for r in range(n):
-                    total = spread[r]
-                    for i in range(n_elements):
-                        total += shapes[i, r] * point[i]
-                    new[r] = total
-                if distributed and sweep < passes - 1:
-                    # the forces that depend on the whole shape, from the motion just predicted
-                    for r in range(n):
-                        q[r] = base_q[r] + e[r, 0, 3] * new[r]
-                        v[r] = base_v[r] + e[r, 1, 3] * new[r]
-                        if sweep == 0:
-                            spread_old[r] = 0.0
-                    if stretch != 0.0:
-                        tension = 0.0
-                        for r in range(n):
-                            changed_r = 0.0
-                            for s in range(n):
-                                changed_r += stretching[r, s] * q[s]
-                            spread_old[r] = changed_r
-                            tension += q[r] * changed_r
-                        for r in range(n):
-                            spread_old[r] *= -stretch * tension
-                    for g in range(drag_weights.size):
-                        speed = 0.0
-                        for r in range(n):
-                            speed += drag_shapes[g, r] * v[r]
-                        push = -drag_weights[g] * abs(speed) * speed
-                        for r in range(n):
-                            spread_old[r] += drag_shapes[g, r] * push
-                    if coupling.size > 0:
-                        for r in range(n):
-                            for s in range(n):
-                                spread_old[r] -= coupling[r, s] * v[s]
-                    for r in range(n):
-                        spread[r] = spread_old[r]
+                    drive[r] += into[j, r] * force
             for r in range(n):
-                q[r] = base_q[r] + e[r, 0, 3] * new[r]
-                v[r] = base_v[r] + e[r, 1, 3] * new[r]
+                start, end = old[r] + drive[r], drive[r]
+                base_q[r] = e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
+                base_v[r] = e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
+            for i in range(n_elements):
+                guess = 2.0 * point[i] - earlier[i]
+                earlier[i], point[i] = point[i], guess
+            for sweep in range(2 if distributed else 1):
+                for i in range(n_elements):
+                    w, u = 0.0, 0.0
+                    for r in range(n):
+                        w += shapes[i, r] * (base_q[r] + e[0, 3, r] * spread[r])
+                        u += shapes[i, r] * (base_v[r] + e[1, 3, r] * spread[r])
+                    w_free[i], v_free[i] = w, u
+                settled = False
+                if n_elements == 1:
+                    point[0] = solve_element(
+                        kinds[0], parameters, 0, w_free[0], v_free[0], aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
+                    )
+                    settled = True
+                elif n_elements == 2:
+                    f, g, settled = solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, point[0], point[1])
+                    if settled:
+                        point[0], point[1] = f, g
+                if n_elements > 1 and not settled:
+                    solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
+                for r in range(n):
+                    new[r] = spread[r]
+                for i in range(n_elements):
+                    for r in range(n):
+                        new[r] += shapes[i, r] * point[i]
+                for r in range(n):
+                    q[r] = base_q[r] + e[0, 3, r] * new[r]
+                    v[r] = base_v[r] + e[1, 3, r] * new[r]
+                if distributed and sweep == 0:
+                    # the forces that depend on the whole shape, from the motion just predicted
+                    spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, coupling, spread)
+            for r in range(n):
                 old[r] = new[r]
             for i in range(n_elements):
-                w = 0.0
-                for r in range(n):
-                    w += shapes[i, r] * q[r]
+                w = w_free[i]
+                for j in range(n_elements):
+                    w += aw[i, j] * point[j]
                 if kinds[i] == BOUC_WEN:
                     z[i], _ = _yield_update(z[i], w - w_old[i], parameters[i, 1])
                 w_old[i] = w
@@ -277,6 +317,6 @@ def step_record(
 def make_stepper(law):
     """`step_record` with force(w, v, parameters) = `law` for the elements of kind USER, compiled for it."""
     scope = dict(globals(), user_law=njit(nogil=True)(law))
-    for name in ("element_force", "solve_element", "step_record"):
+    for name in ("element_force", "solve_element", "solve_pair", "solve_in_turn", "step_record"):
         scope[name] = njit(nogil=True)(FunctionType(globals()[name].py_func.__code__, scope, name))
     return scope["step_record"]
