@@ -67,7 +67,7 @@ def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = Tru
     squares = sum((each**2).sum(axis=1) for each in left)
     whole = sum((record.outputs**2).sum(axis=1) for record in records)
     rounding = (squares < ROUNDING**2 * whole).any()
-    if order == 0 or rounding or all(_white(power, poles.size).all() for power in powers):
+    if order == 0 or rounding or all(white(power, poles.size).all() for power in powers):
         return None
     filters = []
     for rows in zip(*left, strict=True):
@@ -98,7 +98,7 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> n
     power = np.abs(np.fft.rfft(residual, axis=0)[1:]) ** 2 / n
     omega = 2.0 * np.pi / (n * sample_time) * np.arange(1, len(power) + 1)
     factors = np.ones((m, poles.size))
-    coloured = ~_white(power, poles.size)
+    coloured = ~white(power, poles.size)
     for r, pole in enumerate(poles):
         width = max(abs(pole.real), LEAST_BINS * omega[0])
         heard = _listens((omega - pole.imag) / width)
@@ -121,7 +121,7 @@ def heard_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.n
     along = (heard / np.where(whole > 0, whole, 1.0)).T @ power
     # A constant hears what lies about zero.
     along[whole <= 1e-20 * len(signals)] = power[: 2 * LEAST_BINS].mean(axis=0)
-    return np.where(_white(power, n_modes), 1.0, along)
+    return np.where(white(power, n_modes), 1.0, along)
 
 
 def _listens(away: np.ndarray) -> np.ndarray:
@@ -129,7 +129,7 @@ def _listens(away: np.ndarray) -> np.ndarray:
     return (1.0 + away**2) ** -2.0
 
 
-def _white(power: np.ndarray, n_modes: int) -> np.ndarray:
+def white(power: np.ndarray, n_modes: int) -> np.ndarray:
     """Outputs (n_outputs,) whose spectrum may be flat: its sum runs along a straight line (Bartlett; Kolmogorov)."""
     bins, m = power.shape
     whole = power.sum(axis=0)

@@ -1,44 +1,32 @@
 """Modes from what went in and what came out, whatever the excitation.
 
-Each input u_i drives each pole, z' = λ z + Σ_i l_i u_i, and each output sees y = Re Σ_r a_r z_r + D u. Between samples
-the input is held, or runs straight from one to the next, so that z is known exactly at the samples:
-
-    z_k+1 = e^{λΔt} z_k + c_0 u_k + c_1 u_k+1
-    held: c_0 = Δt φ_1, c_1 = 0;    straight: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
-
-with φ_1(x) = (e^x - 1)/x, φ_2(x) = (e^x - 1 - x)/x² at x = λΔt. The state at the first sample is one more drive, a blow
-before it. All of it is then fitted at once as `modal_fit` says: output error, most likely where the noise is the
-sensors' and white.
+What each pole answers is known sample by sample (`known_inputs.py`); all of it is fitted at once as `modal_fit` says:
+output error, most likely where the noise is the sensors' and normal. How that noise runs along frequency is learnt from
+what the modes leave, and they from it in turn (`noise_course.py`).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from math import factorial
 
 import control
 import numpy as np
-from scipy.fft import next_fast_len
-from scipy.signal import lfilter
 
-from workbench.identification.coloured import heard_along, noise_near
 from workbench.identification.fit_errors import errors, fixed_std, pole_covariance
 from workbench.identification.ibrahim import check_alike, normalised_shapes
-from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED
+from workbench.identification.identified import FALSE_ALARM
+from workbench.identification.known_inputs import KnownInputs
 from workbench.identification.modal_count import Told, tell
-from workbench.identification.modal_fit import Fit, free_parameters
-from workbench.identification.noise_levels import differ, variances
+from workbench.identification.modal_fit import Fit, projected, settled
+from workbench.identification.noise_course import alike
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 
-# φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
-TERMS = 40
-SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
-BESIDE = 50
-PEAKS_A_RATE = 12
-# Where one record is noisier than another, what hid in its noise shows once it counts less.
-REWEIGHTED = 2
+# Modes by which the noise is first told, and how often it is learnt: it and the modes settle together.
+STRONGEST, LEARNT = 8, 4
+# Times the limit up to which a mode may be noise that was taken out of the noise.
+DOUBTED = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,18 +143,13 @@ def identify_driven(
     records = [records] if isinstance(records, Record) else list(records)
     check_alike(records)
     _check_inputs(records)
-    drive = _Inputs(records, at_rest, straight, feedthrough)
+    drive = KnownInputs(records, at_rest=at_rest, straight=straight, feedthrough=feedthrough)
     rows, columns = drive.fixed.shape
     if rows < columns + 4 * (drive.n_drives + 2):
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    how = {"most_modes": min(most_modes, (rows - columns) // 6), "false_alarm": false_alarm}
-    told = tell(drive, **how)
-    for _ in range(REWEIGHTED):
-        if not drive.reweighted(told.fit):
-            break
-        told = tell(drive, **how)
+    drive, told = _told(drive, most_modes=min(most_modes, (rows - columns) // 6), false_alarm=false_alarm)
     if told.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
@@ -174,6 +157,35 @@ def identify_driven(
             " inputs and outputs belong together"
         )
     return _report(records, drive, told)
+
+
+def _told(drive: KnownInputs, **how) -> tuple[KnownInputs, Told]:
+    """The modes, in the noise that they leave; the strongest first, for noise that is not white passes for modes.
+
+    What a false mode took out of its lines, their noise lacks, and so the mode seems true. So the noise is learnt anew
+    with all doubtful modes left in it, and they stay if both, modes and noise, are then less likely.
+    """
+    few = {**how, "most_modes": min(STRONGEST, how["most_modes"])}
+    drive, told = _with_noise(drive, tell(drive, **few), few, how)
+    doubted = told.evidence < DOUBTED * told.limit
+    if drive.sizes is None or not doubted.any():
+        return drive, told
+    sure = settled(drive, projected(drive, told.fit.poles[~doubted], told.fit.loads[~doubted]))
+    other = drive.weighing(drive.course(sure))
+    other, fewer = _with_noise(other, tell(other, **how), how, how)
+    worth = told.limit * (told.fit.poles.size - fewer.fit.poles.size)
+    return (drive, told) if other.cost(fewer.fit) - drive.cost(told.fit) > worth else (other, fewer)
+
+
+def _with_noise(drive: KnownInputs, told: Told, once: dict, how: dict) -> tuple[KnownInputs, Told]:
+    """Modes and noise that leave each other as they are; `once` is how `told` was told."""
+    for _ in range(LEARNT):
+        sizes = drive.course(told.fit)
+        if alike(sizes, drive.sizes) and not (told.full and once["most_modes"] < how["most_modes"]):
+            break
+        drive, once = drive.weighing(sizes), how
+        told = tell(drive, **how)
+    return drive, told
 
 
 def _check_inputs(records: Sequence[Record]) -> None:
@@ -200,165 +212,7 @@ def _check_inputs(records: Sequence[Record]) -> None:
         )
 
 
-class _Inputs:
-    """Records driven by their inputs, as a `modal_fit.Drive`: rows are the samples, one record after another."""
-
-    weights: np.ndarray | None = None
-
-    def __init__(self, records: Sequence[Record], at_rest: bool, straight: bool, feedthrough: bool) -> None:
-        self.records, self.at_rest, self.straight = records, at_rest, straight
-        self.dt = records[0].sample_time
-        lengths = [record.n_samples for record in records]
-        ends = np.cumsum([0, *lengths])
-        self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
-        self.values = np.vstack([record.outputs.T for record in records])
-        constant = np.zeros((ends[-1], len(records)))
-        for k, rows in enumerate(self.rows):
-            constant[rows, k] = 1.0
-        direct = np.vstack([record.inputs.T for record in records])
-        self.n_inputs = direct.shape[1]
-        self.n_drives = self.n_inputs + (0 if at_rest else len(records))
-        self.feedthrough = feedthrough and not _flat(direct)
-        self.fixed = np.hstack([direct, constant]) if self.feedthrough else constant
-        self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
-        self.highest = np.pi / self.dt
-        self.size = next_fast_len(2 * max(lengths))
-        span = max(lengths) * self.dt
-        fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
-        self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
-        self.cells = self.rates.size * max(lengths)
-
-    def noise(self, fit: Fit) -> np.ndarray:
-        """Standard deviation of what is left of each output in each record, (n_records, n_outputs)."""
-        weights = 1.0 if self.weights is None else np.array([self.weights[rows.start] for rows in self.rows])
-        return np.sqrt(variances(*self._left(fit))) / weights
-
-    def reweighted(self, fit: Fit) -> bool:
-        """Count each record by its noise; whether that changed anything."""
-        squares, free = self._left(fit)
-        if not differ(squares, free).any():
-            return False
-        raw = self.values if self.weights is None else self.values / self.weights
-        weights = np.repeat(1.0 / self.noise(fit), [rows.stop - rows.start for rows in self.rows], axis=0)
-        self.weights = weights / np.sqrt((weights**2).mean(axis=0))
-        self.values = self.weights * raw
-        return True
-
-    def heard(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """Noise over its mean that each mode, (n_outputs, n_modes), and each fixed column, (n_fixed, n_outputs), hears:
-        of each record as much as the mode swings in it."""
-        std = np.sqrt(variances(*self._left(fit)))
-        swings = np.column_stack([self._swing(pole, load) for pole, load in zip(fit.poles, fit.loads)])
-        near, beside, energy, power = [], [], [], []
-        for k, rows in enumerate(self.rows):
-            weights = np.ones(std.shape[1]) if self.weights is None else self.weights[rows.start]
-            left = fit.residual[rows] / std[k]
-            near.append(noise_near(fit.poles, left, self.dt))
-            beside.append(heard_along(self.fixed[rows], left, fit.poles.size))
-            energy.append(np.outer(weights**2, (np.abs(swings[rows]) ** 2).sum(axis=0)))
-            power.append(np.outer((self.fixed[rows] ** 2).sum(axis=0), weights**2))
-        return np.average(near, axis=0, weights=energy), np.average(beside, axis=0, weights=np.array(power) + 1e-300)
-
-    def _swing(self, pole: complex, load: np.ndarray) -> np.ndarray:
-        real, imaginary = self.answers(pole)
-        return (real + 1j * imaginary) @ load
-
-    def _left(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """Squares of what is left, records counted as they are, and their degrees of freedom."""
-        length = np.array([rows.stop - rows.start for rows in self.rows])
-        squares = np.array([(fit.residual[rows] ** 2).sum(axis=0) for rows in self.rows])
-        lost = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
-        floor = 1e-28 * squares.max() + 1e-300
-        return np.maximum(squares, floor), np.maximum(length * (1.0 - lost / length.sum()), 1.0)
-
-    def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        x = np.zeros((self.values.shape[0], self.n_drives), complex)
-        for k, (record, rows) in enumerate(zip(self.records, self.rows)):
-            x[rows, : self.n_inputs] = self._driven(record, pole)[0].T
-            if not self.at_rest:
-                x[rows, self.n_inputs + k] = np.exp(pole * self.dt * np.arange(record.n_samples))
-        return x.real, x.imag
-
-    def slopes(self, pole: complex, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        found = np.zeros(self.values.shape[0], complex)
-        mu = np.exp(pole * self.dt)
-        for k, (record, rows) in enumerate(zip(self.records, self.rows)):
-            x, by_coefficients = self._driven(record, pole)
-            load = loads[: self.n_inputs]
-            later = self.dt * mu * (load @ x)[:-1] + (load @ by_coefficients)[1:]
-            found[rows] = lfilter([1.0], [1.0, -mu], np.r_[0.0, later])
-            if not self.at_rest:
-                time = self.dt * np.arange(record.n_samples)
-                found[rows] += loads[self.n_inputs + k] * time * np.exp(pole * time)
-        return found.real, found.imag
-
-    def _driven(self, record: Record, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        """z of each input from rest, and what its sources change with λ, (n_inputs, n_samples) each."""
-        (now, after), (now_slope, after_slope) = _sources(pole, self.dt, self.straight)
-        u = record.inputs.astype(complex)
-        rest = -after * u[:, :1]
-        x = lfilter([after, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=rest)[0]
-        before = np.hstack([np.zeros((u.shape[0], 1)), u[:, :-1]])
-        return x, now_slope * before + after_slope * u
-
-    def candidates(self, residual: np.ndarray) -> np.ndarray:
-        """Poles whose answer to the inputs agrees best with the residual.
-
-        Σ_k y_k x_k(λ) = Σ_τ R_yu(τ) e^{λ τ}, so that one transform of the correlations, weighted by a decay, compares
-        all frequencies at that rate of decay; the initial state is a blow before the first sample.
-        """
-        size, omega = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt)
-        lags = np.arange(size // 2)
-        crossed, own = [], []
-        for record, rows in zip(self.records, self.rows):
-            y = np.fft.rfft(residual[rows].T, size)
-            drives = [*record.inputs] if self.at_rest else [*record.inputs, np.eye(1, record.n_samples)[0]]
-            for u in filter(np.any, drives):
-                spectrum = np.fft.rfft(u, size)
-                crossed.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
-                own.append(np.fft.irfft(np.abs(spectrum) ** 2, size)[: size // 2])
-        found, strength = [], []
-        for rate in self.rates:
-            decay = np.exp(-rate * self.dt * lags)
-            lowest = omega > max(0.5 * self.resolution, rate / MOST_DAMPED)
-            score = np.zeros(omega.size)
-            # The answer's own power: the spectrum of the input seen through the pole.
-            for r, power in zip(crossed, own):
-                agreed = (np.abs(np.fft.rfft(r * decay, size)) ** 2).sum(axis=0)
-                whole = 2.0 * np.fft.rfft(power * decay, size).real - power[0]
-                score += agreed / np.maximum(whole / (1.0 - np.exp(-2.0 * rate * self.dt)), 1e-12 * power[0])
-            score[~lowest] = 0.0
-            peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
-            best = peaks[np.argsort(score[peaks])[-PEAKS_A_RATE:]]
-            found.append(-rate + 1j * omega[best])
-            strength.append(score[best])
-        order = np.argsort(np.concatenate(strength))[::-1]
-        return np.concatenate(found)[order[: 3 * PEAKS_A_RATE]]
-
-    def colour(self, residual: np.ndarray, pole: complex) -> float:
-        longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
-        power = (np.abs(np.fft.rfft(residual[longest], axis=0)[1:]) ** 2).mean(axis=1)
-        at = round(pole.imag / self.resolution) - 1
-        beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
-        return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0
-
-
-def _flat(inputs: np.ndarray) -> bool:
-    """Whether an input is a constant, which the offset of each output holds already."""
-    return bool((np.ptp(inputs, axis=0) == 0).any())
-
-
-def _sources(pole: complex, dt: float, straight: bool):
-    """c_0, c_1 and their derivatives by λ."""
-    x = pole * dt
-    powers = x ** np.arange(TERMS)
-    (phi1, phi1_slope), (phi2, phi2_slope) = ((s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES)
-    if not straight:
-        return (dt * phi1, 0.0), (dt**2 * phi1_slope, 0.0)
-    return (dt * (phi1 - phi2), dt * phi2), (dt**2 * (phi1_slope - phi2_slope), dt**2 * phi2_slope)
-
-
-def _report(records: Sequence[Record], drive: _Inputs, told: Told) -> Driven:
+def _report(records: Sequence[Record], drive: KnownInputs, told: Told) -> Driven:
     fit: Fit = told.fit
     channels, n_inputs = records[0].output_channels, records[0].n_inputs
     derivative = time_derivatives(channels)[:, None]
