@@ -3,9 +3,15 @@ import pytest
 
 from workbench.identification.order import identify
 from workbench.identification.refinement import bound, refine
-from workbench.identification.synthesis import free_decay
+from workbench.identification.synthesis import free_decay, struck
 from workbench.records.record import Channel, Record
+from workbench.structure.damping import ProportionalDamping
+from workbench.structure.member import Bar
 from workbench.structure.modes import SampledModes, mac
+
+
+def taper(x):
+    return 2.0 * (1.0 - x)
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +30,17 @@ def test_the_modes_that_are_there_and_no_others(truth, noise):
     std = bound(truth, record, noise_std=noise or 1e-9).omega_std
     assert (np.abs(found.modes.omega - truth.omega) < 4 * std).all()
     assert (found.evidence > found.limit).all()
+
+
+def test_without_noise_every_mode_comes_in_and_nothing_else_is_tried():
+    """The bar of section 4.4 from six sensors: a pole that seems to split another on its way bars no other."""
+    bar = Bar(length=1.0, mass_per_length=taper, axial_stiffness=taper, left="fixed", right="free",
+              damping=ProportionalDamping(g1=0.002, g2=0.1))  # fmt: skip
+    exact = bar.modes(20)
+    decay = struck(exact, at=0.63, positions=np.arange(1, 7) / 6)
+    found = identify(free_decay(decay, sample_time=0.01, n_samples=1500, quantity="acceleration"))
+    assert np.abs(found.modes.omega / exact.omega - 1.0).max() < 1e-11
+    assert found.noise_modes.n_modes == 0
 
 
 def test_a_mode_beneath_the_noise_is_left_out(truth):

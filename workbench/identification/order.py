@@ -40,6 +40,8 @@ MOST_ROUNDS = 4
 MOST_SPLITS = 6
 # A swing whose part outside the modes there already is smaller than this share cannot be told from them.
 LEAST_APART = 1e-7
+# Squares of what is left, over those of the record, that are round-off.
+ROUND_OFF = 1e-26
 # Bins on either side from which the colour of the noise is taken.
 BESIDE = 50
 
@@ -121,8 +123,9 @@ class Told:
     def grow(self, most_modes: int) -> bool:
         """Take in modes until what is left is noise; whether any came in."""
         grown, refusals, splits = False, 0, 0
-        while self.poles.size < most_modes and refusals < MOST_REFUSALS and splits < MOST_SPLITS:
+        while not self._exact() and self.poles.size < most_modes and refusals < MOST_REFUSALS and splits < MOST_SPLITS:
             swing, strength = self._strongest_swing()
+            flagged = self._no_modes(self.poles).sum()
             if strength < self.enter * self._colour(swing):
                 break
             try:
@@ -134,7 +137,8 @@ class Told:
                 refusals += 1
                 self.refuse(swing, gain)
                 continue
-            if self._no_modes(found[0]).any():
+            # One flagged before, on its way or to be put out, is not the new one's fault.
+            if self._no_modes(found[0]).sum() > flagged:
                 splits += 1
                 self.refuse(swing, gain)
                 continue
@@ -220,10 +224,15 @@ class Told:
         beside = left[max(at - BESIDE, 0) : at + BESIDE + 1]
         return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
 
+    def _exact(self) -> bool:
+        """Whether what is left is round-off, of which every try would make something else."""
+        each = zip(self.records, self.fits, strict=True)
+        return all(bool(((left**2).sum(axis=0) <= ROUND_OFF * (r.outputs**2).sum(axis=1)).all()) for r, left in each)
+
     def _ratio(self, before, after) -> float:
         """Twice the log likelihood ratio, noise unknown: Σ_ij N_i log(s²_before / s²_after), records i, sensors j."""
         n = np.array([residual.shape[0] for residual in after])
-        floor = 1e-26 * np.array([(r.outputs**2).sum(axis=1) for r in self.records]) + 1e-300
+        floor = ROUND_OFF * np.array([(r.outputs**2).sum(axis=1) for r in self.records]) + 1e-300
         first, second = (np.array([(r**2).sum(axis=0) for r in fits]) + floor for fits in (before, after))
         apart = differ(second, n)
         return float((n @ np.log(variances(first, n, apart) / variances(second, n, apart))).sum())
