@@ -65,6 +65,13 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert 0.93 < (np.abs(apart) < 1.96).mean() < 0.97
 
 
+def test_a_spectrum_singular_at_one_line_is_no_mode():
+    """Of one line only one direction is seen: a mode that cancels the rest there would make the record likely at will."""
+    found = identify_ambient(driven(219))
+    assert found.modes.n_modes == N
+    assert (np.abs(found.modes.omega - OMEGA) < 4 * found.omega_std).all()
+
+
 def test_too_short_a_record_is_refused():
     with pytest.raises(ValueError, match="measure longer"):
         ambient_decays(driven(2, n_samples=1000), longest=5.0)

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.signal.windows import tukey
 
 # A taper at both ends keeps strong modes from leaking into far weak ones.
@@ -30,6 +31,8 @@ MOST_STEPS, MOST_SWEEPS, SETTLED = 40, 3, 1e-2
 LEAST_TOLD = 1e-10
 # A mode narrower than so many lines would answer single ones, and no record is too unlikely for that.
 NARROWEST = 3.0
+# Nor for a spectrum that is singular at a line, across what is seen there: the mean of a few lines keeps it from that.
+LEAST_OF_MEAN = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +197,8 @@ class Task:
     """One band: unknowns are, mode by mode, Re λ, Im λ, φ but its largest entry, c, and then B."""
 
     def __init__(self, spectrum: Spectrum, others: Sequence[Swing], about: Sequence[Swing], held: list[int]) -> None:
-        self.z, power, counts = _averaged(spectrum, about)
+        self.z, power, counts, mean = _averaged(spectrum, about)
+        self.least = LEAST_OF_MEAN * mean
         self.power, self.counts, self.held = power, counts / spectrum.loss, held
         self.dt, self.narrowest = spectrum.sample_time, NARROWEST * spectrum.spacing
         self.fixed = sum((swing.spectrum(self.z, self.dt) for swing in others), np.zeros_like(power))
@@ -214,7 +218,7 @@ class Task:
         level = np.linalg.eigvalsh(self.power[quiet].mean(axis=0))
         floor = np.zeros((DEGREE + 1, self.p, self.p), complex)
         floor[0] = max(level[0], 1e-6 * level[-1]) * np.eye(self.p)
-        whole = self.whole(swings, floor)
+        whole = self.whole(swings, floor) - self.least
         floor[0] += max(0.0, 1.1 * float((-np.linalg.eigvalsh(whole)[:, 0]).max()) + level[0]) * np.eye(self.p)
         return floor
 
@@ -228,6 +232,7 @@ class Task:
         s = self.whole(swings, background)
         try:
             root = np.linalg.cholesky(s)
+            np.linalg.cholesky(s - self.least)
         except np.linalg.LinAlgError:
             return np.inf
         logs = 2.0 * np.log(np.einsum("kii->ki", root).real).sum(axis=1)
@@ -302,8 +307,9 @@ def _lines(spectrum: Spectrum, low: float, high: float) -> slice:
     return slice(first, max(first + 1, min(int(np.floor(high / spectrum.spacing)), n)))
 
 
-def _averaged(spectrum: Spectrum, swings: Sequence[Swing]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """z, products of the transforms and how many lines each stands for, over the band of some modes."""
+def _averaged(spectrum: Spectrum, swings: Sequence[Swing]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """z, products of the transforms, how many lines each stands for, and their mean over a few lines about, over the
+    band of some modes."""
     centre, width = np.array([[s.pole.imag, abs(s.pole.real)] for s in swings]).T
     reach = np.maximum(np.minimum(REACH * width, 0.5 * centre), LEAST_LINES * spectrum.spacing)
     band = _lines(spectrum, max((centre - reach).min(), 2.5 * spectrum.spacing), (centre + reach).max())
@@ -311,6 +317,9 @@ def _averaged(spectrum: Spectrum, swings: Sequence[Swing]) -> tuple[np.ndarray, 
     size = max(1, int(width.min() / PARTS / spectrum.spacing), values.shape[1] // MOST_PARTS)
     edges = np.arange(0, values.shape[1], size)
     counts = np.diff(np.r_[edges, values.shape[1]])
-    power = np.add.reduceat(np.einsum("ik,jk->kij", values, values.conj()), edges, axis=0) / counts[:, None, None]
+    products = np.einsum("ik,jk->kij", values, values.conj())
+    power = np.add.reduceat(products, edges, axis=0) / counts[:, None, None]
+    about = max(size, 2 * len(values) + 1)
+    mean = uniform_filter1d(products, about, axis=0, mode="nearest")[edges + (counts - 1) // 2]
     omega = spectrum.spacing * (1 + band.start + edges + 0.5 * (counts - 1))
-    return np.exp(1j * omega * spectrum.sample_time), power, counts.astype(float)
+    return np.exp(1j * omega * spectrum.sample_time), power, counts.astype(float), mean
