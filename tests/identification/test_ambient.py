@@ -1,5 +1,7 @@
 """Truth: a chain of three masses under white forces, stepped with the exact covariance of each step (Van Loan 1978)."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import expm
@@ -65,11 +67,18 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert 0.93 < (np.abs(apart) < 1.96).mean() < 0.97
 
 
-def test_a_spectrum_singular_at_one_line_is_no_mode():
-    """Of one line only one direction is seen: a mode that cancels the rest there would make the record likely at will."""
-    found = identify_ambient(driven(219))
-    assert found.modes.n_modes == N
-    assert (np.abs(found.modes.omega - OMEGA) < 4 * found.omega_std).all()
+def test_a_spectrum_all_but_singular_at_one_line_is_not_likely():
+    """Of one line only one direction is seen, so that a swing that cancels the rest there would win without end."""
+    rng = np.random.default_rng(0)
+    spectrum = Spectrum(rng.standard_normal((2, 300)) + 1j * rng.standard_normal((2, 300)), 0.01, 0.5, 1.0)
+    swing = Swing(-0.05 + 1.5j, np.array([1.0, 0.0]), np.array([-1.0, 0.0]))
+    task, [swing] = posed(spectrum, [swing], [], [swing])
+    background = np.array([2.0 * np.eye(2), np.zeros((2, 2))])
+    deepest = -swing.spectrum(task.z, task.dt)[:, 0, 0].real.min()
+    for left, likely in ((1.0, True), (1e-9, False)):
+        cancelling = replace(swing, drive=swing.drive * (2.0 - left) / deepest)
+        assert np.linalg.eigvalsh(task.whole([cancelling], background)).min() == pytest.approx(left, rel=1e-5)
+        assert np.isfinite(task.cost([cancelling], background)) == likely
 
 
 def test_too_short_a_record_is_refused():
