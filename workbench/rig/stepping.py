@@ -59,7 +59,7 @@ def _moments(pole, h, e):
 
 
 @njit(cache=True, nogil=True)
-def _yield_update(z, dw, limit):
+def yield_update(z, dw, limit):
     """Bouc-Wen z after a monotone travel dw, and dz/d(dw): exact, since the law does not depend on the speed."""
     s = 1.0 if dw >= 0 else -1.0
     left = abs(dw)
@@ -95,7 +95,7 @@ def element_force(kind, parameters, i, w, v, z, w_old):
         level = math.tanh(v / b)
         return -a * level, 0.0, -a / b * (1.0 - level * level)
     if kind == BOUC_WEN:
-        pulled, slope = _yield_update(z, w - w_old, b)
+        pulled, slope = yield_update(z, w - w_old, b)
         return -a * pulled, -a * slope, 0.0
     p = parameters[i]
     force = user_law(w, v, p)
@@ -310,7 +310,7 @@ def step_record(
                 for j in range(n_elements):
                     w += aw[i, j] * point[j]
                 if kinds[i] == BOUC_WEN:
-                    z[i], _ = _yield_update(z[i], w - w_old[i], parameters[i, 1])
+                    z[i], _ = yield_update(z[i], w - w_old[i], parameters[i, 1])
                 w_old[i] = w
 
 

@@ -12,6 +12,7 @@ from functools import cache, lru_cache
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
+from scipy.special import eval_legendre
 
 
 @cache
@@ -42,13 +43,19 @@ def reference_basis(degree: int, continuity: int) -> np.ndarray:
 
 
 @cache
+def _derived(degree: int, continuity: int, derivative: int) -> np.ndarray:
+    """Legendre coefficients of a derivative of the basis, a column a function."""
+    basis = reference_basis(degree, continuity).T
+    return legendre.legder(basis, derivative) if derivative else basis
+
+
+@cache
 def tabulated_basis(degree: int, continuity: int, n_points: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Gauss points and weights on [-1, 1] and the basis with its derivatives there, (n_points, degree + 1) each."""
     points, weights = legendre.leggauss(n_points)
-    basis = reference_basis(degree, continuity).T
     tables = []
     for order in range(continuity + 2):
-        coefficients = legendre.legder(basis, order) if order else basis
+        coefficients = _derived(degree, continuity, order)
         tables.append(legendre.legvander(points, coefficients.shape[0] - 1) @ coefficients)
     return points, weights, tables
 
@@ -135,13 +142,13 @@ def _evaluation(nodes: bytes, degree: int, continuity: int, places: bytes, deriv
     x = np.frombuffer(places)
     matrix = np.zeros((x.size, segments.n_functions))
     segment = np.clip(np.searchsorted(segments.nodes, x, side="right") - 1, 0, segments.n_segments - 1)
-    coefficients = reference_basis(degree, continuity).T
-    coefficients = legendre.legder(coefficients, derivative) if derivative else coefficients
+    coefficients = _derived(degree, continuity, derivative)
+    orders = np.arange(coefficients.shape[0])
     for s in np.unique(segment):
         here = segment == s
         h = segments.nodes[s + 1] - segments.nodes[s]
         local = 2.0 * (x[here] - segments.nodes[s]) / h - 1.0
-        values = legendre.legvander(local, coefficients.shape[0] - 1) @ coefficients
+        values = eval_legendre(orders, local[:, None]) @ coefficients
         matrix[np.ix_(np.flatnonzero(here), segments.indices(s))] = (
             values * segments.scales(s) * (2.0 / h) ** derivative
         )

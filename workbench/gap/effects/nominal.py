@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.gap.effects.effect import Kind, Parameter
+from workbench.gap.effects.structural import solved_once
 from workbench.rig.rig import Rig
 
 FREQUENCY_STD, DAMPING_STD, MASS_STD = 0.01, 0.25, 0.02
@@ -51,7 +52,7 @@ NOMINAL_FIGURES = Kind(
         Parameter(name, "", 1.0 / most, most, logarithmic=True, prior_std=std)
         for name, std, most in _names(rig.modes.n_modes)
     ),
-    apply=_adjusted,
+    apply=solved_once(_adjusted),
     starts=lambda evidence, _: [{name: 1.0 for name, _, _ in _names(evidence.rig.modes.n_modes)}],
     phrase="nominal frequencies and damping ratios that are a little off",
     last=True,

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from numba import njit
 
 from workbench.gap.effects.effect import Kind, Parameter
 from workbench.gap.effects.structural import place_parameter
@@ -16,6 +17,7 @@ from workbench.rig.elements import (
     OneSidedStop,
 )
 from workbench.rig.rig import Rig
+from workbench.rig.stepping import yield_update
 
 
 def with_element(rig: Rig, element) -> Rig:
@@ -192,13 +194,12 @@ COULOMB_FRICTION = Kind(
 # --- bouc_wen
 
 
+@njit(cache=True, nogil=True)
 def _hysteresis(displacement: np.ndarray, limit: float) -> np.ndarray:
     """z of a Bouc-Wen spring along a path of displacements."""
     z = np.zeros_like(displacement)
     for k in range(1, displacement.size):
-        dw = displacement[k] - displacement[k - 1]
-        rate = 1.0 - (np.sign(dw) * z[k - 1] + abs(z[k - 1])) / (2 * limit)
-        z[k] = min(max(z[k - 1] + rate * dw, -limit), limit)
+        z[k], _ = yield_update(z[k - 1], displacement[k] - displacement[k - 1], limit)
     return z
 
 

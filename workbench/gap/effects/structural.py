@@ -1,7 +1,8 @@
 """Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,20 @@ def resolved(rig: Rig, structure) -> Rig:
     return replace(rig, structure=structure, modes=structure.modes(rig.modes.n_modes, tolerance=RESOLUTION))
 
 
+def solved_once(change: Callable[[Rig, Any, dict[str, float]], Rig]) -> Callable[[Rig, Any, dict[str, float]], Rig]:
+    """The change of a structure or of its modes, remembered: a search asks for one beside many other effects."""
+
+    @lru_cache(maxsize=256)
+    def changed(structure: Structure | None, modes: Modes, target, values) -> Rig:
+        return change(Rig(modes, (), (), structure=structure), target, dict(values))
+
+    def apply(rig: Rig, target, values: dict[str, float]) -> Rig:
+        found = changed(rig.structure, rig.modes, target, tuple(values.items()))
+        return replace(rig, structure=found.structure, modes=found.modes)
+
+    return apply
+
+
 def _member(rig: Rig) -> Structure:
     if rig.structure is None:
         raise ValueError("plain modal data have no structure to change; describe it as a beam or a rod")
@@ -53,9 +68,10 @@ def _beam(rig: Rig) -> Beam:
 
 
 def _with_attachment(rig: Rig, part) -> Rig:
-    if rig.structure is None:
-        return replace(rig, modes=attach(rig.modes, (part,)))
-    return resolved(rig, replace(rig.structure, attachments=(*rig.structure.attachments, part)))
+    structure = rig.structure and replace(rig.structure, attachments=(*rig.structure.attachments, part))
+    if structure is None or isinstance(part, PointDamper):  # which leaves the modes what they are
+        return replace(rig, structure=structure, modes=attach(rig.modes, (part,)))
+    return resolved(rig, structure)
 
 
 def stiffness_name(structure) -> str:
@@ -94,7 +110,7 @@ MODULUS_ERROR = Kind(
     name="modulus_error",
     path="structure",
     parameters=lambda rig, _: (Parameter("factor", "", 0.2, 5.0, logarithmic=True),),
-    apply=_modulus,
+    apply=solved_once(_modulus),
     starts=_modulus_starts,
     phrase="an overall stiffness error",
 )
@@ -155,7 +171,7 @@ POINT_MASS = Kind(
     name="point_mass",
     path="structure",
     parameters=_positive("mass", "kg", _total_mass),
-    apply=lambda rig, _, v: _with_attachment(rig, PointMass(v["at"], v["mass"])),
+    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(v["at"], v["mass"]))),
     starts=_point_starts("mass", "acceleration", _total_mass),
     phrase="an added mass",
 )
@@ -164,7 +180,7 @@ GROUND_SPRING = Kind(
     name="ground_spring",
     path="structure",
     parameters=_positive("stiffness", "N/m", _typical_stiffness),
-    apply=lambda rig, _, v: _with_attachment(rig, PointSpring(v["at"], v["stiffness"])),
+    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(v["at"], v["stiffness"]))),
     starts=_point_starts("stiffness", "displacement", _typical_stiffness),
     phrase="a spring to ground",
 )
@@ -173,7 +189,7 @@ POINT_DAMPER = Kind(
     name="point_damper",
     path="structure",
     parameters=_positive("coefficient", "N s/m", _typical_damping),
-    apply=lambda rig, _, v: _with_attachment(rig, PointDamper(v["at"], v["coefficient"])),
+    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(v["at"], v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", _typical_damping),
     phrase="a viscous damper to ground",
 )
@@ -213,7 +229,7 @@ LOCAL_STIFFNESS_LOSS = Kind(
     name="local_stiffness_loss",
     path="structure",
     parameters=_loss_parameters,
-    apply=_softened,
+    apply=solved_once(_softened),
     starts=_loss_starts,
     targets=lambda rig: (None,) if rig.structure is not None else (),
     phrase="a local loss of stiffness",
@@ -246,7 +262,7 @@ SUPPORT_ROTATION = Kind(
     parameters=lambda rig, _: (
         Parameter("rotational_stiffness", "N m/rad", 1e-4 * _end_stiffness(rig), 1e5 * _end_stiffness(rig), True),
     ),
-    apply=_rotated,
+    apply=solved_once(_rotated),
     starts=lambda evidence, _: [
         {"rotational_stiffness": _end_stiffness(evidence.rig) * s} for s in np.geomspace(0.01, 3000.0, 16)
     ],
@@ -276,7 +292,7 @@ AXIAL_LOAD = Kind(
     parameters=lambda rig, _: (
         Parameter("tension", "N", -4.0 * _buckling(rig), 200.0 * _buckling(rig), scale=0.05 * _buckling(rig)),
     ),
-    apply=_pulled,
+    apply=solved_once(_pulled),
     starts=lambda evidence, _: [
         {"tension": share * _buckling(evidence.rig)}
         for share in (
@@ -315,7 +331,7 @@ TRUNCATED_MODES = Kind(
     name="truncated_modes",
     path="structure",
     parameters=lambda rig, _: (),
-    apply=_truncated,
+    apply=solved_once(_truncated),
     starts=lambda evidence, _: [{}],
     targets=lambda rig: tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)) if rig.structure else (),
     phrase="modes left out of the model",
@@ -340,7 +356,7 @@ MODAL_DAMPING = Kind(
     name="modal_damping",
     path="structure",
     parameters=lambda rig, _: (Parameter("factor", "", 1e-3, 100.0, logarithmic=True),),
-    apply=_damped,
+    apply=solved_once(_damped),
     starts=lambda evidence, _: [{"factor": f} for f in (0.2, 0.4, 0.6, 0.8, 0.9, 1.1, 1.25, 1.6, 2.2, 3.0, 5.0, 8.0)],
     phrase="a damping error common to all modes",
 )
