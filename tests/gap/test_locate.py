@@ -28,8 +28,8 @@ def measured(record_of):
     return make
 
 
-def where(rig, records):
-    return locate(Evidence.of(rig, FitData(tuple(records), np.full(4, NOISE))), ())
+def where(rig, records, **options):
+    return locate(Evidence.of(rig, FitData(tuple(records), np.full(4, NOISE))), (), **options)
 
 
 def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
@@ -54,6 +54,17 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     assert found.at_std < 0.005 * rig.modes.length
     assert 2 in found.modes and found.point_share > 0.95
     assert found.path == "structure" and found.linear_share < 0.1
+
+
+def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
+    faulty = rig.sensors[1]
+    sensors = tuple(replace(s, gain=-1.0) if s is faulty else s for s in rig.sensors)
+    real = replace(rig, elements=(PeriodicForce(1.37, 1.1 * rig.modes.frequencies_hz[1], 0.05, 0.3),), sensors=sensors)
+    records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]
+    misled, found = where(rig, records), where(rig, records, faulty=[faulty.name])
+    assert abs(misled.at - 1.37) > 0.02 * rig.modes.length
+    assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
+    assert found.point_share > 0.95 and found.sensor_shares[1] == misled.sensor_shares[1]
 
 
 def test_no_gap_has_no_path(rig, measured):

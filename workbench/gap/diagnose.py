@@ -83,12 +83,13 @@ def _verdict(
     shrinkage = measure(rig, corrected, validation, settle=settle)
     outcome = "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
     effects = found.best.effects if outcome in ("none", "explained") else ()
+    faulty = [str(effect.target) for effect in found.best.effects if effect.kind.path == "sensor"]
     return Verdict(
         case=name,
         outcome=outcome,
         effects=found.best.effects,
         alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in found.rivals),
-        where=locate(found.evidence, effects),
+        where=locate(found.evidence, effects, faulty=faulty),
         shrinkage=shrinkage,
         corrected=corrected,
         nominal=rig,

@@ -1,6 +1,7 @@
 """What the records say before any effect is guessed: the missing force, its place, and the motion there."""
 
-from dataclasses import dataclass, field
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,6 +67,19 @@ class Evidence:
         predictions = data.predictions(rig)
         residuals = tuple(r.outputs - p for r, p in zip(data.counted, predictions, strict=True))
         return cls(rig, data, motions, residuals, n_places)
+
+    def without(self, names: Collection[str]) -> "Evidence":
+        """The same evidence without some of the sensors; with all of them where none would be left."""
+        kept = [j for j, sensor in enumerate(self.rig.sensors) if sensor.name not in names]
+        if len(kept) in (0, len(self.rig.sensors)):
+            return self
+        sensors = tuple(self.rig.sensors[j] for j in kept)
+        return replace(
+            self,
+            rig=replace(self.rig, sensors=sensors),
+            data=self.data.of_outputs(tuple(sensor.name for sensor in sensors)),
+            residuals=tuple(residual[kept] for residual in self.residuals),
+        )
 
     @property
     def length(self) -> float:

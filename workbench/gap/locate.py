@@ -1,6 +1,6 @@
 """Where a simulation and a test disagree: by record, mode, band, time, sensor and level, and along which path."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,8 +61,14 @@ class Where:
         return self.place.at_std
 
 
-def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
-    """Take the gap on the fit records apart; the path is that of the effects, where they are known."""
+def locate(evidence: Evidence, effects: Sequence[Effect], *, faulty: Collection[str] = ()) -> Where:
+    """Take the gap on the fit records apart.
+
+    Args:
+        evidence: of the nominal rig.
+        effects: that explain the gap, where they are known: the path is theirs.
+        faulty: names of sensors at fault, left out where a force is placed: it would have to explain them too.
+    """
     data = evidence.data
     scaled = [
         r / record.outputs.std(axis=1, keepdims=True)
@@ -75,7 +81,8 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
     between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
     mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - OCTAVES, 1)]
-    place = placed(evidence)
+    hearing = evidence.without(faulty)
+    place = placed(hearing)
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     return Where(
@@ -92,7 +99,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect]) -> Where:
         input_levels=levels,
         linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
         place=place,
-        point_share=_share(evidence, place),
+        point_share=_share(hearing, place),
     )
 
 
