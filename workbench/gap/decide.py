@@ -5,13 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from workbench.gap.beside_random import NEAR, decide_with_random
-from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, ranked, relocated, simplest
 from workbench.gap.fit import Fit
 from workbench.gap.outcome import Decision
-from workbench.gap.search import Search, one_more, spread_over_kinds
+from workbench.gap.search import Search, apart, one_more, spread_over_kinds
 
+FIRSTS = 5  # single effects that a second one is looked for beside
+MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
+NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
+SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
 TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
 FAR_BEHIND = 2.0  # finer steps bring no set this many times as costly as another to the noise floor before it
 
@@ -41,26 +45,69 @@ def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
 
 
 def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
-    """The best few single effects, each with a second one or a random disturbance, until a pair explains."""
-    firsts = spread_over_kinds(singles, 2)[:5]
+    """The best few single effects, each with a second one or a random disturbance, until a pair explains.
+
+    In a near miss the right half has nearly its right numbers, better ones than it had alone: as soon as there is one,
+    the other half is looked for anew beside either.
+    """
     pairs: list[Fit] = []
     ended: list[Fit] = []
-    for i, first in enumerate(firsts):
-        begin = 0.5 + 0.4 * i / len(firsts)
-        evidence = Evidence.of(apply_all(search.rig, first.effects), search.data, 20)
+    given: list[Effect] = []
+    missed: list[Fit] = []
+
+    def explained_beside(effect: Effect, evidence: Evidence, finalists: int) -> bool:
+        begin = 0.5 + 0.05 * min(len(given), 8)
+        given.append(effect)
+        pairs.extend(one_more(search, (effect,), evidence, begin, begin + 0.05, finalists=finalists))
+        pairs.sort(key=lambda f: f.cost)
+        fresh = [pair for pair in pairs[:TRIED_FURTHER] if not _done(pair, ended)]
+        taken = _to_their_ends(search, fresh)
+        ended.extend((*fresh, *taken))
+        pairs[:] = sorted((*taken, *pairs), key=lambda f: f.cost)
+        return any(search.explains(pair) for pair in taken)
+
+    def explained_by_exchange() -> bool:
+        missed.append(pairs[0])
+        halves = [half for half in pairs[0].effects[::-1] if not any(_unmoved(half, other) for other in given)]
+        return any(explained_beside(half, _evidence(search, half), 4) for half in halves)
+
+    for first in spread_over_kinds(singles, 2)[:FIRSTS]:
+        (effect,) = first.effects
+        if any(_alike(effect, half, search) for pair in missed for half in pair.effects):
+            continue
+        evidence = _evidence(search, effect)
         beside = decide_with_random(search, first, evidence)
         if beside is not None:
             return beside
-        step = 0.4 / len(firsts)
-        pairs += one_more(search, first.effects, evidence, begin, begin + step, finalists=3 if i else 5)
-        pairs.sort(key=lambda f: f.cost)
-        fresh = [pair for pair in pairs[:TRIED_FURTHER] if pair not in ended]
-        taken = _to_their_ends(search, fresh)
-        ended += [*fresh, *taken]
-        pairs = sorted((*taken, *pairs), key=lambda f: f.cost)
-        if any(search.explains(pair) for pair in taken):
-            return _of_pairs(search, start, pairs, ended)
-    return _of_pairs(search, start, _exchanged(search, pairs), ended)
+        if explained_beside(effect, evidence, 3 if given else 5):
+            break
+        if not missed and search.near(pairs[0], NEAR) and explained_by_exchange():
+            break
+    else:
+        if search.near(pairs[0], NEAR) and all(pairs[0].cost - 1.0 < NEARER * (m.cost - 1.0) for m in missed):
+            explained_by_exchange()
+    return _of_pairs(search, start, pairs, ended)
+
+
+def _evidence(search: Search, effect: Effect) -> Evidence:
+    return Evidence.of(apply_all(search.rig, (effect,)), search.data, 20)
+
+
+def _alike(one: Effect, other: Effect, search: Search) -> bool:
+    """Whether two effects are the same but for their numbers."""
+    if one.label != other.label:
+        return False
+    return "at" not in one.values or not apart(one, other, search.rig.modes.length)
+
+
+def _unmoved(one: Effect, other: Effect) -> bool:
+    """Whether two effects are the same, with nearly the same numbers."""
+    return one.label == other.label and all(np.isclose(one.values[n], other.values[n], rtol=MOVED) for n in one.values)
+
+
+def _done(pair: Fit, ended: Sequence[Fit]) -> bool:
+    """Whether the same set was taken to its end before, from hardly another place."""
+    return any(pair.key == other.key and other.cost - 1.0 < SAME * (pair.cost - 1.0) for other in ended)
 
 
 def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
@@ -70,21 +117,6 @@ def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
         return ended
     near = [pair for pair in ended if search.near(pair, 0.2 * NEAR)]
     return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
-
-
-def _exchanged(search: Search, pairs: list[Fit]) -> list[Fit]:
-    """The pairs, and those that come of keeping one half of a near miss and looking for the other half anew.
-
-    In a near miss the right half has nearly its right numbers, better ones than it had alone.
-    """
-    best = pairs[0]
-    if not search.near(best, NEAR):
-        return pairs
-    for i in range(len(best.effects)):
-        kept = best.effects[:i] + best.effects[i + 1 :]
-        evidence = Evidence.of(apply_all(search.rig, kept), search.data, 20)
-        pairs = pairs + one_more(search, kept, evidence, 0.9, 0.94, finalists=4)
-    return sorted(pairs, key=lambda f: f.cost)
 
 
 def unexplained(start: Fit, best: Fit, rivals) -> Decision:
@@ -101,7 +133,7 @@ def _of_pairs(search: Search, start: Fit, pairs: list[Fit], done: list[Fit]) -> 
     ended = sorted(_ended(search, list(distinct.values())[:4]), key=lambda f: f.cost)
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
-        fresh = [f for f in ended[:2] if f not in done]
+        fresh = [f for f in ended[:2] if not _done(f, done)]
         ended = [*search.side_by_side(relocated, fresh), *(f for f in ended if f not in fresh)]
         explaining = [f for f in ended if search.explains(f)]
     if explaining:

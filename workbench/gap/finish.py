@@ -8,11 +8,12 @@ import numpy as np
 from workbench.gap.effects.containment import fewer, simpler_forms
 from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import Fit, cost_of, fit
-from workbench.gap.search import Search
+from workbench.gap.search import Search, promise
 
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
 NO_NEARER = 0.9
 TRIED = 2  # iterations at each other place, before the likeliest are chosen
+LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
 APART = 0.02  # of the length: nearer, a place is the same valley
 FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
@@ -31,11 +32,14 @@ def relocated(search: Search, candidate: Fit) -> Fit:
     for i, effect in enumerate(candidate.effects):
         if "at" not in effect.values or effect.kind.path not in ("structure", "environment"):
             continue
+        here = fit(search.rig, candidate.effects, search.quick, iterations=6)
         for moved in _elsewhere(search, candidate.effects, i):
             started = fit(search.rig, moved, search.quick, iterations=6)
+            if promise(started) > LOWER * here.cost:
+                continue
             trial = fit(search.rig, started.effects, search.data, iterations=10)
             if trial.cost < candidate.cost:
-                candidate = trial
+                candidate, here = trial, started
     return finished(search, candidate)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from workbench.rig.simulate import is_stepped
 HOPELESS = 1e300
 BENT, MOST_BENT = 0.1, 0.75
 SLOPE_SUBSTEPS = 2
+PROMISED = 0.1  # of the tolerance: a step that promises less is not worth trying
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,11 @@ class _Problem:
         self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
         self.centre = np.array([self.parameters[j][1].to_free(1.0) for j in self.believed])
 
+    @cached_property
+    def is_coarsened(self) -> bool:
+        """Whether slopes are taken by coarser steps of time than residuals."""
+        return self.data.substeps > SLOPE_SUBSTEPS and is_stepped(apply_all(self.rig, (*self.effects, *self.held)))
+
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
         for (i, parameter), z in zip(self.parameters, free, strict=True):
@@ -99,8 +106,7 @@ class _Problem:
 
     def jacobian(self, free: np.ndarray, residual: np.ndarray) -> np.ndarray:
         """Differences, by coarser steps of time where the rig is stepped: slopes need not be as exact as residuals."""
-        stepped = is_stepped(apply_all(self.rig, (*self.at(free), *self.held)))
-        on_coarse = self.residual(free, coarsely=True) if stepped and self.data.substeps > SLOPE_SUBSTEPS else None
+        on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
         coarsely = on_coarse is not None
         if on_coarse is not None:
             residual = on_coarse
@@ -166,7 +172,14 @@ def fit(
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         improved: np.ndarray | None = None
         for _ in range(7):
-            step = _step(problem, free, residual, jacobian, gradient, normal + damping * np.diag(diagonal))
+            damped = normal + damping * np.diag(diagonal)
+            straight, moving = _straight(problem, free, gradient, damped)
+            promised = -(2.0 * gradient + normal @ straight) @ straight
+            if promised < PROMISED * tolerance * cost:
+                break
+            step = _bounded(
+                problem, free, straight + _bend(problem, free, residual, jacobian, damped, straight, moving)
+            )
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
                 improved = trial
@@ -184,11 +197,8 @@ def fit(
     return _result(problem, free, residual, normal, status, falling)
 
 
-def _step(problem: _Problem, free, residual, jacobian, gradient, damped) -> np.ndarray:
-    """The damped step, bent along its valley, no longer than is sensible, and inside the bounds.
-
-    A number that stands at a bound and would pass it stays there, and the others step without it.
-    """
+def _straight(problem: _Problem, free, gradient, damped) -> tuple[np.ndarray, np.ndarray]:
+    """The damped step, and which numbers it moves: one at a bound that it would pass stays, the others do without."""
     moving = np.ones(free.size, bool)
     step = np.zeros(free.size)
     for _ in range(free.size):
@@ -199,7 +209,11 @@ def _step(problem: _Problem, free, residual, jacobian, gradient, damped) -> np.n
             break
         moving &= ~leaving
         step[leaving] = 0.0
-    step = step + _bend(problem, free, residual, jacobian, damped, step, moving)
+    return step, moving
+
+
+def _bounded(problem: _Problem, free, step) -> np.ndarray:
+    """The step, no longer than is sensible, and inside the bounds."""
     reach = _reach(problem)
     step = np.clip(step, -reach, reach)
     return np.clip(free + step, problem.low, problem.high) - free

@@ -18,7 +18,7 @@ SLACK = 0.03
 INTEGRATION_SHARE = 2e-6
 SURE = 30.0
 WORTHWHILE = 0.01  # of the noise power: less is within what two good finite-element models differ by
-TARGETS_A_KIND, JOINED = 2, 10
+TARGETS_A_KIND, LIKELY, JOINED = 2, 16, 10
 ELSEWHERE = 0.1  # of the length
 CLOSE = 1.5
 FEW, MORE = 3, 4  # iterations of a quick fit, and of one that may come first
@@ -118,8 +118,7 @@ def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begi
     started = [s for s in search.pool.map(lambda task: _started(search, rig, evidence, *task), tasks) if s]
     search.report("starts", begin + 0.3 * (end - begin))
     if given:
-        started = _promising(started, TARGETS_A_KIND)
-        started = list(search.pool.map(lambda s: _alone(search, rig, s), started))
+        started = _improved(search, rig, _promising(started, TARGETS_A_KIND))
         started = _promising(started, TARGETS_A_KIND)[:JOINED]
     quick_fits: list[Fit] = []
     for i, candidate in enumerate(search.pool.map(lambda s: _quick_fit(search, given, s), started)):
@@ -132,7 +131,7 @@ def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begi
     full = list(search.pool.map(lambda f: _on_all(search, f, 5), chosen))
     full.sort(key=lambda f: f.cost)
     running = [f for i, f in enumerate(full) if i < 3 or f.cost < 2.0 * full[0].cost]
-    full[: len(running)] = search.pool.map(lambda f: _on_all(search, f, 25), running)
+    full[: len(running)] = search.pool.map(lambda f: _on_all(search, f, 25) if f.falling else f, running)
     search.report("all records", end)
     return sorted(full, key=lambda f: f.cost)
 
@@ -177,12 +176,12 @@ def _started(search: Search, rig: Rig, evidence: Evidence, kind: Kind, target) -
     costs = [cost_of(rig, (effect, *search.held), search.first) for effect in starts]
     order = [i for i in np.argsort(costs) if costs[i] < HOPELESS]
     # a lone start is of an effect that is linear in its number: its cost says nothing yet
-    chosen = order[:1] + [i for i in order[1:] if _elsewhere(starts[i], starts[order[0]], rig.modes.length)][:1]
+    chosen = order[:1] + [i for i in order[1:] if apart(starts[i], starts[order[0]], rig.modes.length)][:1]
     return [(-1.0 if len(starts) == 1 else costs[i], starts[i]) for i in chosen]
 
 
-def _elsewhere(one: Effect, other: Effect, length: float) -> bool:
-    """Whether two starts stand far enough apart to end in different valleys; those of no place always do."""
+def apart(one: Effect, other: Effect, length: float) -> bool:
+    """Whether two effects stand far enough apart to be in different valleys; those of no place always do."""
     return "at" not in one.values or abs(one.values["at"] - other.values["at"]) > ELSEWHERE * length
 
 
@@ -198,22 +197,35 @@ def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[lis
     return kept
 
 
-def _alone(search: Search, rig: Rig, started: list[tuple[float, Effect]]) -> list[tuple[float, Effect]]:
-    """The starts improved a little with the effects found before held fixed: the best, and a rival near it."""
-    fits = [fit(rig, (effect,), search.quick, held=search.held, iterations=3) for _, effect in started]
-    fits.sort(key=lambda f: f.cost)
-    return [(f.cost, f.effects[0]) for f in fits if f.cost < CLOSE * fits[0].cost]
+def _improved(search: Search, rig: Rig, started: list[list[tuple[float, Effect]]]) -> list[list[tuple[float, Effect]]]:
+    """The starts of each task improved with the effects found before held fixed: its best, and a rival near it.
+
+    One step for every start tells which are worth more.
+    """
+
+    def alone(effect: Effect, steps: int) -> Fit:
+        return fit(rig, (effect,), search.quick, held=search.held, iterations=steps)
+
+    task_of = [i for i, task in enumerate(started) for _ in task]
+    fits = list(search.pool.map(lambda effect: alone(effect, 1), [effect for task in started for _, effect in task]))
+    likely = {*np.argsort([f.cost for f in fits])[:LIKELY], *np.argsort([promise(f) for f in fits])[:LIKELY]}
+    fits = list(search.pool.map(lambda i: alone(fits[i].effects[0], 2) if i in likely else fits[i], range(len(fits))))
+    improved = []
+    for i in range(len(started)):
+        task = sorted((f for f, owner in zip(fits, task_of, strict=True) if owner == i), key=lambda f: f.cost)
+        improved.append([(f.cost, f.effects[0]) for f in task if f.cost < CLOSE * task[0].cost])
+    return improved
 
 
 def _quick_fit(search: Search, given: tuple[Effect, ...], started: list[tuple[float, Effect]]) -> Fit:
     """The most promising of a kind's starts, improved a little on the quick records, jointly with the given effects."""
-    return min((_quickly(search, (*given, effect), FEW) for _, effect in started), key=_promise)
+    return min((_quickly(search, (*given, effect), FEW) for _, effect in started), key=promise)
 
 
 def _with_more_time(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits by their costs, those improved further that are still on their way and not far behind."""
-    order = sorted(fits, key=_promise)
-    hopeful = [f for f in order[:HOPEFUL] if f.falling > 0 and _promise(f) < FAR * _promise(order[0])]
+    order = sorted(fits, key=promise)
+    hopeful = [f for f in order[:HOPEFUL] if f.falling > 0 and promise(f) < FAR * promise(order[0])]
     longer = search.pool.map(lambda f: _quickly(search, f.effects, MORE), hopeful)
     return sorted((*(f for f in fits if f not in hopeful), *longer), key=lambda f: f.cost)
 
@@ -222,7 +234,7 @@ def _quickly(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
     return fit(search.rig, effects, search.quick, held=search.held, iterations=iterations, tolerance=AT_REST)
 
 
-def _promise(candidate: Fit) -> float:
+def promise(candidate: Fit) -> float:
     """The cost that one more iteration like the last would come to."""
     return candidate.cost * (1.0 - candidate.falling)
 
