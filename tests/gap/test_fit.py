@@ -11,9 +11,10 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.containment import fewer, simpler_forms
 from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import cost_of, fit
-from workbench.gap.prediction import FitData
+from workbench.gap.missing_force import force_filter, sampled_model, whiten
+from workbench.gap.prediction import LOOSE, FitData
 from workbench.gap.shrinkage import Shrinkage
-from workbench.rig.elements import CubicSpring
+from workbench.rig.elements import CubicSpring, PeriodicForce
 
 NOISE, DT = 1e-5, 0.01
 CUBIC, SPRING, LOSS = (kind_named(n) for n in ("cubic_spring", "ground_spring", "local_stiffness_loss"))
@@ -26,9 +27,9 @@ def rig(hinged_rig):
 
 @pytest.fixture(scope="module")
 def measured(record_of):
-    def make(real):
+    def make(real, level=1.0):
         rng = np.random.default_rng(3)
-        command = np.repeat(rng.normal(size=100), 10)[None]
+        command = level * np.repeat(rng.normal(size=100), 10)[None]
         return FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
 
     return make
@@ -44,6 +45,30 @@ def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(ri
     assert nominal > 100 and found.cost < 1.02
     assert values["at"] == pytest.approx(0.2, abs=4 * spread["at"] + 1e-3)
     assert values["stiffness"] == pytest.approx(400.0, rel=0.05)
+
+
+def test_predictions_ahead_err_by_the_innovations_of_the_filter_where_all_is_linear(rig, record_of):
+    rng = np.random.default_rng(5)
+    real = replace(rig, elements=(PeriodicForce(1.37, 3.0, 0.05, 0.3),))
+    record = record_of(real, np.repeat(rng.normal(size=30), 10)[None], rng)
+    data = FitData((record,), np.full(4, NOISE))
+    places = (np.arange(50) + 0.5) / 25
+    forces = LOOSE * data.force_rms * np.sqrt(np.mean(rig.modes.phi(places) ** 2, axis=0))
+    kalman = force_filter(sampled_model(rig.modes, rig.sensors, data.noise, DT), np.eye(6), forces**2, 0.0)
+    expected = whiten(kalman, data.residual(rig).reshape(4, -1) * NOISE)
+    np.testing.assert_allclose(data.following(rig).residual(rig).reshape(4, -1), expected, atol=1e-6)
+    assert np.std(expected) > 2.0  # so that more than noise was compared
+
+
+def test_predictions_ahead_lead_to_a_spring_beside_which_motions_run_apart(rig, measured):
+    data = measured(replace(rig, elements=(CubicSpring(0.62, 4e4),)), level=0.5)
+    away = (Effect(CUBIC, None, {"at": 0.56, "stiffness": 2.8e4}),)
+    lost = fit(rig, away, data, iterations=30)
+    ahead = fit(rig, away, data.following(rig), iterations=15)
+    found = fit(rig, ahead.effects, data.stepped(8), iterations=15)
+    assert lost.cost > 1e4 and found.cost < 1.02
+    assert found.effects[0].values["at"] == pytest.approx(0.62, abs=1e-4)
+    assert found.effects[0].values["stiffness"] == pytest.approx(4e4, rel=1e-3)
 
 
 def test_a_number_comes_back_from_its_bound(rig, measured):

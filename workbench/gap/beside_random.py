@@ -117,7 +117,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
 
 
 def _random_beside(search: Search, given: Fit, rig: Rig, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
-    found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.force_rms)
+    found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.data.force_rms)
     rms, rms_std = found.seen_rms
     effect = Effect(RANDOM_DISTURBANCE, None, {"at": found.at, "rms": rms}, {"at": found.at_std, "rms": rms_std})
     combined = Fit(

@@ -7,7 +7,7 @@ import numpy as np
 from workbench.gap.beside_random import NEAR, decide_with_random
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
-from workbench.gap.finish import finished, ranked, relocated, simplest
+from workbench.gap.finish import finished, followed, ranked, relocated, simplest
 from workbench.gap.fit import Fit
 from workbench.gap.outcome import Decision
 from workbench.gap.search import Search, apart, one_more, spread_over_kinds
@@ -113,6 +113,9 @@ def _done(pair: Fit, ended: Sequence[Fit]) -> bool:
 def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     """The pairs with finer steps, and from other places where little is left and none explains the records yet."""
     ended = search.side_by_side(finished, pairs)
+    if any(search.explains(pair) for pair in ended):
+        return ended
+    ended = search.side_by_side(followed, ended)
     if any(search.explains(pair) for pair in ended):
         return ended
     near = [pair for pair in ended if search.near(pair, 0.2 * NEAR)]

@@ -86,12 +86,6 @@ class Evidence:
         return self.rig.modes.length
 
     @cached_property
-    def force_rms(self) -> float:
-        """Root mean square of the inputs that are not at rest, N."""
-        squares = [row[row != 0] ** 2 for record in self.data.counted for row in record.inputs if np.any(row)]
-        return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 1.0
-
-    @cached_property
     def model(self) -> SampledModel:
         noise = self.data.noise
         return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
@@ -114,7 +108,7 @@ class Evidence:
         """Rms, N, and correlation time, in samples, of the missing force: the likeliest of a coarse grid."""
         coarse = self.places[::5] if self.places.size > 8 else self.places
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
-        sizes = [(share * self.force_rms, memory) for memory in MEMORIES for share in LEVELS]
+        sizes = [(share * self.data.force_rms, memory) for memory in MEMORIES for share in LEVELS]
         return max(sizes, key=lambda size: max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse))
 
     @cached_property

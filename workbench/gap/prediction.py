@@ -7,12 +7,38 @@ from threading import Lock
 
 import numpy as np
 
-from workbench.gap.missing_force import ForceFilter, whiten
+from workbench.gap.effects.structural import known_places
+from workbench.gap.missing_force import ForceFilter, force_filter, sampled_model, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import Motion, move, read
+from workbench.rig.simulate import Motion, follow, move, read
 
 REMEMBERED = 24
+LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """What holds a rig beside the records: a steady Kalman filter of its modes, under random forces on all of them.
+
+    Attributes:
+        gain: (2, n_modes, n_outputs) of their displacements and velocities.
+        whitening: (n_outputs, n_outputs) to errors of unit covariance.
+    """
+
+    gain: np.ndarray
+    whitening: np.ndarray
+
+    @classmethod
+    def of(cls, rig: Rig, noise: np.ndarray, force: float, sample_time: float) -> "Follower":
+        """For sensors of that noise (n_outputs,), and forces of that rms, N, at any place."""
+        modes, n = rig.modes, rig.modes.n_modes
+        places = known_places(rig)
+        along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
+        forces = force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
+        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), np.eye(n), forces**2, 0.0)
+        gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
+        return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +55,8 @@ class FitData:
             none.
         given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
             believed figures that are fitted along with every candidate to first order; None where none are.
+        follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
+            they are of the whole record.
     """
 
     records: tuple[Record, ...]
@@ -37,6 +65,7 @@ class FitData:
     lead: int = 0
     whitener: ForceFilter | None = None
     given_way: tuple[np.ndarray, np.ndarray] | None = None
+    follower: Follower | None = None
     _memory: OrderedDict = field(default_factory=OrderedDict, repr=False, init=False)
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 
@@ -73,6 +102,17 @@ class FitData:
         directions, sizes, _ = np.linalg.svd(sensitivity, full_matrices=False)
         return replace(self, given_way=(directions, 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)))
 
+    def following(self, rig: Rig) -> "FitData":
+        """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be."""
+        follower = Follower.of(rig, self.noise, LOOSE * self.force_rms, self.records[0].sample_time)
+        return replace(self, follower=follower)
+
+    @cached_property
+    def force_rms(self) -> float:
+        """Root mean square of the inputs that are not at rest, N."""
+        squares = [row[row != 0] ** 2 for record in self.counted for row in record.inputs if np.any(row)]
+        return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 1.0
+
     @cached_property
     def counted(self) -> tuple[Record, ...]:
         """The records without their lead."""
@@ -106,6 +146,8 @@ class FitData:
 
     def residual(self, rig: Rig) -> np.ndarray:
         """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
+        if self.follower is not None:
+            return np.concatenate([self._ahead(rig, record, self.follower) for record in self.records])
         both = zip(self.counted, self.predictions(rig), strict=True)
         left = [record.outputs - prediction for record, prediction in both]
         if self.whitener is None:
@@ -116,6 +158,17 @@ class FitData:
             directions, shares = self.given_way
             residual -= directions @ (shares * (directions.T @ residual))
         return residual
+
+    def _ahead(self, rig: Rig, record: Record, follower: Follower) -> np.ndarray:
+        errors = follow(
+            rig,
+            record.inputs,
+            record.outputs,
+            follower.gain,
+            sample_time=record.sample_time,
+            substeps=self.substeps,
+        )
+        return (follower.whitening @ errors[:, self.lead :]).ravel()
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""

@@ -51,6 +51,7 @@ LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
     UserLaw: (USER, lambda e: e.parameters),
 }
+NOT_MEASURED, NOTHING = np.zeros((0, 0)), np.zeros((0, 0, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +191,41 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
+    return _stepped(rig, inputs, NOT_MEASURED, NOTHING, sample_time, substeps)[0]
+
+
+def follow(
+    rig: Rig, inputs: np.ndarray, outputs: np.ndarray, gain: np.ndarray, *, sample_time: float, substeps: int = 8
+) -> np.ndarray:
+    """Errors (n_sensors, n_samples) of predictions one sample ahead, by a rig that every sample sets right.
+
+    A motion that runs away from the measured one within a few periods, as that of a stiff contact a little out of place
+    does, is held beside it: the errors then go smoothly with every number of the rig.
+
+    Args:
+        rig: its sensors may have gain, bias and drift; lag, clipping and rounding are not seen.
+        inputs: (n_actuators, n_samples) commands.
+        outputs: (n_sensors, n_samples) measured.
+        gain: (2, n_modes, n_sensors) by which an error moves the displacements and velocities of the modes.
+        sample_time: s.
+        substeps: of each sample interval.
+    """
+    return _stepped(rig, inputs, outputs, gain, sample_time, substeps)[1]
+
+
+def _reading(rig: Rig) -> np.ndarray:
+    """What the sensors read of displacement, velocity and acceleration of the modes: (3, n_sensors, n_modes)."""
+    rows = np.zeros((3, len(rig.sensors), rig.modes.n_modes))
+    for j, sensor in enumerate(rig.sensors):
+        derivative, order = MEASURED[sensor.quantity]
+        rows[order, j] = sensor.gain * rig.modes.phi(sensor.at, derivative)[0]
+    return rows
+
+
+def _stepped(
+    rig: Rig, inputs: np.ndarray, outputs: np.ndarray, gain: np.ndarray, sample_time: float, substeps: int
+) -> tuple[Motion, np.ndarray]:
+    """The motion, and where there are outputs their errors, which set it right."""
     modes = rig.modes
     diagonal = np.diag(modes.damping).copy()
     coupling = modes.damping - np.diag(diagonal)
@@ -212,6 +248,11 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
     drag_shapes, drag_weights = _along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
     q, v, f = (np.zeros((modes.n_modes, n_samples)) for _ in range(3))
+    known, reading, errors = outputs, NOTHING, np.empty_like(outputs)
+    if outputs.size:
+        reading, time = _reading(rig), np.linspace(0.0, 1.0, n_samples)
+        offset = np.array([[s.bias] for s in rig.sensors]) + np.outer([s.drift for s in rig.sensors], time)
+        known = outputs - offset - reading[2] @ (participation @ at_samples)
     _stepper(tuple(e.law for e in points if isinstance(e, UserLaw)))(
         modes.omega,
         diagonal,
@@ -228,14 +269,18 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
         np.array([LAWS[type(e)][0] for e in points], dtype=np.int64),
         modes.phi([e.at for e in points]) if points else np.zeros((0, modes.n_modes)),
         parameters,
+        known,
+        reading,
+        gain,
         q,
         v,
         f,
+        errors,
     )
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(n_samples)
     stiffness = modes.omega[:, None] ** 2 * q * scale
     # the forces f hold what couples the modes; only each mode's own damping is left
-    return Motion(q, v, participation @ at_samples + f - stiffness - diagonal[:, None] * v)
+    return Motion(q, v, participation @ at_samples + f - stiffness - diagonal[:, None] * v), errors
 
 
 @cache

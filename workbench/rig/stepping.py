@@ -218,14 +218,21 @@ def step_record(
     kinds,
     shapes,
     parameters,
+    measured,
+    reading,
+    gain,
     q_out,
     v_out,
     f_out,
+    error_out,
 ):
     """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest.
 
     forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
     stretching (n_modes, n_modes); drag_shapes (n_points, n_modes); shapes (n_elements, n_modes).
+
+    Where something is measured, (n_sensors, n_samples), its error against reading (3, n_sensors, n_modes) of
+    displacement, velocity and acceleration fills error_out, and sets the motion right by gain (2, n_modes, n_sensors).
     """
     n, n_samples, n_elements, n_inputs = omega.size, q_out.shape[1], kinds.size, forces.shape[0]
     h = dt / n_sub
@@ -257,6 +264,23 @@ def step_record(
             q_out[r, k] = q[r]
             v_out[r, k] = v[r]
             f_out[r, k] = old[r]
+        if measured.size > 0:
+            stiffer = 1.0 + rate * k * dt
+            for r in range(n):
+                new[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
+            for j in range(measured.shape[0]):
+                error = measured[j, k]
+                for r in range(n):
+                    error -= reading[0, j, r] * q[r] + reading[1, j, r] * v[r] + reading[2, j, r] * new[r]
+                error_out[j, k] = error
+            for j in range(measured.shape[0]):
+                for r in range(n):
+                    q[r] += gain[0, r, j] * error_out[j, k]
+                    v[r] += gain[1, r, j] * error_out[j, k]
+            for i in range(n_elements):
+                w_old[i] = 0.0
+                for r in range(n):
+                    w_old[i] += shapes[i, r] * q[r]
         if k == n_samples - 1:
             break
         for sub in range(n_sub):
