@@ -462,7 +462,7 @@ def diagnose(
         f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on level"
     )
     console.print(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if where.path == "structure" and known_places(found.rig) is None:
+    if where.path == "structure" and known_places(found.rig) is None and verdict.place_stands:
         console.print(f"  place      x = {where.at:.4g} ± {where.at_std:.1g} m, were it one force, of any law")
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():

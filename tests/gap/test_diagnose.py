@@ -1,5 +1,7 @@
 """The diagnosis on cases made by finite elements: named, quantified, honest; and an effect of the user's own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,9 @@ def test_a_hidden_contact_is_named_placed_and_closed():
     assert verdict.shrinkage.overall > 0.95 and shown["where"]["path"] == "structure"
     assert verdict.shrinkage.ci95[0] <= verdict.shrinkage.overall <= verdict.shrinkage.ci95[1]
     assert shown["where"]["amplitude_dependent"]
+    for shift, stands in ((0.0, True), (0.1, False)):
+        place = replace(verdict.where.place, at=told["at"] - shift * case.rig.modes.length)
+        assert replace(verdict, where=replace(verdict.where, place=place)).place_stands == stands
 
 
 def test_nothing_hidden_nothing_told():

@@ -16,6 +16,8 @@ from workbench.gap.locate import Where
 from workbench.gap.shrinkage import Shrinkage
 from workbench.rig.rig import Rig
 
+BESIDE = 0.02  # of the length: as near as a place is asked for
+
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
@@ -59,6 +61,15 @@ class Verdict:
                 told = [e for e in told if e.kind is not kind]
                 told.insert(0, Effect(kind, ALL, {field: float(np.median([e.values[field] for e in same]))}))
         return tuple(told)
+
+    @property
+    def place_stands(self) -> bool:
+        """Whether the place of one force, of any law, is not contradicted by effects that explain the gap."""
+        if self.outcome != "explained":
+            return True
+        near = max(3.0 * self.where.at_std, BESIDE * self.nominal.modes.length)
+        acting = [e for e in self.effects if "at" in e.values and e.kind.path in ("structure", "environment")]
+        return any(abs(effect.values["at"] - self.where.at) < near for effect in acting)
 
     @property
     def nominal_figures(self) -> dict[str, float | None]:
