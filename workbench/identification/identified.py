@@ -1,5 +1,6 @@
 """What the decision of how many modes a record holds comes to, and the rules it keeps to."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -39,7 +40,13 @@ class Identified:
         return self.refined.modes
 
 
-def no_modes(poles: np.ndarray, shapes: np.ndarray, strength: np.ndarray, bin_width: float) -> np.ndarray:
+def no_modes(
+    poles: np.ndarray,
+    shapes: np.ndarray,
+    strength: np.ndarray,
+    bin_width: float,
+    two: Callable[[int, int], bool] | None = None,
+) -> np.ndarray:
     """Which poles are damped beyond what rings, or split a stronger mode that has their shape and their band.
 
     Args:
@@ -47,15 +54,19 @@ def no_modes(poles: np.ndarray, shapes: np.ndarray, strength: np.ndarray, bin_wi
         shapes: (n_signals, n_modes) amplitudes over the noise, complex.
         strength: (n_modes,) of two alike the weaker splits the other.
         bin_width: rad/s that the length of the record can tell apart.
+        two: whether modes r and s, which one signal sees alike, are two all the same.
     """
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     damped = -poles.real > MOST_DAMPED * np.abs(poles)
     # One damped beyond what rings has every band; it is split itself.
-    # One signal has no shape, and a mode that shifts as it decays looks like two there: both are taken for one.
+    # One signal has no shape, and a mode that shifts as it decays looks like two there.
     others = len(shapes) - 1
     alike = max(SAME_SHAPE, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SAME_SHAPE
     split = near & (mac(shapes, shapes) > alike) & (strength[:, None] < strength) & ~damped
+    if two is not None and others == 0:
+        for r, s in np.argwhere(split):
+            split[r, s] = not two(r, s)
     return split.any(axis=1) | damped
 
 

@@ -12,12 +12,14 @@ swing left is no stronger than the strongest of so many in noise.
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.ailments import check_fit
+from workbench.identification.backbone import left_by_backbone
 from workbench.identification.coloured import in_its_noise, whitened
 from workbench.identification.ibrahim import check_alike
 from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
@@ -40,6 +42,8 @@ MOST_ROUNDS = 4
 MOST_SPLITS = 6
 # A swing whose part outside the modes there already is smaller than this share cannot be told from them.
 LEAST_APART = 1e-7
+# Widths that a mode told behind filters may move when read without.
+GONE = 5.0
 # Squares of what is left, over those of the record, that are round-off.
 ROUND_OFF = 1e-26
 # Bins on either side from which the colour of the noise is taken.
@@ -79,13 +83,15 @@ def identify(
         white = whitened(records, told.ringing)
         if white is None:
             break
-        told = _told(white, most_modes, false_alarm)
+        told = _told(white, most_modes, false_alarm, records)
     return told.report(records) if told.poles.size else _refuse(records)
 
 
-def _told(records: Sequence[Record], most_modes: int, false_alarm: float) -> "Told":
+def _told(
+    records: Sequence[Record], most_modes: int, false_alarm: float, measured: Sequence[Record] | None = None
+) -> "Told":
     longest = max(record.n_samples for record in records)
-    told = Told(records, [_Grid(record, longest) for record in records], false_alarm)
+    told = Told(records, [_Grid(record, longest) for record in records], false_alarm, measured or records)
     for _ in range(MOST_ROUNDS):
         if not (told.grow(most_modes) and told.prune()):
             break
@@ -102,9 +108,13 @@ def _refuse(records: Sequence[Record]) -> NoReturn:
 class Told:
     """The search: poles so far, their fits, and what was refused, each record with the grid of swings to look for."""
 
-    def __init__(self, records: Sequence[Record], grids: Sequence, false_alarm: float) -> None:
-        self.records, self.grids = records, grids
+    def __init__(
+        self, records: Sequence[Record], grids: Sequence, false_alarm: float, measured: Sequence[Record]
+    ) -> None:
+        self.records, self.grids, self.measured = records, grids, measured
         self.offset = grids[0].offset
+        # What is left may be no louder than round-off, which says nothing of one sensor beside another.
+        self.round_off = ROUND_OFF * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
         cells = grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
@@ -112,6 +122,7 @@ class Told:
         self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
         self.poles = np.zeros(0, complex)
         self.refused: list[tuple[complex, float]] = []
+        self.told_two: dict[bytes, bool] = {}
         self.weights, self.fits = self._settled(self.poles)[1:]
 
     @property
@@ -167,11 +178,40 @@ class Told:
         """Which poles are damped beyond what rings, or split another mode that has their shape and their band."""
         fits = [project(record, poles, self.offset) for record in self.records]
         shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(fits, self.weights, strict=True)])
-        return no_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width)
+
+        def two(r: int, s: int) -> bool:
+            return self._two(poles, r, s)
+
+        return no_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width, two)
+
+    def _two(self, poles: np.ndarray, r: int, s: int) -> bool:
+        """Whether one sensor that sees modes r and s beat is likelier to see both than one that shifts as it decays."""
+        asked = np.round(np.r_[poles[r], poles[s], np.delete(poles, [r, s])] / self.grids[0].bin_width, 1).tobytes()
+        if asked not in self.told_two:
+            self.told_two[asked] = False
+            with suppress(np.linalg.LinAlgError):
+                self.told_two[asked] = self._worth_of_two(poles, r, s) > self.limit * self._colour(poles[r])
+        return self.told_two[asked]
+
+    def _worth_of_two(self, poles: np.ndarray, r: int, s: int) -> float:
+        """Twice the log likelihood ratio of both modes over one on a backbone.
+
+        In the record as measured: a filter that makes white what one mode leaves takes most of what speaks for it.
+        """
+        [record] = self.measured
+        poles, [fit], *_ = search([record], poles, np.ones((1, 1)), self.offset, most_steps=12)
+        both, pair, others = float(fit.squares.sum()), poles[[r, s]], np.delete(poles, [r, s])
+        one = left_by_backbone(record, pair, others, offset=self.offset, enough=both)
+        floor = ROUND_OFF * float((record.outputs**2).sum()) + 1e-300
+        return record.n_samples * float(np.log((one + floor) / (both + floor)))
 
     def report(self, records: Sequence[Record]) -> Identified:
         # Filters cost the first samples, the strongest: modes are counted behind them, and read without.
-        refined = in_its_noise(refine(records, unshaped(self.poles, records[0]), offset=True), records)
+        refined = refine(records, unshaped(self.poles, records[0]), offset=True)
+        while (gone := self._gone(refined.modes.poles)).any() and not gone.all():
+            self.poles = self.poles[~gone]
+            refined = refine(records, unshaped(self.poles, records[0]), offset=True)
+        refined = in_its_noise(refined, records)
         evidence = self._evidence()[np.argsort(np.abs(self.poles))]
         refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
         noise = np.array([pole for pole, _ in refused], complex)
@@ -180,14 +220,19 @@ class Told:
             refined, frozen(evidence), self.limit, noise_modes, frozen([evidence for _, evidence in refused])
         )
 
+    def _gone(self, refined: np.ndarray) -> np.ndarray:
+        """Which modes are no more where they were told: what else is in a record than modes has drawn them off."""
+        away = np.abs(np.subtract.outer(self.poles, refined)).min(axis=1)
+        return away > GONE * (np.abs(self.poles.real) + self.grids[0].bin_width)
+
     def _settled(self, poles: np.ndarray, most_steps: int = MOST_STEPS):
         """Poles, weights and fits after a search, sensors weighted by the noise found in each record."""
         weights = getattr(self, "weights", np.ones((len(self.records), self.records[0].n_outputs)))
         if poles.size == 0:
             fits = [grid.nothing for grid in self.grids]
-            return poles, 1.0 / _spread(fits), fits
+            return poles, 1.0 / self._spread(fits), fits
         poles, fits, *_ = search(self.records, poles, weights, self.offset, most_steps)
-        return poles, 1.0 / _spread([fit.residual for fit in fits]), [fit.residual for fit in fits]
+        return poles, 1.0 / self._spread([fit.residual for fit in fits]), [fit.residual for fit in fits]
 
     def _without(self, r: int):
         return self._settled(np.delete(self.poles, r), most_steps=12)
@@ -226,14 +271,17 @@ class Told:
 
     def _exact(self) -> bool:
         """Whether what is left is round-off, of which every try would make something else."""
-        each = zip(self.records, self.fits, strict=True)
-        return all(bool(((left**2).sum(axis=0) <= ROUND_OFF * (r.outputs**2).sum(axis=1)).all()) for r, left in each)
+        return bool((_squares(self.fits) <= self.round_off).all())
+
+    def _spread(self, residuals: Sequence[np.ndarray]) -> np.ndarray:
+        """Of what is left of each output in each record, (n_records, n_outputs)."""
+        n = np.array([r.shape[0] for r in residuals])
+        return np.sqrt(variances(np.maximum(_squares(residuals), self.round_off), n))
 
     def _ratio(self, before, after) -> float:
         """Twice the log likelihood ratio, noise unknown: Σ_ij N_i log(s²_before / s²_after), records i, sensors j."""
         n = np.array([residual.shape[0] for residual in after])
-        floor = ROUND_OFF * np.array([(r.outputs**2).sum(axis=1) for r in self.records]) + 1e-300
-        first, second = (np.array([(r**2).sum(axis=0) for r in fits]) + floor for fits in (before, after))
+        first, second = (_squares(fits) + self.round_off for fits in (before, after))
         apart = differ(second, n)
         return float((n @ np.log(variances(first, n, apart) / variances(second, n, apart))).sum())
 
@@ -330,8 +378,6 @@ def _geometric(a: np.ndarray, b: np.ndarray, n: int) -> np.ndarray:
     return np.where(small, n, (1.0 - np.outer(a**n, b**n)) / np.where(small, 1.0, gap))
 
 
-def _spread(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """Of what is left of each output in each record, (n_records, n_outputs)."""
-    squares = np.array([(r**2).sum(axis=0) for r in residuals])
-    n = np.array([r.shape[0] for r in residuals])
-    return np.sqrt(variances(np.maximum(squares, 1e-28 * squares.max() + 1e-300), n))
+def _squares(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Sums of those of each output in each record, (n_records, n_outputs)."""
+    return np.array([(left**2).sum(axis=0) for left in residuals])
