@@ -20,6 +20,7 @@ from scipy.special import ndtri
 from workbench.identification.eigenfunctions import KnownEnds, Splines, inertia_of, mass_matrix
 from workbench.identification.ibrahim import normalised_shapes
 from workbench.identification.refinement import Refined
+from workbench.identification.told_ends import check_ends
 from workbench.identification.unseen import Foretold, missed_kernel
 from workbench.structure.modes import frozen
 from workbench.structure.profile import ProfileLike
@@ -89,8 +90,8 @@ def eigenfunction_bands(
         seed: of the draws that set the width of the band of the whole curve.
 
     Raises:
-        ValueError: a level outside 0..1, places outside the structure, no more sensors than the degree takes; as
-            `eigenfunctions`.
+        ValueError: a level outside 0..1, places outside the structure, no more sensors than the degree takes, an end
+            that the shapes contradict; as `eigenfunctions`.
     """
     x = np.atleast_1d(np.asarray(x, float))
     if not 0.0 < level < 1.0:
@@ -99,6 +100,8 @@ def eigenfunction_bands(
     if not ((x >= -slack) & (x <= length + slack)).all():
         outside = x[~((x >= -slack) & (x <= length + slack))][0]
         raise ValueError(f"x = {outside:g} lies outside the structure, 0 to {length:g}")
+    if ends is not None:
+        check_ends(refined, ends, length=length)
     modes, rng = refined.modes, np.random.default_rng(seed)
     where: dict[str, Any] = {"length": length, "ends": ends or KnownEnds()}
     splines = Splines.through(modes, degree=degree, **where)

@@ -62,24 +62,34 @@ class Foretold:
 
     def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
         """τ² of a shape (n_sensors,) of known covariance, the upper end of its interval; 0 where it may be noise."""
-        missed = self.misses @ values
-        noise = self.misses @ covariance @ self.misses.T
-        by_rough = (self.kernel**2).sum(axis=1)
-        told = by_rough > 1e-12 * by_rough.max()  # an end that is held foretells the sensor on it
-        missed, noise, by_rough = missed[told], noise[np.ix_(told, told)], by_rough[told]
-        by_noise = np.diag(noise) + 1e-30 * (values**2).max()
+        missed, noise, _ = self._missed(values, covariance)
+        by_noise = np.diag(noise)
         together = np.sum(noise**2 / np.outer(by_noise, by_noise)) / missed.size  # χ² of size / together, stretched
         if (missed**2 / by_noise).sum() < together * chi2.isf(UNLIKELY, missed.size / together):
             return 0.0
+        return self.roughest(values, covariance)
+
+    def roughest(self, values: np.ndarray, covariance: np.ndarray) -> float:
+        """The upper end of the interval of τ², noise or not."""
+        missed, noise, by_rough = self._missed(values, covariance)
+        by_noise = np.diag(noise)
 
         def unlikely(log_strength):
             power = by_noise + np.exp(log_strength) * by_rough
             return (np.log(power) + missed**2 / power).sum()
 
-        highest = np.log((missed**2 / by_rough).max())
+        highest = np.log((np.maximum(missed**2, by_noise) / by_rough).max())
         best = minimize_scalar(unlikely, bounds=(highest - 20.0, highest), method="bounded")
         limit = best.fun + chi2.isf(2.0 * UNLIKELY, 1)
         return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, highest + 20.0)))
+
+    def _missed(self, values: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What is missed of each sensor, the covariance of its noise, and its square for τ² = 1."""
+        missed = self.misses @ values
+        noise = self.misses @ covariance @ self.misses.T + 1e-30 * (values**2).max() * np.eye(values.size)
+        by_rough = (self.kernel**2).sum(axis=1)
+        told = by_rough > 1e-12 * by_rough.max()  # an end that is held foretells the sensor on it
+        return missed[told], noise[np.ix_(told, told)], by_rough[told]
 
 
 def _power(x: np.ndarray, u: np.ndarray, order: int, derivative: int = 0) -> np.ndarray:
