@@ -58,8 +58,8 @@ def check_ends(refined: Refined, ends: KnownEnds, *, length: float) -> None:
             raise ValueError(
                 f"the {name} end is told to hold {' and '.join(DERIVATIVES[d] for d in told)} at zero, and the shapes"
                 f" contradict it (p = {max(chance, 1e-99):.1g}): of its largest entry, along the length, mode {r + 1}"
-                f" has a {DERIVATIVES[told[k]]} of {away[r, k]:.3g} ± {std[r, k]:.2g} there{rest}; tell the end as it is,"
-                " or leave it untold"
+                f" has a {DERIVATIVES[told[k]]} of {away[r, k]:.3g} ± {std[r, k]:.2g} there{rest}; tell the end as it"
+                " is, or leave it untold"
             )
 
 
