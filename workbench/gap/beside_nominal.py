@@ -13,6 +13,7 @@ from workbench.gap.outcome import Decision
 from workbench.gap.search import Search, one_more, spread_over_kinds
 from workbench.rig.rig import Rig
 
+WITHIN_REACH = 3.0  # times the noise: the residual is all but linear in the figures, and what four steps leave stays
 TELLING = 0.5  # of the gap's power: what freed figures must take away before the catalogue is searched beside them
 
 
@@ -76,5 +77,7 @@ def _freed(search: Search, effects: tuple[Effect, ...]) -> Fit:
         effects = trial.effects
         if trial.cost - 1.0 > 0.5 * (before - 1.0) and not search.near(trial, NEAR):
             return fit(search.rig, effects, search.data, iterations=0)
+    if trial.cost > WITHIN_REACH and trial.falling < 0.5:
+        return fit(search.rig, effects, search.data, iterations=0)
     trial = fit(search.rig, effects, search.data, iterations=8)
     return fit(search.rig, trial.effects, search.data.stepped(8), iterations=6) if search.near(trial, NEAR) else trial

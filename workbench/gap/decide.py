@@ -7,10 +7,10 @@ import numpy as np
 from workbench.gap.beside_random import NEAR, decide_with_random
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
-from workbench.gap.finish import finished, followed, ranked, relocated, simplest
+from workbench.gap.finish import finished, followed, ranked, relocated, simplest, simplified
 from workbench.gap.fit import Fit
 from workbench.gap.outcome import Decision
-from workbench.gap.search import Search, apart, one_more, spread_over_kinds
+from workbench.gap.search import FAR, Search, apart, one_more, spread_over_kinds
 
 FIRSTS = 5  # single effects that a second one is looked for beside
 MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
@@ -73,7 +73,8 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
 
     for first in spread_over_kinds(singles, 2)[:FIRSTS]:
         (effect,) = first.effects
-        if any(_alike(effect, half, search) for pair in missed for half in pair.effects):
+        tried = any(_alike(effect, half, search) for pair in missed for half in pair.effects)
+        if tried or (missed and first.cost > FAR * singles[0].cost):
             continue
         evidence = _evidence(search, effect)
         beside = decide_with_random(search, first, evidence)
@@ -111,7 +112,7 @@ def _done(pair: Fit, ended: Sequence[Fit]) -> bool:
 
 
 def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
-    """The pairs with finer steps, and from other places where little is left and none explains the records yet."""
+    """The pairs with finer steps, and where none explains the records yet, from elsewhere and in simpler forms."""
     ended = search.side_by_side(finished, pairs)
     if any(search.explains(pair) for pair in ended):
         return ended
@@ -119,6 +120,9 @@ def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     if any(search.explains(pair) for pair in ended):
         return ended
     near = [pair for pair in ended if search.near(pair, 0.2 * NEAR)]
+    simpler = search.side_by_side(simplified, near)
+    if any(search.explains(pair) for pair in simpler):
+        return [*simpler, *(pair for pair in ended if pair not in near)]
     return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
 
 

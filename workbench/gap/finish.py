@@ -9,6 +9,7 @@ from workbench.gap.effects.containment import fewer, simpler_forms
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.search import Search, promise
+from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import is_stepped
 
@@ -43,6 +44,27 @@ def followed(search: Search, candidate: Fit) -> Fit:
     ahead = fit(search.rig, ahead.effects, search.data.following(rig).stepped(8), iterations=8)
     whole = fit(search.rig, ahead.effects, search.data.stepped(8), iterations=25, tolerance=1e-7)
     return whole if whole.cost < candidate.cost else candidate
+
+
+def simplified(search: Search, candidate: Fit) -> Fit:
+    """A near miss with an effect as what it turns into at a bound, where that comes nearer.
+
+    A hysteretic spring finds its way from where a plain one does not, and then never yields.
+    """
+    here = cost_of(search.rig, candidate.effects, search.quick)
+    for effects in _simpler_forms(search.rig, candidate.effects):
+        started = fit(search.rig, effects, search.quick, iterations=6)
+        if promise(started) < here:
+            trial = finished(search, fit(search.rig, started.effects, search.data, iterations=10))
+            if trial.cost < candidate.cost:
+                return trial
+    return candidate
+
+
+def _simpler_forms(rig: Rig, effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    for i, effect in enumerate(effects):
+        for simpler in simpler_forms(effect, rig):
+            yield (*effects[:i], simpler, *effects[i + 1 :])
 
 
 def _reads_at_once(sensor: Sensor) -> bool:
@@ -109,9 +131,7 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
         if cost_of(search.rig, rest, search.data) < 1.0 + IDLE:
             yield rest
     yield from fewer(candidate.effects)
-    for i, effect in enumerate(candidate.effects):
-        for simpler in simpler_forms(effect, search.rig):
-            yield (*candidate.effects[:i], simpler, *candidate.effects[i + 1 :])
+    yield from _simpler_forms(search.rig, candidate.effects)
 
 
 def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:

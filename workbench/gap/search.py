@@ -128,9 +128,8 @@ def one_more(search: Search, given: tuple[Effect, ...], evidence: Evidence, begi
     chosen = spread_over_kinds(quick_fits, 3)
     close = [f for f in chosen if f.cost < 4.0 * chosen[0].cost]
     chosen = chosen[: max(finalists, min(len(close), 2 * finalists))]
-    full = list(search.pool.map(lambda f: _on_all(search, f, 5), chosen))
-    full.sort(key=lambda f: f.cost)
-    running = [f for i, f in enumerate(full) if i < 3 or f.cost < 2.0 * full[0].cost]
+    full = sorted(search.pool.map(lambda f: _on_all(search, f, 5), chosen), key=promise)
+    running = [f for i, f in enumerate(full) if i < 3 or promise(f) < 2.0 * promise(full[0])]
     full[: len(running)] = search.pool.map(lambda f: _on_all(search, f, 25) if f.falling else f, running)
     search.report("all records", end)
     return sorted(full, key=lambda f: f.cost)
