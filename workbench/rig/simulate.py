@@ -264,7 +264,7 @@ def _stepped(
         participation,
         stretch,
         _stretching(rig) if stretch else np.zeros((0, 0)),
-        drag_shapes,
+        np.ascontiguousarray(drag_shapes.T),
         drag * drag_weights,
         np.array([LAWS[type(e)][0] for e in points], dtype=np.int64),
         modes.phi([e.at for e in points]) if points else np.zeros((0, modes.n_modes)),
@@ -294,9 +294,14 @@ def _stepper(laws: tuple[Callable, ...]):
 
 def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
     """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
-    points, weights = np.polynomial.legendre.leggauss(max(3 * rig.modes.n_modes + 12, 30))
+    points, weights = _gauss(max(3 * rig.modes.n_modes + 12, 30))
     length = rig.modes.length
     return rig.modes.phi(0.5 * length * (points + 1.0), derivative), 0.5 * length * weights
+
+
+@cache
+def _gauss(n_points: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.polynomial.legendre.leggauss(n_points)
 
 
 def _stretching(rig: Rig) -> np.ndarray:

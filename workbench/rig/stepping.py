@@ -176,8 +176,8 @@ def solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, force):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, coupling, out):
-    """Fill the modal forces (n_modes,) of what acts all along, or couples the modes."""
+def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, out):
+    """Fill the modal forces (n_modes,) of what acts all along, or couples the modes; push is a work array."""
     n = q.size
     out[:] = 0.0
     if stretch != 0.0:
@@ -188,13 +188,16 @@ def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, coupling
             tension += q[r] * out[r]
         for r in range(n):
             out[r] *= -stretch * tension
-    for g in range(drag_weights.size):
-        speed = 0.0
-        for r in range(n):
-            speed += drag_shapes[g, r] * v[r]
-        push = -drag_weights[g] * abs(speed) * speed
-        for r in range(n):
-            out[r] += drag_shapes[g, r] * push
+    for g in range(push.size):
+        push[g] = 0.0
+    for r in range(n if push.size > 0 else 0):
+        for g in range(push.size):
+            push[g] += drag_shapes[r, g] * v[r]
+    for g in range(push.size):
+        push[g] *= -drag_weights[g] * abs(push[g])
+    for r in range(n if push.size > 0 else 0):
+        for g in range(push.size):
+            out[r] += drag_shapes[r, g] * push[g]
     if coupling.size > 0:
         for r in range(n):
             for s in range(n):
@@ -229,7 +232,7 @@ def step_record(
     """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest.
 
     forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
-    stretching (n_modes, n_modes); drag_shapes (n_points, n_modes); shapes (n_elements, n_modes).
+    stretching (n_modes, n_modes); drag_shapes (n_modes, n_points); shapes (n_elements, n_modes).
 
     Where something is measured, (n_sensors, n_samples), its error against reading (3, n_sensors, n_modes) of
     displacement, velocity and acceleration fills error_out, and sets the motion right by gain (2, n_modes, n_sensors).
@@ -245,7 +248,7 @@ def step_record(
     w_free, v_free, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
     distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
-    changed = np.empty(n)
+    changed, push = np.empty(n), np.empty(drag_weights.size)
     for k in range(n_samples):
         if rate != 0.0:
             scale = math.sqrt(max(1.0 + rate * (k + 0.5) * dt, 1e-6))
@@ -326,7 +329,7 @@ def step_record(
                     v[r] = base_v[r] + e[1, 3, r] * new[r]
                 if distributed and sweep == 0:
                     # the forces that depend on the whole shape, from the motion just predicted
-                    spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, coupling, spread)
+                    spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
             for r in range(n):
                 old[r] = new[r]
             for i in range(n_elements):
