@@ -38,6 +38,24 @@ def test_a_hidden_contact_is_named_placed_and_closed():
         assert replace(verdict, where=replace(verdict.where, place=place)).place_stands == stands
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "kinds"),
+    [
+        (1365775580, ("bouc_wen", "cubic_spring")),  # motions that run apart
+        (1419681537, ("ground_spring", "cubic_spring")),  # found as a hysteretic spring that never yields
+        (540003792, ("one_sided_stop", "cubic_spring")),  # found beside the better half of a near miss
+    ],
+)
+def test_hard_pairs_are_named_and_placed(seed, kinds):
+    case, label = make_trial(seed, kinds=kinds)
+    assert tuple(e["kind"] for e in label["effects"]) == kinds
+    verdict = verdict_on(case)
+    assert verdict.outcome == "explained"
+    told = {e.kind.name: e.values["at"] for e in verdict.effects}
+    assert told == {e["kind"]: pytest.approx(e["at"], abs=0.005 * case.rig.modes.length) for e in label["effects"]}
+
+
 def test_nothing_hidden_nothing_told():
     case, _ = make_trial(12)
     verdict = verdict_on(case)

@@ -197,22 +197,26 @@ def _promising(started: list[list[tuple[float, Effect]]], most: int) -> list[lis
 
 
 def _improved(search: Search, rig: Rig, started: list[list[tuple[float, Effect]]]) -> list[list[tuple[float, Effect]]]:
-    """The starts of each task improved with the effects found before held fixed: its best, and a rival near it.
+    """The likeliest starts improved with the effects found before held fixed: of each task its best, and a rival near.
 
-    One step for every start tells which are worth more.
+    One step of every start on the most telling record says which are likely.
     """
 
-    def alone(effect: Effect, steps: int) -> Fit:
-        return fit(rig, (effect,), search.quick, held=search.held, iterations=steps)
+    def alone(effect: Effect, data: FitData, steps: int) -> Fit:
+        return fit(rig, (effect,), data, held=search.held, iterations=steps)
 
-    task_of = [i for i, task in enumerate(started) for _ in task]
-    fits = list(search.pool.map(lambda effect: alone(effect, 1), [effect for task in started for _, effect in task]))
-    likely = {*np.argsort([f.cost for f in fits])[:LIKELY], *np.argsort([promise(f) for f in fits])[:LIKELY]}
-    fits = list(search.pool.map(lambda i: alone(fits[i].effects[0], 2) if i in likely else fits[i], range(len(fits))))
+    starts = [(i, effect) for i, task in enumerate(started) for _, effect in task]
+    first = list(search.pool.map(lambda start: alone(start[1], search.first, 1), starts))
+    likely = {*np.argsort([f.cost for f in first])[:LIKELY], *np.argsort([promise(f) for f in first])[:LIKELY]}
+    chosen = sorted(i for i in likely if first[i].cost < HOPELESS)
+    fits = list(search.pool.map(lambda i: alone(first[i].effects[0], search.quick, 2), chosen))
+    by_task: dict[int, list[Fit]] = {}
+    for i, candidate in zip(chosen, fits, strict=True):
+        by_task.setdefault(starts[i][0], []).append(candidate)
     improved = []
-    for i in range(len(started)):
-        task = sorted((f for f, owner in zip(fits, task_of, strict=True) if owner == i), key=lambda f: f.cost)
-        improved.append([(f.cost, f.effects[0]) for f in task if f.cost < CLOSE * task[0].cost])
+    for task in by_task.values():
+        best = min(f.cost for f in task)
+        improved.append(sorted(((f.cost, f.effects[0]) for f in task if f.cost < CLOSE * best), key=lambda s: s[0]))
     return improved
 
 
