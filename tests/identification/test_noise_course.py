@@ -64,7 +64,8 @@ def test_the_course_of_noise_is_its_spectrum():
     """S(ω) = (1 - a²) / |1 - a e^{-iωΔt}|², the second record three times as loud; the other output is white."""
     rng = np.random.default_rng(0)
     left = [size * np.vstack([tailed(rng, 0.95, n, 1), tailed(rng, 0.0, n, 1)]).T for size, n in ((1, 4000), (3, 2000))]
-    sizes = course(left, [1e3 * each for each in left], 0, np.array([4000.0, 2000.0]))
+    taken = [np.zeros(each.shape) for each in left]
+    sizes = course(left, [1e3 * each for each in left], taken, 0, np.array([4000.0, 2000.0]))
     for loud, each in zip((1.0, 3.0), sizes, strict=True):
         omega = np.pi / len(each) * np.arange(len(each))
         exact = loud**2 * (1.0 - 0.95**2) / np.abs(1.0 - 0.95 * np.exp(-1j * omega)) ** 2 / (22.0 / 6.0)
@@ -72,7 +73,7 @@ def test_the_course_of_noise_is_its_spectrum():
         assert np.abs(np.log(each[:, 0] ** 2 / exact)).max() < 0.2
         assert np.ptp(each[:, 1]) == 0.0
     white = tailed(rng, 0.0, 1000).T
-    assert course([white], [1e3 * white], 0, np.array([1000.0])) is None
+    assert course([white], [1e3 * white], [0.0 * white], 0, np.array([1000.0])) is None
 
 
 def test_lines_of_steep_noise_are_independent_and_as_large_as_told():

@@ -26,7 +26,7 @@ from workbench.structure.modes import SampledModes, frozen
 # Modes by which the noise is first told, and how often it is learnt: it and the modes settle together.
 STRONGEST, LEARNT = 8, 4
 # Times the limit up to which a mode may be noise that was taken out of the noise.
-DOUBTED = 4.0
+DOUBTED, MOST_GROWTH = 4.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,18 +163,25 @@ def _told(drive: KnownInputs, **how) -> tuple[KnownInputs, Told]:
     """The modes, in the noise that they leave; the strongest first, for noise that is not white passes for modes.
 
     What a false mode took out of its lines, their noise lacks, and so the mode seems true. So the noise is learnt anew
-    with all doubtful modes left in it, and they stay if both, modes and noise, are then less likely.
+    with all doubtful modes left in it; they stay if modes and noise are then less likely by what so many modes take.
     """
     few = {**how, "most_modes": min(STRONGEST, how["most_modes"])}
     drive, told = _with_noise(drive, tell(drive, **few), few, how)
-    doubted = told.evidence < DOUBTED * told.limit
+    doubted = (told.evidence < DOUBTED * told.limit) | ~_rings(drive, told)
     if drive.sizes is None or not doubted.any():
         return drive, told
     sure = settled(drive, projected(drive, told.fit.poles[~doubted], told.fit.loads[~doubted]))
     other = drive.weighing(drive.course(sure))
     other, fewer = _with_noise(other, tell(other, **how), how, how)
     worth = told.limit * (told.fit.poles.size - fewer.fit.poles.size)
-    return (drive, told) if other.cost(fewer.fit) - drive.cost(told.fit) > worth else (other, fewer)
+    strange = (~_rings(drive, told)).sum() > (~_rings(other, fewer)).sum()
+    return (other, fewer) if strange or other.cost(fewer.fit) - drive.cost(told.fit) <= worth else (drive, told)
+
+
+def _rings(drive: KnownInputs, told: Told) -> np.ndarray:
+    """Which modes swing within a record and hardly grow; what else comes in may be noise that is not white."""
+    poles, span = told.fit.poles, 2.0 * np.pi / drive.resolution
+    return (np.abs(poles) > drive.resolution) & (poles.real * span < MOST_GROWTH)
 
 
 def _with_noise(drive: KnownInputs, told: Told, once: dict, how: dict) -> tuple[KnownInputs, Told]:

@@ -18,8 +18,9 @@ from scipy.fft import next_fast_len
 from scipy.signal import lfilter
 
 from workbench.identification.coloured import heard_along, noise_near
+from workbench.identification.fit_errors import covariance
 from workbench.identification.identified import MOST_DAMPED
-from workbench.identification.modal_fit import Fit, free_parameters
+from workbench.identification.modal_fit import Fit, free_parameters, moves
 from workbench.identification.noise_course import course, lines_of, samples_of
 from workbench.identification.noise_levels import variances
 from workbench.records.record import Record
@@ -90,7 +91,30 @@ class KnownInputs:
         """How the noise runs along the lines of each record, as `noise_course` reads it off what a fit leaves."""
         raw = fit.residual if self.weights is None else fit.residual / self.weights
         left = [self._samples(raw[rows]) for rows in self.rows]
-        return course(left, [record.outputs.T for record in self.records], fit.poles.size, self._free(fit))
+        taken = self._taken(fit)
+        shares = [taken[rows] for rows in self.rows]
+        return course(left, [record.outputs.T for record in self.records], shares, fit.poles.size, self._free(fit))
+
+    def _taken(self, fit: Fit) -> np.ndarray:
+        """Share of the noise of each line that the fit has taken, its leverage, (n_rows, n_outputs)."""
+        answers = [self.answers(pole) for pole in fit.poles]
+        slopes = [self.slopes(pole, load) for pole, load in zip(fit.poles, fit.loads)]
+        swings = [self._swing(pole, load) for pole, load in zip(fit.poles, fit.loads)]
+        phi = np.column_stack([*(x for x, _ in swings), *(y for _, y in swings), self.fixed])
+        tangents = [np.column_stack([s[k], a[k]]) for k in (0, 1) for s, a in zip(slopes, answers)]
+        t = np.hstack(tangents) if tangents else np.zeros((len(phi), 0))
+        if not self.by_line:
+            phi, t = (np.vstack([lines_of(columns[rows]) for rows in self.rows]) for columns in (phi, t))
+        free, found = free_parameters(fit), []
+        bound = covariance(fit) if free.size else np.zeros((0, 0))
+        moved = np.concatenate([moves(fit, part)[:, free] for part in fit.parts], axis=2)
+        weights = np.ones((1, fit.noise.size)) if self.weights is None else self.weights
+        for weight, std, each in zip(weights.T[:, :, None], fit.noise, moved.transpose(2, 0, 1)):
+            q = np.linalg.qr(weight * phi / np.maximum(np.linalg.norm(weight * phi, axis=0), 1e-300))[0]
+            searched = (weight * t) @ each
+            searched -= q @ (q.T @ searched)
+            found.append((q**2).sum(axis=1) + ((searched @ bound) * searched).sum(axis=1) / std**2)
+        return np.array(found).T
 
     def cost(self, fit: Fit) -> float:
         """Twice the negative logarithm of the likelihood of modes and noise, up to a constant."""

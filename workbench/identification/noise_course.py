@@ -3,7 +3,7 @@
 In the cosine transform of a record of n samples, noise of spectrum S is independent from line to line, line k of
 variance S(πk / nΔt), the closer the steeper S falls, for the transform sees no jump between a record's ends (Ahmed,
 Natarajan & Rao, IEEE Trans. Comput. C-23, 1974). S is that of y_k = Σ_i a_i y_k-i + e_k, by Burg's recursion, as many
-terms as lower n ln var(e) + p ln n.
+terms as lower n ln var(e) + p ln n; before, each line gets back what the fit took of its noise, its leverage.
 """
 
 from collections.abc import Sequence
@@ -15,6 +15,8 @@ from workbench.identification.coloured import ORDER, ROUNDING, SAMPLES_EACH, whi
 from workbench.identification.noise_levels import differ, variances
 
 ALIKE = 0.1
+# Of a line that a fit took whole nothing is known.
+MOST_TAKEN = 0.9
 
 
 def lines_of(samples: np.ndarray) -> np.ndarray:
@@ -28,15 +30,21 @@ def samples_of(lines: np.ndarray) -> np.ndarray:
 
 
 def course(
-    left: Sequence[np.ndarray], whole: Sequence[np.ndarray], n_modes: int, free: np.ndarray
+    left: Sequence[np.ndarray],
+    whole: Sequence[np.ndarray],
+    taken: Sequence[np.ndarray],
+    n_modes: int,
+    free: np.ndarray,
 ) -> list[np.ndarray] | None:
     """Standard deviation of the noise at each line of each record, (n_samples, n_outputs) each, over their rms.
 
     Args:
         left: of each record, (n_samples, n_outputs): what a fit leaves.
         whole: of each record, what was measured.
+        taken: of each record, (n_samples, n_outputs): share of the noise of each line that the fit has taken with it,
+            which is made good: about its modes a spectrum of what is left is too low.
         n_modes: of the fit.
-        free: (n_records, n_outputs) degrees of freedom of what is left.
+        free: (n_records,) degrees of freedom of what is left.
 
     Returns:
         None where the noise may be white, and as loud in all records, or is round-off.
@@ -50,15 +58,16 @@ def course(
     flat = np.all([white(each, n_modes) for each in power], axis=0)
     if flat.all() and not differ(squares, free).any():
         return None
+    good = [
+        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, MOST_TAKEN)))
+        for each, share in zip(left, taken, strict=True)
+    ]
     found = [np.tile(row, (len(each), 1)) for row, each in zip(loud, left, strict=True)]
     for j in np.flatnonzero(~flat):
-        rows = [each[:, j] / row[j] for each, row in zip(left, loud, strict=True)]
-        filtered = _burg(rows)
+        filtered = _burg([each[:, j] / row[j] for each, row in zip(good, loud, strict=True)])
         for each in found:
-            gain = np.abs(
-                np.exp(-1j * np.pi / len(each) * np.outer(np.arange(len(each)), np.arange(filtered.size))) @ filtered
-            )
-            each[:, j] *= 1.0 / gain
+            turns = np.exp(-1j * np.pi / len(each) * np.arange(len(each)))
+            each[:, j] /= np.abs(np.polyval(filtered[::-1], turns))
     rms = np.sqrt(np.vstack([each**2 for each in found]).mean(axis=0))
     return [each / rms for each in found]
 
