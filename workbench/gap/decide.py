@@ -16,6 +16,7 @@ FIRSTS = 5  # single effects that a second one is looked for beside
 MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
 NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
 SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
+VERY_NEAR = 0.2 * NEAR  # what is tried from other places at once; what is near, where nothing else explains the records
 TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
 FAR_BEHIND = 2.0  # finer steps bring no set this many times as costly as another to the noise floor before it
 
@@ -85,9 +86,13 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
         if not missed and search.near(pairs[0], NEAR) and explained_by_exchange():
             break
     else:
-        if search.near(pairs[0], NEAR) and all(pairs[0].cost - 1.0 < NEARER * (m.cost - 1.0) for m in missed):
+        moved = _from_elsewhere(search, pairs, ended)
+        ended.extend(moved)
+        pairs[:] = sorted((*moved, *pairs), key=lambda f: f.cost)
+        nearer = all(pairs[0].cost - 1.0 < NEARER * (m.cost - 1.0) for m in missed)
+        if search.near(pairs[0], NEAR) and nearer and not any(search.explains(pair) for pair in moved):
             explained_by_exchange()
-    return _of_pairs(search, start, pairs, ended)
+    return _of_pairs(search, start, pairs)
 
 
 def _evidence(search: Search, effect: Effect) -> Evidence:
@@ -119,11 +124,26 @@ def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     ended = search.side_by_side(followed, ended)
     if any(search.explains(pair) for pair in ended):
         return ended
-    near = [pair for pair in ended if search.near(pair, 0.2 * NEAR)]
+    near = [pair for pair in ended if search.near(pair, VERY_NEAR)]
     simpler = search.side_by_side(simplified, near)
     if any(search.explains(pair) for pair in simpler):
         return [*simpler, *(pair for pair in ended if pair not in near)]
     return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
+
+
+def _from_elsewhere(search: Search, pairs: Sequence[Fit], done: Sequence[Fit]) -> list[Fit]:
+    """The best of the pairs that are near, tried from other places, but for those with which that is done."""
+    best = _distinct(pairs)[:TRIED_FURTHER]
+    fresh = [f for f in best if search.near(f, NEAR) and not (search.near(f, VERY_NEAR) and _done(f, done))]
+    return search.side_by_side(relocated, fresh)
+
+
+def _distinct(pairs: Sequence[Fit]) -> list[Fit]:
+    """The best of every set, in the order of the pairs."""
+    distinct: dict[tuple, Fit] = {}
+    for candidate in pairs:
+        distinct.setdefault(candidate.key, candidate)
+    return list(distinct.values())
 
 
 def unexplained(start: Fit, best: Fit, rivals) -> Decision:
@@ -132,17 +152,10 @@ def unexplained(start: Fit, best: Fit, rivals) -> Decision:
     return Decision("part" if closed > 0.5 else "unknown", best, rivals=rivals)
 
 
-def _of_pairs(search: Search, start: Fit, pairs: list[Fit], done: list[Fit]) -> Decision:
-    """What the pairs say; those that are done with need no other places."""
-    distinct: dict[tuple, Fit] = {}
-    for candidate in pairs:
-        distinct.setdefault(candidate.key, candidate)
-    ended = sorted(_ended(search, list(distinct.values())[:4]), key=lambda f: f.cost)
+def _of_pairs(search: Search, start: Fit, pairs: list[Fit]) -> Decision:
+    """What the pairs say."""
+    ended = sorted(_ended(search, _distinct(pairs)[:4]), key=lambda f: f.cost)
     explaining = [f for f in ended if search.explains(f)]
-    if not explaining:
-        fresh = [f for f in ended[:2] if not _done(f, done)]
-        ended = [*search.side_by_side(relocated, fresh), *(f for f in ended if f not in fresh)]
-        explaining = [f for f in ended if search.explains(f)]
     if explaining:
         best, rivals = ranked(search, [simplest(search, f) for f in explaining])
         return Decision("explained", best, rivals=rivals)
