@@ -55,6 +55,7 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
     ended: list[Fit] = []
     given: list[Effect] = []
     missed: list[Fit] = []
+    moved: list[Fit] = []
 
     def explained_beside(effect: Effect, evidence: Evidence, finalists: int) -> bool:
         begin = 0.5 + 0.05 * min(len(given), 8)
@@ -72,6 +73,17 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
         halves = [half for half in pairs[0].effects[::-1] if not any(_unmoved(half, other) for other in given)]
         return any(explained_beside(half, _evidence(search, half), 4) for half in halves)
 
+    def explained_from_elsewhere() -> bool:
+        fresh = [f for f in _distinct(pairs)[:TRIED_FURTHER] if search.near(f, NEAR) and not _done(f, moved)]
+        fresh = [f for f in fresh if not (search.near(f, VERY_NEAR) and _done(f, ended))]
+        found = search.side_by_side(relocated, fresh)
+        moved.extend((*fresh, *found))
+        pairs[:] = sorted((*found, *pairs), key=lambda f: f.cost)
+        if any(search.explains(pair) for pair in found):
+            return True
+        nearer = all(pairs[0].cost - 1.0 < NEARER * (m.cost - 1.0) for m in missed)
+        return search.near(pairs[0], NEAR) and nearer and explained_by_exchange()
+
     for first in spread_over_kinds(singles, 2)[:FIRSTS]:
         (effect,) = first.effects
         tried = any(_alike(effect, half, search) for pair in missed for half in pair.effects)
@@ -83,15 +95,11 @@ def decide_on_pairs(search: Search, start: Fit, singles: list[Fit]) -> Decision:
             return beside
         if explained_beside(effect, evidence, 3 if given else 5):
             break
-        if not missed and search.near(pairs[0], NEAR) and explained_by_exchange():
+        near = not missed and search.near(pairs[0], NEAR)
+        if near and (explained_by_exchange() or explained_from_elsewhere()):
             break
     else:
-        moved = _from_elsewhere(search, pairs, ended)
-        ended.extend(moved)
-        pairs[:] = sorted((*moved, *pairs), key=lambda f: f.cost)
-        nearer = all(pairs[0].cost - 1.0 < NEARER * (m.cost - 1.0) for m in missed)
-        if search.near(pairs[0], NEAR) and nearer and not any(search.explains(pair) for pair in moved):
-            explained_by_exchange()
+        explained_from_elsewhere()
     return _of_pairs(search, start, pairs)
 
 
@@ -129,13 +137,6 @@ def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     if any(search.explains(pair) for pair in simpler):
         return [*simpler, *(pair for pair in ended if pair not in near)]
     return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
-
-
-def _from_elsewhere(search: Search, pairs: Sequence[Fit], done: Sequence[Fit]) -> list[Fit]:
-    """The best of the pairs that are near, tried from other places, but for those with which that is done."""
-    best = _distinct(pairs)[:TRIED_FURTHER]
-    fresh = [f for f in best if search.near(f, NEAR) and not (search.near(f, VERY_NEAR) and _done(f, done))]
-    return search.side_by_side(relocated, fresh)
 
 
 def _distinct(pairs: Sequence[Fit]) -> list[Fit]:
