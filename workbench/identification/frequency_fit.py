@@ -12,14 +12,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
 from workbench.identification.fit_errors import errors, pole_covariance
+from workbench.identification.gathering import NARROW, parts_of
 from workbench.identification.ibrahim import normalised_shapes
-from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED
+from workbench.identification.identified import FALSE_ALARM
 from workbench.identification.line_noise import noise_with_size
-from workbench.identification.modal_count import Told, bases_of, tell, weights_of
-from workbench.identification.modal_fit import Fit
+from workbench.identification.modal_count import Told, evidence_of, tell
+from workbench.identification.modal_fit import Fit, projected, settled
+from workbench.identification.spectral_lines import Lines
 from workbench.identification.standard_errors import StandardErrors
 from workbench.identification.synthesis import TIME_DERIVATIVE, time_derivatives
 from workbench.records.record import Channel
@@ -27,11 +28,10 @@ from workbench.structure.modes import SampledModes, frozen
 
 # Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
 MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
-MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
+# A mode whose frequency is known no better than this is none to report.
+UNSURE = 0.01
 # Modes by which the noise of the lines is first told, how often it is told, and how far off it may be (rms of log).
 STRONGEST, REWEIGHTED, ALIKE = 4, 2, 0.2
-# Widths beside a mode, and the chance that even noise is taken for uneven.
-DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +47,8 @@ class TransferModes(StandardErrors):
             none was stated, of real and imaginary part each, in the unit of the output.
         evidence: (n_modes,) χ² of each mode in what is left.
         converged: whether the search ended because the step was small.
+        parts_hz: of each mode what was told beside it and is part of it (`gathering`), Hz: points measured one after
+            another disagree there, or the mode depends on amplitude.
         full_hz: bands (lowest, highest line) in which the search stopped at the most modes it might take: what it left
             there is no noise, and what it found is not all, or is no modes but points that disagree.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
@@ -60,6 +62,7 @@ class TransferModes(StandardErrors):
     misfit: np.ndarray
     evidence: np.ndarray
     converged: bool
+    parts_hz: tuple[tuple[float, ...], ...]
     full_hz: tuple[tuple[float, float], ...]
     fitted: np.ndarray = field(repr=False)
     frequencies_hz: np.ndarray = field(repr=False)
@@ -142,9 +145,9 @@ def identify_transfer(
     return whole
 
 
-def _told(h, omega, powers, noise, **how) -> tuple["_Lines", Told]:
+def _told(h, omega, powers, noise, **how) -> tuple[Lines, Told]:
     """The modes of a band; where no noise is told, its course along the lines by what the strongest modes leave."""
-    lines = _Lines(h, omega, powers, noise)
+    lines = Lines(h, omega, powers, noise)
     if noise is not None:
         return lines, tell(lines, **how)
     told = tell(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
@@ -154,7 +157,7 @@ def _told(h, omega, powers, noise, **how) -> tuple["_Lines", Told]:
         if guessed is None or (before is not None and _much_as(guessed, before)):
             break
         before = guessed
-        lines = _Lines(h, omega, powers, guessed, guessed=True)
+        lines = Lines(h, omega, powers, guessed, guessed=True)
         told = tell(lines, **how)
     return (lines, told) if lines.guessed else (lines, tell(lines, **how))
 
@@ -164,12 +167,15 @@ def _much_as(one: np.ndarray, other: np.ndarray) -> bool:
     return bool(np.log(one / other).std(axis=(1, 2)).max() < ALIKE)
 
 
-def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
+def _modes_of(lines: Lines, told: Told, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
-    fit = told.fit
+    fit, parts_hz = _gathered(lines, told, channels)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
+    heard = np.tile(lines.louder_near(fit), (len(channels), 1))
+    covariance = pole_covariance(fit, heard)
+    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < UNSURE * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
-    inside = np.flatnonzero(within & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
+    inside = np.flatnonzero(within & sure & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
     n = inside.size
     derivative = time_derivatives(channels)[:, None]
     poles, loads = fit.poles[inside], fit.loads[inside]
@@ -181,27 +187,42 @@ def _modes_of(lines: "_Lines", told: Told, channels, edges_hz: tuple[float, floa
         return (seen / seen[largest, each]).real.ravel()
 
     std = np.zeros((len(channels), n))
-    covariance = np.zeros((2 * n, 2 * n))
     if n:
-        heard = np.tile(lines.louder_near(fit), (len(channels), 1))
         std = np.sqrt(np.diag(errors(fit, relative, heard))).reshape(len(channels), n)
         std[largest, each] = 0.0
-        both = np.r_[inside, fit.poles.size + inside]
-        covariance = pole_covariance(fit, heard)[np.ix_(both, both)]
+    both = np.r_[inside, fit.poles.size + inside]
     shapes = normalised_shapes(seen) if n else seen
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     return TransferModes(
         modes=SampledModes(np.abs(poles), -poles.real / np.abs(poles), shapes, _places(channels)),
-        covariance=frozen(covariance),
+        covariance=frozen(covariance[np.ix_(both, both)]),
         shape_std=frozen(std),
         participation=frozen(loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
         misfit=frozen(lines.misfit(fit)),
-        evidence=frozen(told.evidence[inside]),
+        evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
+        parts_hz=tuple(parts_hz[r] for r in inside),
         full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if told.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
     )
+
+
+def _gathered(lines: Lines, told: Told, channels) -> tuple[Fit, list[tuple[float, ...]]]:
+    """The fit with one mode for every crowd of parts, and the frequencies of those of each mode, Hz."""
+    fit = told.fit
+    shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
+    seen = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, _places(channels))
+    parts = parts_of(fit.poles, seen.phase_collinearity, told.evidence)
+    kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
+    parts_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
+    if not parts:
+        return fit, parts_hz
+    middle = fit.poles.copy()
+    for r, others in parts.items():
+        crowd = [r, *(k for k in others if np.abs(fit.poles.real[k]) < NARROW * np.abs(fit.poles.real[r]))]
+        middle[r] = np.average(fit.poles[crowd], weights=told.evidence[crowd])
+    return settled(lines, projected(lines, middle[kept], fit.loads[kept])), parts_hz
 
 
 def _together(found: Sequence[TransferModes], channels) -> TransferModes:
@@ -222,6 +243,7 @@ def _together(found: Sequence[TransferModes], channels) -> TransferModes:
         misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
         evidence=frozen(np.concatenate([band.evidence for band in found])),
         converged=all(band.converged for band in found),
+        parts_hz=tuple(parts for band in found for parts in band.parts_hz),
         full_hz=tuple(full for band in found for full in band.full_hz),
         fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
         frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
@@ -261,121 +283,3 @@ def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
         j, _, line = bad[0]
         raise ValueError(f"output {channels[j].name!r} is no number at {f[keep][line]:g} Hz; leave that line out")
     return h[:, :, keep], f[keep], None if noise is None else noise[:, :, keep]
-
-
-class _Lines:
-    """Lines of a spectrum as a `modal_fit.Drive`: rows are real, then imaginary parts, reference by reference."""
-
-    def __init__(
-        self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, guessed=False
-    ) -> None:
-        self.guessed = guessed
-        self.omega, (_, self.refs, self.lines) = omega, h.shape
-        self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
-        self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
-        s = 1j * omega / omega[-1]
-        self.fixed = self._stacked(np.array([self._of(i, s**p) for i in range(self.refs) for p in powers]))
-        self.resolution = float(np.diff(omega).min())
-        # A pole may leave the band: one close beyond it is no constant there. It counts among what is left out.
-        self.highest = 2.0 * float(omega[-1])
-        span = omega[-1] - omega[0]
-        self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), RATES)
-        self.cells = RATES * self.lines
-
-    def _stacked(self, values: np.ndarray) -> np.ndarray:
-        rows = values.reshape(values.shape[0], -1).T
-        return np.vstack([rows.real, rows.imag])
-
-    def _of(self, reference: int, values: np.ndarray) -> np.ndarray:
-        found = np.zeros((self.refs, self.lines), complex)
-        found[reference] = values
-        return found
-
-    def unstacked(self, rows: np.ndarray) -> np.ndarray:
-        real, imaginary = np.split(rows, 2)
-        return (real + 1j * imaginary).T.reshape(-1, self.refs, self.lines)
-
-    def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        s = 1j * self.omega
-        above, below = 1.0 / (s - pole), 1.0 / (s - pole.conjugate())
-        pair = (0.5 * (above + below), -0.5j * (above - below))
-        real, imaginary = (self._stacked(np.array([self._of(i, x) for i in range(self.refs)])) for x in pair)
-        return real, imaginary
-
-    def slopes(self, pole: complex, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        s = 1j * self.omega
-        above = loads[:, None] / (s - pole) ** 2
-        below = loads.conj()[:, None] / (s - pole.conjugate()) ** 2
-        pair = (0.5 * (above + below), -0.5j * (above - below))
-        real, imaginary = (self._stacked(x[None])[:, 0] for x in pair)
-        return real, imaginary
-
-    def candidates(self, residual: np.ndarray) -> np.ndarray:
-        left = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.lines)
-        weight = 1.0 if self.weights is None else (np.abs(self.unstacked(self.weights)) ** 2).mean(axis=(0, 1)) / 2.0
-        power = (np.abs(left) ** 2).sum(axis=0)
-        at = np.sort(np.argsort(power)[-MOST_CANDIDATES:])
-        found, strength = [], []
-        for rate in self.rates:
-            x = 1.0 / (1j * (self.omega - self.omega[at, None]) + rate)
-            score = (np.abs(left @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
-            score[rate > MOST_DAMPED * self.omega[at]] = 0.0
-            best = np.argsort(score)[-PEAKS_A_RATE:]
-            found.append(-rate + 1j * self.omega[at[best]])
-            strength.append(score[best])
-        order = np.argsort(np.concatenate(strength))[::-1]
-        beyond = np.r_[0.6 * self.omega[0], 0.9 * self.omega[0], np.array([1.05, 1.2, 1.5]) * self.omega[-1]]
-        return np.r_[np.concatenate(found)[order[: 3 * PEAKS_A_RATE]], (-0.01 + 1j) * beyond]
-
-    def fitted(self, fit: Fit) -> np.ndarray:
-        """The model at the lines, (n_outputs, n_references, n_frequencies)."""
-        return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
-
-    def left(self, fit: Fit) -> np.ndarray:
-        """What the model leaves at the lines, (n_outputs, n_references, n_frequencies)."""
-        return self.unstacked(fit.residual / (1.0 if self.weights is None else self.weights))
-
-    def misfit(self, fit: Fit) -> np.ndarray:
-        """Rms of what is left of each output, (n_outputs,), in units of the noise where that was told."""
-        if not self.guessed:
-            return fit.noise
-        raw = fit.residual / self.weights
-        return fit.noise * np.sqrt((raw**2).sum(axis=0) / (fit.residual**2).sum(axis=0))
-
-    def louder_near(self, fit: Fit) -> np.ndarray:
-        """What is left about each mode as the mode hears it, in power, over the mean of all lines, (n_modes,).
-
-        It is heard by swings a few widths beside the mode, each output as much as it shows the mode. 1 where that may
-        be noise alike at all lines.
-        """
-        residual, noise = fit.residual / fit.noise, fit.noise
-        found = np.ones(fit.poles.size)
-        if self.weights is not None and not self.guessed:
-            return found
-        bases, weights = bases_of(self, fit), weights_of(self)
-        for r, pole in enumerate(fit.poles):
-            shown = (np.abs(fit.amplitudes[:, r]) / noise) ** 2
-            width = max(abs(pole.real), 0.5 * self.resolution)
-            heard = []
-            for beside in pole.imag + width * DETUNED:
-                if self.omega[0] < beside < self.omega[-1]:
-                    columns = np.hstack(self.answers(-width + 1j * beside))
-                    power = []
-                    for basis, weight, rest in zip(bases, weights, np.split(residual, len(bases), axis=1), strict=True):
-                        # of the rest the amplitudes have taken the noise
-                        x = weight * columns - basis @ (basis.T @ (weight * columns))
-                        power.append((x.T @ rest) ** 2 / (x**2).sum(axis=0)[:, None])
-                    heard.append(np.hstack(power))
-            if not heard:
-                continue
-            power = np.mean(heard, axis=(0, 1)) @ shown / shown.sum()
-            degrees = np.size(heard) / shown.size * shown.sum() ** 2 / (shown**2).sum()
-            found[r] = power if power > chi2.isf(LOUDER, degrees) / degrees else 1.0
-        return found
-
-    def colour(self, residual: np.ndarray, pole: complex) -> float:
-        power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))
-        at = int(np.argmin(np.abs(self.omega - pole.imag)))
-        beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
-        # The median of a power of two degrees of freedom and more is at most its mean.
-        return max(1.0, float(np.median(beside) / power.mean()))

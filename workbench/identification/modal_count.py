@@ -45,7 +45,7 @@ def tell(drive: Drive, *, most_modes: int, false_alarm: float = FALSE_ALARM) -> 
         if ended:
             break
     order = np.argsort(np.abs(fit.poles))
-    evidence = np.array([_evidence(fit, r) for r in order])
+    evidence = np.array([evidence_of(fit, r) for r in order])
     fit = replace(projected(drive, fit.poles[order], fit.loads[order]), converged=fit.converged, steps=fit.steps)
     return Told(fit, evidence, limit, full)
 
@@ -143,7 +143,7 @@ def no_modes(drive: Drive, fit: Fit) -> np.ndarray:
     """Which are damped beyond what rings, or split another mode that has their shape and their band."""
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
-    strength = np.array([_evidence(fit, r) for r in range(poles.size)])
+    strength = np.array([evidence_of(fit, r) for r in range(poles.size)])
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + drive.resolution
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.loads.T, fit.loads.T)
@@ -152,7 +152,7 @@ def no_modes(drive: Drive, fit: Fit) -> np.ndarray:
     return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
 
 
-def _evidence(fit: Fit, r: int) -> float:
+def evidence_of(fit: Fit, r: int) -> float:
     """χ² of a mode's shape in the noise, poles and loads held."""
     both, noise, found = [r, fit.poles.size + r], fit.noise, 0.0
     first = 0
@@ -171,7 +171,7 @@ def _pruned(drive: Drive, fit: Fit, limit: float) -> Fit:
         for r, pole in enumerate(fit.poles):
             near = np.abs(np.delete(fit.poles, r) - pole).min(initial=np.inf) < 2.0 * abs(pole.real)
             need = limit * drive.colour(fit.residual / fit.noise, pole)
-            if damped[r] or near or _evidence(fit, r) < 4.0 * need:
+            if damped[r] or near or evidence_of(fit, r) < 4.0 * need:
                 rest = np.delete(np.arange(fit.poles.size), r)
                 without = settled(drive, projected(drive, fit.poles[rest], fit.loads[rest]), 12)
                 gain = ratio(drive, without, fit)

@@ -20,6 +20,7 @@ TURN = 2.0 * math.pi
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 UNLIKELY, MOST_MODES = 0.01, 40
 BROAD = 0.1  # damping ratio
+MAINS_HZ, SURE = (50.0, 60.0), 3.0
 AGREED = 0.8  # phase collinearity below which points do not swing together
 
 
@@ -165,7 +166,19 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
             " points measured one after another, or on a structure that changes, disagree like that: leave that band"
             " out by --band-hz, or take more --modes"
         )
-    uneasy = np.flatnonzero(apart & ~doubtful)
+    for r, parts in enumerate(found.parts_hz):
+        if parts:
+            lines.append(
+                f"mode {r + 1} stands for a crowd, others at {', '.join(f'{f:.4g}' for f in parts)} Hz: points measured"
+                " one after another disagree there, or it depends on amplitude; modes closer than that are not told"
+            )
+    doubt = SURE * found.omega_std / TURN + float(np.diff(found.frequencies_hz).min())
+    hums = np.zeros(at.size, bool)
+    for mains in MAINS_HZ:
+        hum = apart & (at > 0.5 * mains) & (np.abs(at - mains * np.round(at / mains)) < np.minimum(doubt, 0.02 * mains))
+        lines += [f"mode {r + 1}: a multiple of {mains:g} Hz: mains hum?" for r in np.flatnonzero(hum)]
+        hums |= hum
+    uneasy = np.flatnonzero(apart & ~doubtful & ~hums)
     if uneasy.size:
         lines.append(
             f"modes {', '.join(str(r + 1) for r in uneasy)}: their points do not swing together; either damping couples"
@@ -182,6 +195,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
         "participation_imag": found.participation.imag,
         "misfit": found.misfit,
         "doubtful": doubtful,
+        "parts_hz": found.parts_hz,
         "full_hz": found.full_hz,
         "converged": found.converged,
     }
