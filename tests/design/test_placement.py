@@ -258,7 +258,8 @@ def test_every_limit_is_part_of_the_proof(limits):
     kept = np.all([excess <= 0 for excess in keep.broken(fine, figures).values()], axis=0)
     for low, high in keep.forbidden:
         kept &= ~((fine > low) & (fine < high)).any(axis=1)
-    assert kept.any() and figures.work[kept].min() >= proof.lower_bound
+    # the best of the candidates is evaluated here among others: the last digit may differ
+    assert kept.any() and figures.work[kept].min() >= proof.lower_bound * (1.0 - 1e-12)
     # and a worse one that keeps the limits is found out
     worse = two.placed(fine[kept][np.argsort(figures.work[kept])[kept.sum() // 2]], "")
     assert certify(two, worse, gap=0.01, **limits).better is not None
