@@ -53,8 +53,9 @@ def errors(refined: Refined, limit: Refined) -> dict[str, tuple[np.ndarray, np.n
     truth, modes = limit.modes, refined.modes
     columns, k = np.arange(truth.n_modes), np.abs(modes.shapes).argmax(axis=0)
     shape = (modes.shapes / modes.shapes[k, columns] - truth.shapes / truth.shapes[k, columns]).real
-    # The bound is of shapes relative to their true largest entry; where another one is, only the own error counts.
-    same = k == np.abs(truth.shapes).argmax(axis=0)
+    # The bound is of shapes relative to their largest entry, which has none; where that is another, alike by symmetry
+    # or nearly, only the own error counts.
+    same = limit.shape_std[k, columns] == 0.0
     ends = (np.arange(truth.shapes.shape[0])[:, None] != k) & same
     omega, zeta = modes.omega - truth.omega, modes.zeta - truth.zeta
     return {
