@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from workbench.identification.coloured import heard_along, noise_near
 from workbench.identification.fit_errors import covariance
 from workbench.identification.identified import MOST_DAMPED
-from workbench.identification.modal_fit import Fit, free_parameters, moves
+from workbench.identification.modal_fit import Fit, columns, free_parameters, moves
 from workbench.identification.noise_course import course, lines_of, samples_of
 from workbench.identification.noise_levels import variances
 from workbench.records.record import Record
@@ -97,14 +97,9 @@ class KnownInputs:
 
     def _taken(self, fit: Fit) -> np.ndarray:
         """Share of the noise of each line that the fit has taken, its leverage, (n_rows, n_outputs)."""
-        answers = [self.answers(pole) for pole in fit.poles]
-        slopes = [self.slopes(pole, load) for pole, load in zip(fit.poles, fit.loads)]
-        swings = [self._swing(pole, load) for pole, load in zip(fit.poles, fit.loads)]
-        phi = np.column_stack([*(x for x, _ in swings), *(y for _, y in swings), self.fixed])
-        tangents = [np.column_stack([s[k], a[k]]) for k in (0, 1) for s, a in zip(slopes, answers)]
-        t = np.hstack(tangents) if tangents else np.zeros((len(phi), 0))
+        phi, t = columns(self, fit.poles, fit.loads)
         if not self.by_line:
-            phi, t = (np.vstack([lines_of(columns[rows]) for rows in self.rows]) for columns in (phi, t))
+            phi, t = (np.vstack([lines_of(matrix[rows]) for rows in self.rows]) for matrix in (phi, t))
         free, found = free_parameters(fit), []
         bound = covariance(fit) if free.size else np.zeros((0, 0))
         moved = np.concatenate([moves(fit, part)[:, free] for part in fit.parts], axis=2)

@@ -3,7 +3,8 @@
     s² = a² + b² |H|²      of each output: its sensor's own noise, and that of the force or of too few averages
 
 What a fit has not yet found is smooth from line to line, noise is not: where lines stand about evenly, r_k less the
-mean of r_k-1 and r_k+1 holds noise alone, 3/2 s² of it. H is the fit's own, for a measured H goes with its noise.
+mean of r_k-1 and r_k+1 holds noise alone, 3/2 s² of it. H is the fit's own, for a measured H goes with its noise; where
+a mode is not yet found it is the running median of what was measured.
 """
 
 import numpy as np
@@ -24,7 +25,6 @@ def noise_with_size(left: np.ndarray, fitted: np.ndarray) -> np.ndarray | None:
     """
     inner = np.arange(1, left.shape[-1] - 1, 3)  # every third: no line counts twice
     rough = np.abs(left[..., inner] - 0.5 * (left[..., inner - 1] + left[..., inner + 1]))
-    # What a mode not yet found adds to the fit is seen in the measured functions alone.
     seen = median_filter(np.abs(fitted + left), (1, 1, SMOOTHED))
     size, found, uneven = np.maximum(np.abs(fitted), seen), np.ones(left.shape), False
     for j, (each, of) in enumerate(zip(rough, size[..., inner], strict=True)):

@@ -107,6 +107,16 @@ class Fit:
 
 def projected(drive: Drive, poles: np.ndarray, loads: np.ndarray) -> Fit:
     """The shapes that belong to given poles and loads, by least squares."""
+    phi, t = columns(drive, poles, loads)
+    if drive.weights is None:
+        return Fit(poles, loads, (_part(phi, t, drive.values),))
+    each = drive.weights.T[:, :, None]
+    parts = [_part(w * phi, w * t, y[:, None]) for w, y in zip(each, drive.values.T)]
+    return Fit(poles, loads, tuple(parts))
+
+
+def columns(drive: Drive, poles: np.ndarray, loads: np.ndarray) -> Pair:
+    """Swings and what is fixed, Φ (n_rows, n_columns), and tangents T (n_rows, n_tangents), not weighted."""
     answers = [drive.answers(pole) for pole in poles]
     slopes = [drive.slopes(pole, load) for pole, load in zip(poles, loads)]
     swings, tangents = [], []
@@ -115,14 +125,8 @@ def projected(drive: Drive, poles: np.ndarray, loads: np.ndarray) -> Fit:
         turned = [a[0] @ load.imag + a[1] @ load.real for a, load in zip(answers, loads)]
         swings += turned if k else whole
         tangents += [np.column_stack([s[k], a[k]]) for s, a in zip(slopes, answers)]
-    rows = drive.values.shape[0]
     phi = np.column_stack([*swings, drive.fixed]) if swings else drive.fixed
-    t = np.hstack(tangents) if tangents else np.zeros((rows, 0))
-    if drive.weights is None:
-        return Fit(poles, loads, (_part(phi, t, drive.values),))
-    each = drive.weights.T[:, :, None]
-    parts = [_part(w * phi, w * t, y[:, None]) for w, y in zip(each, drive.values.T)]
-    return Fit(poles, loads, tuple(parts))
+    return phi, np.hstack(tangents) if tangents else np.zeros((drive.values.shape[0], 0))
 
 
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
