@@ -11,8 +11,9 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.containment import fewer, simpler_forms
 from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import cost_of, fit
+from workbench.gap.following import LOOSE
 from workbench.gap.missing_force import force_filter, sampled_model, whiten
-from workbench.gap.prediction import LOOSE, FitData
+from workbench.gap.prediction import FitData
 from workbench.gap.shrinkage import Shrinkage
 from workbench.rig.elements import CubicSpring, PeriodicForce
 

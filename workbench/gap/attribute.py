@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.beside_nominal import decide_beside_nominal, decide_with_figures_freed
 from workbench.gap.beside_random import decide_on_random
-from workbench.gap.decide import decide, decide_on_pairs
+from workbench.gap.decide import decide
 from workbench.gap.disturbance import RandomForceFit
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -16,10 +16,15 @@ from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of
 from workbench.gap.outcome import Decision
+from workbench.gap.pairs import Pairs
 from workbench.gap.prediction import FitData
-from workbench.gap.search import Search, one_more
+from workbench.gap.pursuit import on_whole_records, one_more
+from workbench.gap.search import Search
+from workbench.gap.weighing import Weighed
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
+
+FINALISTS = 8  # single effects that are fitted to whole records
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,10 +120,12 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
     else:
         found, singles = (None, []) if search.explains(start) else decide_on_random(search, evidence)
         if found is None:
-            singles = one_more(search, (), evidence, 0.05, 0.45, finalists=8)
-            found = decide(search, start, singles) or decide_on_pairs(search, start, singles)
-            if found.outcome not in ("none", "explained"):
-                found = decide_beside_nominal(search, start, singles) or found
+            report("one effect", 0.1)
+            weighed = Weighed.of(search, (), evidence)
+            ahead = one_more(search, (), evidence, weighed)
+            report("one effect, on whole records", 0.3)
+            singles = on_whole_records(search, ahead, FINALISTS)
+            found = decide(search, start, singles) or _with_a_second(search, start, singles, ahead, weighed)
     outcome, best, random, rivals = found
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
@@ -134,6 +141,14 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
         evidence=Evidence.of(rig, data) if seen else evidence,
         data=data,
     )
+
+
+def _with_a_second(search: Search, start: Fit, singles: list[Fit], ahead: list[Fit], weighed: Weighed) -> Decision:
+    """What a second effect explains, or figures of the model that are a little off."""
+    pairs = Pairs(search)
+    if pairs.at_once(weighed):
+        return pairs.decision(start)
+    return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, singles, ahead)
 
 
 def _telling(data: FitData, start: Fit) -> tuple[str, ...]:

@@ -9,13 +9,15 @@ from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, f
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
-from workbench.gap.finish import finished, ranked
+from workbench.gap.finish import finished, ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.outcome import Decision
-from workbench.gap.search import Search, one_more, spread_over_kinds
+from workbench.gap.pursuit import on_whole_records, one_more
+from workbench.gap.search import Search, spread_over_kinds
 from workbench.rig.rig import Rig
 
 NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
+FINALISTS = 4  # effects beside it that are fitted to whole records
 SPREAD = 0.5  # of the missing force's level over records: most forces of the rig's own follow the level of the inputs
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
@@ -48,8 +50,10 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
         return None, []
     beside = search.through(model_filter(evidence.model, search.rig, alone[1]))
     cost = cost_of(search.rig, (), beside.data)
-    singles = spread_over_kinds(one_more(beside, (), evidence, 0.2, 0.8, finalists=4), 1)
+    search.report("beside a random disturbance", 0.2)
+    singles = spread_over_kinds(on_whole_records(beside, one_more(beside, (), evidence), FINALISTS), 1)
     gaining = [f for f in singles[:3] if beside.surely_better(f, cost, f.n_parameters)]
+    gaining = beside.side_by_side(simplest, gaining)
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]

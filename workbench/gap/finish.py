@@ -6,12 +6,11 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.gap.effects.containment import fewer, simpler_forms
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect
 from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.pursuit import FINE
 from workbench.gap.search import Search, promise
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import is_stepped
 
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
 NO_NEARER = 0.9
@@ -24,26 +23,10 @@ FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 def finished(search: Search, candidate: Fit) -> Fit:
     """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
     if candidate.falling == 0 and not search.explains(candidate):
-        finely = cost_of(search.rig, candidate.effects, search.data.stepped(8))
+        finely = cost_of(search.rig, candidate.effects, search.data.stepped(FINE))
         if finely - 1.0 > NO_NEARER * (candidate.cost - 1.0):
             return candidate
-    return fit(search.rig, candidate.effects, search.data.stepped(8), iterations=25, tolerance=1e-7)
-
-
-def followed(search: Search, candidate: Fit) -> Fit:
-    """The set fitted to predictions one sample ahead first, which go smoothly with its numbers, then to whole records.
-
-    Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way.
-    """
-    rig = apply_all(search.rig, candidate.effects)
-    if not is_stepped(rig) or not all(_reads_at_once(sensor) for sensor in rig.sensors):
-        return candidate
-    ahead = fit(search.rig, candidate.effects, search.quick.following(rig), iterations=12, tolerance=1e-4)
-    if cost_of(search.rig, ahead.effects, search.quick) > cost_of(search.rig, candidate.effects, search.quick):
-        return candidate
-    ahead = fit(search.rig, ahead.effects, search.data.following(rig).stepped(8), iterations=8)
-    whole = fit(search.rig, ahead.effects, search.data.stepped(8), iterations=25, tolerance=1e-7)
-    return whole if whole.cost < candidate.cost else candidate
+    return fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=25, tolerance=1e-7)
 
 
 def simplified(search: Search, candidate: Fit) -> Fit:
@@ -65,11 +48,6 @@ def _simpler_forms(rig: Rig, effects: Sequence[Effect]) -> Iterator[tuple[Effect
     for i, effect in enumerate(effects):
         for simpler in simpler_forms(effect, rig):
             yield (*effects[:i], simpler, *effects[i + 1 :])
-
-
-def _reads_at_once(sensor: Sensor) -> bool:
-    """Whether a reading is of the present motion alone, and all of it."""
-    return sensor.time_constant == 0 and not np.isfinite(sensor.limit)
 
 
 def relocated(search: Search, candidate: Fit) -> Fit:
@@ -111,15 +89,31 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
     return [*(f.effects for f in elsewhere[:2]), moved(length - effect.values["at"])]
 
 
+def plainest(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits without those that come to another of them at a bound, and are no better than it."""
+    by_key = {candidate.key: candidate for candidate in fits}
+
+    def needless(candidate: Fit) -> bool:
+        forms = (*fewer(candidate.effects), *_simpler_forms(search.rig, candidate.effects))
+        others = (by_key.get(tuple(sorted(effect.label for effect in form))) for form in forms)
+        return any(other and not _pays(search, candidate, other) for other in others if other is not candidate)
+
+    return [candidate for candidate in fits if not needless(candidate)]
+
+
+def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
+    extra = max(candidate.n_parameters - simpler.n_parameters, 1)
+    return search.surely_better(candidate, simpler.cost, extra)
+
+
 def simplest(search: Search, candidate: Fit) -> Fit:
     """The set with effects replaced by simpler or fewer ones, where the records cannot tell them apart."""
     improved = True
     while improved:
         improved = False
         for effects in _simpler_sets(search, candidate):
-            trial = fit(search.rig, effects, search.data.stepped(8), iterations=12, tolerance=1e-7)
-            extra = max(candidate.n_parameters - trial.n_parameters, 1)
-            if search.explains(trial) and not search.surely_better(candidate, trial.cost, extra):
+            trial = fit(search.rig, effects, search.data.stepped(FINE), iterations=12, tolerance=1e-7)
+            if search.explains(trial) and not _pays(search, candidate, trial):
                 candidate, improved = trial, True
                 break
     return candidate

@@ -49,12 +49,12 @@ class Fit:
 
 def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
     """Cost per measured value; `HOPELESS` where the rig cannot be (a buckled beam, say)."""
-    residual = _finite_residual(rig, effects, data)
+    residual = finite_residual(rig, effects, data)
     return HOPELESS if residual is None else float(residual @ residual) / residual.size
 
 
-def _finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray | None:
-    """The residual, or None where the rig cannot be or its motion runs away."""
+def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray | None:
+    """The residual (n_values,) of a rig with effects, or None where it cannot be or its motion runs away."""
     with np.errstate(over="ignore", invalid="ignore"):
         try:
             residual = data.residual(apply_all(rig, effects))
@@ -99,17 +99,21 @@ class _Problem:
 
     def residual(self, free: np.ndarray, *, coarsely: bool = False) -> np.ndarray | None:
         data = self.coarse if coarsely else self.data
-        residual = _finite_residual(self.rig, (*self.at(free), *self.held), data)
+        residual = finite_residual(self.rig, (*self.at(free), *self.held), data)
         if residual is None or not self.believed:
             return residual
         return np.r_[residual, (free[self.believed] - self.centre) / self.prior_std]
 
-    def jacobian(self, free: np.ndarray, residual: np.ndarray) -> np.ndarray:
-        """Differences, by coarser steps of time where the rig is stepped: slopes need not be as exact as residuals."""
+    def near(self, free: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The residual that slopes start from, and whether it is by coarser steps of time, as it is for a stepped rig.
+
+        Slopes need not be as exact as residuals.
+        """
         on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
-        coarsely = on_coarse is not None
-        if on_coarse is not None:
-            residual = on_coarse
+        return (residual, False) if on_coarse is None else (on_coarse, True)
+
+    def jacobian(self, free: np.ndarray, residual: np.ndarray, coarsely: bool) -> np.ndarray:
+        """Differences from the residual that `near` gives."""
         columns = []
         for j, (_, parameter) in enumerate(self.parameters):
             step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name == "at" else self.steps[j]
@@ -125,17 +129,22 @@ class _Problem:
         return np.array(columns).T
 
 
-def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray:
-    """How the residual moves with each number of believed effects, (n_values, n_numbers), in units of its belief.
+def slopes(rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()) -> np.ndarray:
+    """How the residual moves with each number of effects, in its free coordinate: (n_values, n_numbers).
 
     Raises:
         ValueError: the rig cannot be simulated with these effects.
     """
-    problem = _Problem(rig, effects, data)
+    problem = _Problem(rig, effects, data, held)
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    return problem.jacobian(problem.start, residual)[: data.n_values] * problem.prior_std
+    return problem.jacobian(problem.start, *problem.near(problem.start, residual))[: data.n_values]
+
+
+def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray:
+    """The slopes along the numbers of believed effects, each in units of its belief."""
+    return slopes(rig, effects, data) * _Problem(rig, effects, data).prior_std
 
 
 def fit(
@@ -167,7 +176,8 @@ def fit(
     damping, status, falling = 1e-3, "most iterations done", 0.0
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
-        jacobian = problem.jacobian(free, residual)
+        nearly, coarsely = problem.near(free, residual)
+        jacobian = problem.jacobian(free, nearly, coarsely)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         improved: np.ndarray | None = None
@@ -177,9 +187,8 @@ def fit(
             promised = -(2.0 * gradient + normal @ straight) @ straight
             if promised < PROMISED * tolerance * cost:
                 break
-            step = _bounded(
-                problem, free, straight + _bend(problem, free, residual, jacobian, damped, straight, moving)
-            )
+            bend = _bend(problem, free, nearly, coarsely, jacobian, damped, straight, moving)
+            step = _bounded(problem, free, straight + bend)
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
                 improved = trial
@@ -219,7 +228,7 @@ def _bounded(problem: _Problem, free, step) -> np.ndarray:
     return np.clip(free + step, problem.low, problem.high) - free
 
 
-def _bend(problem: _Problem, free, residual, jacobian, damped, step, moving) -> np.ndarray:
+def _bend(problem: _Problem, free, residual, coarsely, jacobian, damped, step, moving) -> np.ndarray:
     """What the step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
 
     Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
@@ -227,7 +236,7 @@ def _bend(problem: _Problem, free, residual, jacobian, damped, step, moving) -> 
     turn = np.zeros_like(step)
     if moving.sum() < 2:
         return turn
-    beside = problem.residual(free + BENT * step)
+    beside = problem.residual(free + BENT * step, coarsely=coarsely)
     if beside is None:
         return turn
     curvature = 2.0 / BENT * ((beside - residual) / BENT - jacobian @ step)

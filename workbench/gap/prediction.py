@@ -7,38 +7,13 @@ from threading import Lock
 
 import numpy as np
 
-from workbench.gap.effects.structural import known_places
-from workbench.gap.missing_force import ForceFilter, force_filter, sampled_model, whiten
+from workbench.gap.following import Follower
+from workbench.gap.missing_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import Motion, follow, move, read
+from workbench.rig.simulate import Motion, is_stepped, move, read
 
 REMEMBERED = 24
-LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
-
-
-@dataclass(frozen=True, eq=False)
-class Follower:
-    """What holds a rig beside the records: a steady Kalman filter of its modes, under random forces on all of them.
-
-    Attributes:
-        gain: (2, n_modes, n_outputs) of their displacements and velocities.
-        whitening: (n_outputs, n_outputs) to errors of unit covariance.
-    """
-
-    gain: np.ndarray
-    whitening: np.ndarray
-
-    @classmethod
-    def of(cls, rig: Rig, noise: np.ndarray, force: float, sample_time: float) -> "Follower":
-        """For sensors of that noise (n_outputs,), and forces of that rms, N, at any place."""
-        modes, n = rig.modes, rig.modes.n_modes
-        places = known_places(rig)
-        along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
-        forces = force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
-        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), np.eye(n), forces**2, 0.0)
-        gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
-        return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +79,10 @@ class FitData:
 
     def following(self, rig: Rig) -> "FitData":
         """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be."""
-        follower = Follower.of(rig, self.noise, LOOSE * self.force_rms, self.records[0].sample_time)
-        return replace(self, follower=follower)
+        if self.whitener is not None:  # its innovations are errors one sample ahead as they are
+            return replace(self, given_way=None)
+        follower = Follower.of(rig, self.noise, self.force_rms, self.records[0].sample_time)
+        return replace(self, follower=follower, given_way=None)
 
     @cached_property
     def force_rms(self) -> float:
@@ -146,29 +123,25 @@ class FitData:
 
     def residual(self, rig: Rig) -> np.ndarray:
         """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
-        if self.follower is not None:
-            return np.concatenate([self._ahead(rig, record, self.follower) for record in self.records])
-        both = zip(self.counted, self.predictions(rig), strict=True)
-        left = [record.outputs - prediction for record, prediction in both]
-        if self.whitener is None:
-            residual = np.concatenate([(r / self.noise[:, None]).ravel() for r in left])
-        else:
-            residual = np.concatenate([whiten(self.whitener, r).ravel() for r in left])
+        residual = self._left(rig)
         if self.given_way is not None:
             directions, shares = self.given_way
             residual -= directions @ (shares * (directions.T @ residual))
         return residual
 
-    def _ahead(self, rig: Rig, record: Record, follower: Follower) -> np.ndarray:
-        errors = follow(
-            rig,
-            record.inputs,
-            record.outputs,
-            follower.gain,
-            sample_time=record.sample_time,
-            substeps=self.substeps,
-        )
-        return (follower.whitening @ errors[:, self.lead :]).ravel()
+    def _left(self, rig: Rig) -> np.ndarray:
+        follower = self.follower
+        if follower is not None and is_stepped(rig):
+            ahead = [follower.errors(rig, record, self.substeps)[:, self.lead :] for record in self.records]
+            return np.concatenate([errors.ravel() for errors in ahead])
+        both = zip(self.counted, self.predictions(rig), strict=True)
+        left = [record.outputs - prediction for record, prediction in both]
+        if follower is not None:
+            dt = self.records[0].sample_time
+            return np.concatenate([follower.errors_of_linear(rig, r, dt, self.substeps).ravel() for r in left])
+        if self.whitener is None:
+            return np.concatenate([(r / self.noise[:, None]).ravel() for r in left])
+        return np.concatenate([whiten(self.whitener, r).ravel() for r in left])
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""

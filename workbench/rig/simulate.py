@@ -191,7 +191,12 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
-    return _stepped(rig, inputs, NOT_MEASURED, NOTHING, sample_time, substeps)[0]
+    q, v, beside, _ = _stepped(rig, inputs, NOT_MEASURED, NOTHING, sample_time, substeps)
+    modes = rig.modes
+    scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
+    # the forces beside hold what couples the modes; only each mode's own damping is left
+    own = modes.omega[:, None] ** 2 * scale * q + np.diag(modes.damping)[:, None] * v
+    return Motion(q, v, beside - own)
 
 
 def follow(
@@ -210,7 +215,7 @@ def follow(
         sample_time: s.
         substeps: of each sample interval.
     """
-    return _stepped(rig, inputs, outputs, gain, sample_time, substeps)[1]
+    return _stepped(rig, inputs, outputs, gain, sample_time, substeps)[3]
 
 
 def _reading(rig: Rig) -> np.ndarray:
@@ -224,8 +229,8 @@ def _reading(rig: Rig) -> np.ndarray:
 
 def _stepped(
     rig: Rig, inputs: np.ndarray, outputs: np.ndarray, gain: np.ndarray, sample_time: float, substeps: int
-) -> tuple[Motion, np.ndarray]:
-    """The motion, and where there are outputs their errors, which set it right."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Displacements and velocities of the modes, the forces on them, and where there are outputs their errors."""
     modes = rig.modes
     diagonal = np.diag(modes.damping).copy()
     coupling = modes.damping - np.diag(diagonal)
@@ -277,10 +282,8 @@ def _stepped(
         f,
         errors,
     )
-    scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(n_samples)
-    stiffness = modes.omega[:, None] ** 2 * q * scale
-    # the forces f hold what couples the modes; only each mode's own damping is left
-    return Motion(q, v, participation @ at_samples + f - stiffness - diagonal[:, None] * v), errors
+    acting = f if outputs.size else participation @ at_samples + f
+    return q, v, acting, errors
 
 
 @cache

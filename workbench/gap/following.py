@@ -1,0 +1,82 @@
+"""Predictions one sample ahead: a rig, with all its laws, that every sample of a record sets right."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.gap.effects.structural import known_places
+from workbench.gap.missing_force import force_filter, sampled_model
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import follow, move, read
+
+LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """What holds a rig beside the records: a steady Kalman filter of its modes, under random forces on all of them.
+
+    Attributes:
+        gain: (2, n_modes, n_outputs) of their displacements and velocities.
+        whitening: (n_outputs, n_outputs) to errors of unit covariance.
+    """
+
+    gain: np.ndarray
+    whitening: np.ndarray
+
+    @classmethod
+    def of(cls, rig: Rig, noise: np.ndarray, force: float, sample_time: float) -> "Follower":
+        """For sensors of that noise (n_outputs,), and inputs of that rms, N."""
+        modes, n = rig.modes, rig.modes.n_modes
+        places = known_places(rig)
+        along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
+        forces = LOOSE * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
+        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), np.eye(n), forces**2, 0.0)
+        gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
+        return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
+
+    def errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
+
+        What sensors lose by lag or clipping is not followed: it is made up for as the whole record has it.
+        """
+        slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
+        quick = _at_once(slow)
+        if quick.sensors != slow.sensors:
+            motion = move(rig, record.inputs, sample_time=dt, substeps=substeps)
+            measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
+        gain = self._gain_for(rig.modes.n_modes)
+        return self.whitening @ follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps)
+
+    def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
+        """What the errors of a linear rig over a whole record leave of themselves when every sample sets it right.
+
+        Args:
+            rig: with its predictions in closed form.
+            left: (n_outputs, n_samples) measured less predicted.
+            sample_time: s.
+            substeps: of a sample, where damping couples the modes.
+        """
+        sensors = tuple(Sensor(sensor.name, sensor.at, sensor.quantity, gain=sensor.gain) for sensor in rig.sensors)
+        bare = replace(rig, actuators=(), elements=(), sensors=sensors)
+        coupled = np.any(rig.modes.damping - np.diag(np.diag(rig.modes.damping)))
+        gain, no_inputs = self._gain_for(rig.modes.n_modes), np.zeros((0, left.shape[1]))
+        substeps = substeps if coupled else 1
+        return self.whitening @ follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
+
+    def _gain_for(self, n_modes: int) -> np.ndarray:
+        """The gain with none for modes that are more than it knows of."""
+        gain = np.zeros((2, n_modes, self.whitening.shape[0]))
+        known = min(n_modes, self.gain.shape[1])
+        gain[:, :known] = self.gain[:, :known]
+        return gain
+
+
+def _unrounded(rig: Rig) -> Rig:
+    return replace(rig, sensors=tuple(replace(sensor, step=0.0) for sensor in rig.sensors))
+
+
+def _at_once(rig: Rig) -> Rig:
+    return replace(rig, sensors=tuple(replace(sensor, time_constant=0.0, limit=np.inf) for sensor in rig.sensors))

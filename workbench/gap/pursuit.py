@@ -1,0 +1,110 @@
+"""The likeliest sets of effects, fitted to predictions one sample ahead and then to whole records."""
+
+from collections.abc import Sequence
+
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.evidence import Evidence
+from workbench.gap.fit import Fit, fit
+from workbench.gap.prediction import FitData
+from workbench.gap.search import Search, in_one_valley, promise
+from workbench.gap.weighing import Weighed
+from workbench.rig.simulate import is_stepped
+
+FINE = 8  # substeps of a sample
+TARGETS_A_KIND = 3  # of single effects that are tried
+TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
+CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
+RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
+RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
+
+
+def one_more(
+    search: Search, given: tuple[Effect, ...], evidence: Evidence, weighed: Weighed | None = None
+) -> list[Fit]:
+    """The likeliest fits, one sample ahead, of the given effects with one more, best first.
+
+    Args:
+        evidence: of the rig with the given effects.
+        weighed: what may be there beside them, where it is at hand.
+    """
+    weighed = Weighed.of(search, given, evidence) if weighed is None else weighed
+    chosen: list[Effect] = []
+    for effect in weighed.likeliest():
+        if sum(effect.kind is other.kind for other in chosen) < TARGETS_A_KIND:
+            chosen.append(effect)
+    return fitted_ahead(search, [(*given, effect) for effect in chosen])
+
+
+def pairs_at_once(search: Search, weighed: Weighed) -> list[Fit]:
+    """The likeliest fits, one sample ahead, of any two effects, best first.
+
+    Args:
+        weighed: with nothing given.
+    """
+    return fitted_ahead(search, weighed.likeliest_pairs(TRIED))
+
+
+def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
+    """Fits of sets to predictions one sample ahead, best first: all to the most telling record, fewer to another too.
+
+    Args:
+        sets: the likeliest first.
+    """
+
+    def ahead(effects: tuple[Effect, ...], data: FitData, iterations: int) -> Fit:
+        return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
+
+    tried = search.pool.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[:TRIED])
+    likely = sorted(tried, key=promise)[:LIKELY]
+    fits = _distinct(search, sorted(search.pool.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise))
+    longer = search.pool.map(lambda f: ahead(f.effects, search.ahead, 8) if f.falling else f, fits[:LIKELIEST])
+    return _distinct(search, sorted((*longer, *fits[LIKELIEST:]), key=lambda f: f.cost))
+
+
+def _distinct(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits without those that came to where a better one of the same set came."""
+    distinct: list[Fit] = []
+    for candidate in fits:
+        if not any(in_one_valley(candidate, other, search.rig.modes.length) for other in distinct):
+            distinct.append(candidate)
+    return distinct
+
+
+def on_whole_records(search: Search, ahead: Sequence[Fit], most: int) -> list[Fit]:
+    """The best of fits ahead, fitted to whole records, best first.
+
+    Args:
+        ahead: best first.
+        most: at most so many, and none that is far behind.
+    """
+    close = [f for f in ahead[:most] if f.cost < CLOSE * ahead[0].cost]
+    fits = [followed(search, f.effects, 5) for f in close[:1]]
+    if fits and search.explains(fits[0]):
+        close = [f for f in close if f.cost < ahead[0].cost + RIVAL]
+    fits += search.pool.map(lambda f: followed(search, f.effects, 5), close[1:])
+    fits.sort(key=promise)
+    running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
+    longer = search.pool.map(lambda f: whole(search, f.effects, 25), running)
+    return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
+
+
+def followed(search: Search, effects: tuple[Effect, ...], iterations: int = 25) -> Fit:
+    """The set fitted to predictions one sample ahead, which go smoothly with its numbers, then to whole records.
+
+    Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way.
+
+    Args:
+        iterations: on whole records, at most.
+    """
+    rig = apply_all(search.rig, effects)
+    if is_stepped(rig) and not search.held and search.data.whitener is None:
+        effects = fit(
+            search.rig, effects, search.data.following(rig).stepped(FINE), iterations=8, tolerance=1e-4
+        ).effects
+    return whole(search, effects, iterations)
+
+
+def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
+    """The set fitted to whole records."""
+    data = search.data.stepped(FINE)
+    return fit(search.rig, effects, data, held=search.held, iterations=iterations)
