@@ -1,4 +1,4 @@
-"""A search through the catalogue: every kind and target as one more effect beside those found before."""
+"""What every step of a search for effects works on, and what it may call an explanation."""
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,14 +14,14 @@ from workbench.gap.missing_force import ForceFilter
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
 
-SLACK = 0.03
-INTEGRATION_SHARE = 2e-6
-SURE = 30.0
-WORTHWHILE = 0.01  # of the noise power: less is within what two good finite-element models differ by
-ELSEWHERE = 0.1  # of the length
-SAME_PLACE = 0.02  # of the length
+SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
+INTEGRATION_SHARE = 2e-6  # of the gap's power: errors of stepping
+SURE = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
+WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect model
+ELSEWHERE = 0.1  # of the length: nearer, two places are in one valley of the cost at first
+SAME_PLACE = 0.02  # of the length: nearer, fits go on to the same end
 COARSE = 2.0  # times the noise: below, rounding errors are all but white and of no signal
-FAR = 10.0
+FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
 
 
 @dataclass(frozen=True, eq=False)
