@@ -10,7 +10,7 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.fit import cost_of, fit, sensitivity
 from workbench.gap.prediction import FitData
-from workbench.rig.elements import CoulombFriction
+from workbench.rig.elements import CoulombFriction, CubicSpring
 from workbench.rig.rig import Rig
 
 NOISE = 1e-5
@@ -81,3 +81,22 @@ def test_friction_beside_figures_a_little_off(rig, measured, records):
     assert friction["force"] == pytest.approx(truth.force, rel=0.02) and abs(friction["at"] - truth.at) < 0.01
     assert verdict.nominal_figures["damping_1"] == pytest.approx(DAMPING[0], rel=0.02)
     assert verdict.shrinkage.overall > 0.99
+
+
+def test_nobody_has_to_say_that_figures_are_off(rig, records):
+    real = off(replace(rig, elements=(CoulombFriction(1.37, 0.004, 1e-3),)))
+    verdict = diagnose(rig, records(real))
+    named = {e.kind.name: e for e in verdict.effects}
+    assert verdict.outcome == "explained" and set(named) == {"coulomb_friction", "nominal_figures"}
+    assert named["coulomb_friction"].values["force"] == pytest.approx(0.004, rel=1e-2)
+    np.testing.assert_allclose(
+        [verdict.nominal_figures[f"frequency_{r}"] for r in (1, 2, 3)], FREQUENCIES[:3], atol=2e-4
+    )
+
+
+@pytest.mark.slow
+def test_two_effects_beside_figures_that_are_known_to_be_off(rig, records):
+    two = replace(rig, elements=(CoulombFriction(1.37, 0.03, 1e-3), CubicSpring(0.62, 500.0)))
+    verdict = diagnose(rig, records(off(two)), free_nominal=True)
+    assert verdict.outcome == "explained"
+    assert {e.kind.name for e in verdict.effects} == {"coulomb_friction", "cubic_spring", "nominal_figures"}

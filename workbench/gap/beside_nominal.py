@@ -1,6 +1,9 @@
 """What effects explain beside nominal figures that are a little off."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from workbench.gap.beside_random import NEAR
 from workbench.gap.effects.effect import Effect, apply_all
@@ -10,13 +13,14 @@ from workbench.gap.finish import ranked, simplest
 from workbench.gap.fit import Fit, fit
 from workbench.gap.outcome import Decision, unexplained
 from workbench.gap.pairs import Pairs
-from workbench.gap.pursuit import FINE, one_more, pairs_at_once
+from workbench.gap.pursuit import FINE, distinct_valleys, one_more, pairs_at_once
 from workbench.gap.search import Search, spread_over_kinds
 from workbench.gap.weighing import Weighed
 from workbench.rig.rig import Rig
 
 WITHIN_REACH = 3.0  # times the noise one sample ahead: what may come to it on whole records
-TRIED, PAIRS_TRIED = 4, 2  # sets of one effect and of two that are fitted with the figures
+TRIED, PAIRS_TRIED = 4, 3  # sets of one effect and of two that are fitted with the figures
+N_PLACES = 20  # of a second force
 
 
 def figures(rig: Rig) -> Effect:
@@ -67,15 +71,26 @@ class _Beside:
         self.search = search.beside(self.freed)
         self.evidence = Evidence.of(apply_all(search.rig, (self.freed,)), search.data)
         self.weighed = Weighed.of(self.search, (), self.evidence)
+        self.ahead = one_more(self.search, (), self.evidence, self.weighed)
 
     def singles(self) -> list[Fit]:
         """The figures alone and beside the likeliest single effects, all numbers fitted."""
-        found = one_more(self.search, (), self.evidence, self.weighed)
-        return self._fitted([(), *(f.effects for f in spread_over_kinds(found, 1)[:TRIED])])
+        return self._fitted([(), *(f.effects for f in spread_over_kinds(self.ahead, 1)[:TRIED])])
 
     def pairs(self) -> list[Fit]:
-        """The figures beside the likeliest pairs, all numbers fitted."""
-        return self._fitted([f.effects for f in pairs_at_once(self.search, self.weighed)[:PAIRS_TRIED]])
+        """The figures beside the likeliest pairs, two at once and one with another, all numbers fitted."""
+        found = (*pairs_at_once(self.search, self.weighed), *self._with_the_likeliest())
+        likeliest = distinct_valleys(self.search, sorted(found, key=lambda f: f.cost))[:PAIRS_TRIED]
+        return self._fitted([f.effects for f in likeliest])
+
+    def _with_the_likeliest(self) -> list[Fit]:
+        """The likeliest single effect with another, weighed on the record where it leaves most."""
+        given, search = self.ahead[0].effects, self.search
+        rig = apply_all(search.rig, (*given, self.freed))
+        left = search.ahead.by_channel(search.ahead.residual(rig)).mean(axis=1)
+        telling = search.quick.records[int(np.argmax(left))].name
+        evidence = Evidence.of(rig, self.plain.data, N_PLACES)
+        return one_more(replace(search, first=search.quick.only((telling,))), given, evidence)
 
     def _fitted(self, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
         return list(self.search.pool.map(lambda effects: _freed(self.plain, (*effects, self.freed)), sets))

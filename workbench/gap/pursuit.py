@@ -56,12 +56,14 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
 
     tried = search.pool.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[:TRIED])
     likely = sorted(tried, key=promise)[:LIKELY]
-    fits = _distinct(search, sorted(search.pool.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise))
+    fits = distinct_valleys(
+        search, sorted(search.pool.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
+    )
     longer = search.pool.map(lambda f: ahead(f.effects, search.ahead, 8) if f.falling else f, fits[:LIKELIEST])
-    return _distinct(search, sorted((*longer, *fits[LIKELIEST:]), key=lambda f: f.cost))
+    return distinct_valleys(search, sorted((*longer, *fits[LIKELIEST:]), key=lambda f: f.cost))
 
 
-def _distinct(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits without those that came to where a better one of the same set came."""
     distinct: list[Fit] = []
     for candidate in fits:
