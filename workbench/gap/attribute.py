@@ -14,17 +14,18 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
-from workbench.gap.fit import Fit, cost_of
+from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.outcome import Decision
 from workbench.gap.pairs import Pairs
 from workbench.gap.prediction import FitData
 from workbench.gap.pursuit import on_whole_records, one_more
-from workbench.gap.search import Search
+from workbench.gap.search import Search, spread_over_kinds
 from workbench.gap.weighing import Weighed
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
+SHOWN = 7  # others that are, to be shown beside them
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +127,7 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
             report("one effect, on whole records", 0.3)
             singles = on_whole_records(search, ahead, FINALISTS)
             found = decide(search, start, singles) or _with_a_second(search, start, singles, ahead, weighed)
+            singles = _of_every_kind(search, singles, ahead)
     outcome, best, random, rivals = found
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
@@ -141,6 +143,14 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
         evidence=Evidence.of(rig, data) if seen else evidence,
         data=data,
     )
+
+
+def _of_every_kind(search: Search, singles: Sequence[Fit], ahead: Sequence[Fit]) -> list[Fit]:
+    """The likeliest kinds alone on whole records, those too that were no rivals one sample ahead."""
+    tried = {f.effects[0].kind for f in singles}
+    others = [f for f in spread_over_kinds(ahead, 1) if f.effects[0].kind not in tried]
+    more = search.pool.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), others[:SHOWN])
+    return sorted((*singles, *more), key=lambda f: f.cost)
 
 
 def _with_a_second(search: Search, start: Fit, singles: list[Fit], ahead: list[Fit], weighed: Weighed) -> Decision:
