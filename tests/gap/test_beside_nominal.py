@@ -7,9 +7,11 @@ import pytest
 
 from workbench.gap.beside_nominal import figures
 from workbench.gap.diagnose import diagnose
-from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.fit import cost_of, fit, sensitivity
 from workbench.gap.prediction import FitData
+from workbench.gap.verdict import _off_by
 from workbench.rig.elements import CoulombFriction, CubicSpring
 from workbench.rig.rig import Rig
 
@@ -100,3 +102,10 @@ def test_two_effects_beside_figures_that_are_known_to_be_off(rig, records):
     verdict = diagnose(rig, records(off(two)), free_nominal=True)
     assert verdict.outcome == "explained"
     assert {e.kind.name for e in verdict.effects} == {"coulomb_friction", "cubic_spring", "nominal_figures"}
+
+
+def test_a_single_figure_is_told_as_one():
+    one = Effect(NOMINAL_FIGURES, None, {"frequency_1": 0.983, "damping_1": 0.9932, "modal_mass": 1.0})
+    assert _off_by(one) == "frequency -1.7 %, damping ratio -0.68 %"
+    two = Effect(NOMINAL_FIGURES, None, {**one.values, "frequency_2": 1.004, "damping_2": 0.9932})
+    assert _off_by(two) == "frequencies -1.7 to 0.4 %, damping ratios -0.68 %"

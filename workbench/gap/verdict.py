@@ -209,9 +209,10 @@ def _described(effect: Effect, nominal: Rig) -> str:
 def _off_by(figures: Effect) -> str:
     """How far the nominal figures are off: frequencies -0.5 to 0.6 %, damping ratios -10 to 13 %."""
     ranges = []
-    for words, name in (("frequencies", "frequency"), ("damping ratios", "damping")):
+    for one, more, name in (("frequency", "frequencies", "frequency"), ("damping ratio", "damping ratios", "damping")):
         percent = [100.0 * (value - 1.0) for figure, value in figures.values.items() if figure.startswith(name)]
-        ranges.append(f"{words} {min(percent):.2g} to {max(percent):.2g} %")
+        ends = f"{min(percent):.2g}", f"{max(percent):.2g}"
+        ranges.append(f"{one if len(percent) == 1 else more} {' to '.join(dict.fromkeys(ends))} %")
     return ", ".join(ranges)
 
 
