@@ -12,6 +12,7 @@ from workbench.gap.effects.effect import Effect
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, slopes
 from workbench.gap.following import Follower
+from workbench.gap.pairs import _evidence
 from workbench.gap.prediction import FitData
 from workbench.gap.pursuit import one_more, pairs_at_once
 from workbench.gap.search import Search
@@ -116,3 +117,11 @@ def test_a_sensor_that_rounds_coarsely_is_not_heard_beside_a_random_force(search
     heard = replace(search, rig=replace(search.rig, sensors=rounded)).hearing()
     assert [sensor.name for sensor in heard.rig.sensors] == ["d1", "d3", "d4"]
     assert heard.data.records[0].output_names == ("d1", "d3", "d4")
+
+
+def test_a_force_is_sought_beside_no_motion_that_runs_away(rig, search):
+    """A spring that pushes away is told by predictions one sample ahead; whole records of it alone are none."""
+    softening = Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": -3e5})
+    assert _evidence(search, softening).rig is rig
+    hardening = replace(softening, values={"at": 0.62, "stiffness": 2000.0})
+    assert _evidence(search, hardening).rig.elements

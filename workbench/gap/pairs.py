@@ -10,7 +10,7 @@ from workbench.gap.beside_random import NEAR, decide_with_random
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, plainest, ranked, relocated, simplest, simplified
-from workbench.gap.fit import Fit, fit
+from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.outcome import Decision, unexplained
 from workbench.gap.pursuit import on_whole_records, one_more, pairs_at_once
 from workbench.gap.search import FAR, Search, apart, in_one_valley, spread_over_kinds
@@ -19,6 +19,7 @@ from workbench.gap.weighing import Weighed
 FIRSTS = 4  # single effects that a second one is looked for beside
 FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
 HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
+ASTRAY = 1e4  # times the gap's power
 MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
 NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
 SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
@@ -86,10 +87,11 @@ class Pairs:
             if any(_alike(effect, half, self.search) for half in halves):
                 continue
             evidence = _evidence(self.search, effect)
-            on_all = fit(self.search.rig, first.effects, self.search.data, iterations=0)
-            beside = decide_with_random(self.search, on_all, evidence)
-            if beside is not None:
-                return beside
+            if evidence.rig is not self.search.rig:
+                on_all = fit(self.search.rig, first.effects, self.search.data, iterations=0)
+                beside = decide_with_random(self.search, on_all, evidence)
+                if beside is not None:
+                    return beside
             if self.beside(effect, evidence):
                 break
             if not self.missed and self._near() and (self._by_exchange() or self._from_elsewhere()):
@@ -163,7 +165,9 @@ def _firsts(search: Search, *rankings: Sequence[Fit]) -> list[Fit]:
 
 
 def _evidence(search: Search, effect: Effect) -> Evidence:
-    return Evidence.of(apply_all(search.rig, (effect,)), search.data, 20)
+    """Of the rig with the effect; without it where the motion of whole records would run away with it alone."""
+    astray = cost_of(search.rig, (effect,), search.data) > ASTRAY * search.nominal.mean()
+    return Evidence.of(search.rig if astray else apply_all(search.rig, (effect,)), search.data, 20)
 
 
 def _alike(one: Effect, other: Effect, search: Search) -> bool:

@@ -148,6 +148,7 @@ class FitData:
         rows, start = [], 0
         for record in self.counted:
             size = record.outputs.size
-            rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
+            with np.errstate(over="ignore"):  # of a motion that runs away
+                rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
             start += size
         return np.array(rows)
