@@ -57,20 +57,25 @@ class Weighed:
             moved = finite_residual(search.rig, (*given, start, *search.held), data)
             return None if moved is None else (moved - before)[thin]
 
-        weighed = []
         _ = evidence.at_peaks
         tasks = _starts(search, given, evidence)
         starts = [start for task in tasks for start in task]
         bounds = [_bounds(task) for task in tasks for _ in task]
-        for start, (least, most), m in zip(starts, bounds, search.pool.map(move, starts), strict=True):
+        left = before[thin]
+        telling: list[int] = []
+        moves = np.empty((len(starts), left.size))  # the one large array: rows that tell nothing are closed up in place
+        for i, m in enumerate(search.pool.map(move, starts)):
             if m is not None and 0 < m @ m < RUNAWAY * m.size:
-                weighed.append((start, m, least, most))
-        moves, left = np.array([w[1] for w in weighed]), before[thin]
-        if given and weighed:
+                moves[len(telling)] = m
+                telling.append(i)
+        moves = moves[: len(telling)]
+        if given and telling:
             basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[thin])
-            moves, left = moves - (moves @ basis) @ basis.T, left - basis @ (basis.T @ left)
-        bounded = np.array([w[2:] for w in weighed]).reshape(-1, 2).T
-        return cls(tuple(w[0] for w in weighed), moves, left, bounded[0], bounded[1], search.rig.modes.length)
+            left = left - basis @ (basis.T @ left)
+            for row in moves:
+                row -= basis @ (basis.T @ row)
+        least, most = np.array([bounds[i] for i in telling]).reshape(-1, 2).T
+        return cls(tuple(starts[i] for i in telling), moves, left, least, most, search.rig.modes.length)
 
     def likeliest(self) -> list[Effect]:
         """The best start of every kind and target, and the best elsewhere, in the order of what they can come to."""

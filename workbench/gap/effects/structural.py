@@ -133,8 +133,8 @@ def _point_starts(name: str, series: str, typical):
             for share in (0.4, 1.0, 2.0):
                 if k > 0:
                     yield {"at": place.at, name: share * k}
-        for x in evidence.places[::6]:
-            for share in (0.03, 0.3):
+        for x in evidence.places[::2]:
+            for share in (0.02, 0.1, 0.4):
                 yield {"at": float(x), name: share * size}
 
     return starts
