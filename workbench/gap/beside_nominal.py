@@ -13,7 +13,7 @@ from workbench.gap.finish import ranked, simplest
 from workbench.gap.fit import Fit, fit
 from workbench.gap.outcome import Decision, unexplained
 from workbench.gap.pairs import Pairs
-from workbench.gap.pursuit import FINE, distinct_valleys, one_more, pairs_at_once
+from workbench.gap.pursuit import distinct_valleys, one_more, pairs_at_once, whole
 from workbench.gap.search import Search, spread_over_kinds
 from workbench.gap.weighing import Weighed
 from workbench.rig.rig import Rig
@@ -100,6 +100,4 @@ def _freed(search: Search, effects: tuple[Effect, ...]) -> Fit:
     """The set with all its numbers fitted, the figures among them; given up where that promises nothing."""
     ahead = fit(search.rig, effects, search.ahead, iterations=4)
     trial = fit(search.rig, ahead.effects, search.data, iterations=8 if ahead.cost < WITHIN_REACH else 0)
-    return (
-        fit(search.rig, trial.effects, search.data.stepped(FINE), iterations=6) if search.near(trial, NEAR) else trial
-    )
+    return whole(search, trial.effects, 6) if search.near(trial, NEAR) else trial

@@ -134,13 +134,18 @@ def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, f
     The likelihood of tens of thousands of values is over-confident of small misfits, so its logarithm counts half.
     """
     n = search.data.n_values
-    distinct: dict[tuple, Fit] = {}
-    for candidate in sorted(fits, key=lambda f: f.cost):
-        distinct.setdefault(candidate.key, candidate)
-    fits = list(distinct.values())
+    fits = best_of_each(sorted(fits, key=lambda f: f.cost))
     score = np.array([n * f.cost + f.n_parameters * np.log(n) for f in fits])
     order = np.argsort(score)
     weights = np.exp(-0.25 * (score[order] - score[order[0]]))
     weights /= weights.sum()
     rivals = tuple((fits[i], float(w)) for i, w in zip(order[1:], weights[1:], strict=True))
     return fits[order[0]], rivals[:6]
+
+
+def best_of_each(fits: Sequence[Fit]) -> list[Fit]:
+    """The first fit of every set, in the order of the fits."""
+    distinct: dict[tuple, Fit] = {}
+    for candidate in fits:
+        distinct.setdefault(candidate.key, candidate)
+    return list(distinct.values())

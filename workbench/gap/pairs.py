@@ -9,13 +9,14 @@ import numpy as np
 from workbench.gap.beside_random import NEAR, decide_with_random
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
-from workbench.gap.finish import finished, plainest, ranked, relocated, simplest, simplified
+from workbench.gap.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.outcome import Decision, unexplained
 from workbench.gap.pursuit import on_whole_records, one_more, pairs_at_once
-from workbench.gap.search import FAR, Search, apart, in_one_valley, spread_over_kinds
+from workbench.gap.search import Search, apart, in_one_valley, spread_over_kinds
 from workbench.gap.weighing import Weighed
 
+FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
 FIRSTS = 4  # single effects that a second one is looked for beside
 FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
 HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
@@ -107,13 +108,13 @@ class Pairs:
         Args:
             start: what is there with no effect.
         """
-        best_of_each = _distinct(self.found or [start])[:TOLD]
-        explaining = [f for f in best_of_each if self.search.explains(f)]
+        likeliest = best_of_each(self.found or [start])[:TOLD]
+        explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
             plain = plainest(self.search, explaining)
             best, rivals = ranked(self.search, self.search.side_by_side(simplest, plain))
             return Decision("explained", best, rivals=rivals)
-        best, rivals = ranked(self.search, best_of_each)
+        best, rivals = ranked(self.search, likeliest)
         return unexplained(start, best, rivals)
 
     def _near(self) -> bool:
@@ -140,7 +141,9 @@ class Pairs:
     def _from_elsewhere(self) -> bool:
         """Whether one of the best pairs explains the records with other places, or leads to one that does."""
         search = self.search
-        fresh = [f for f in _distinct(self.found)[:TRIED_FURTHER] if search.near(f, NEAR) and not _done(f, self.moved)]
+        fresh = [
+            f for f in best_of_each(self.found)[:TRIED_FURTHER] if search.near(f, NEAR) and not _done(f, self.moved)
+        ]
         fresh = [f for f in fresh if not (search.near(f, VERY_NEAR) and _done(f, self.ended))]
         elsewhere = search.side_by_side(relocated, fresh)
         self.moved += [*fresh, *elsewhere]
@@ -197,11 +200,3 @@ def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     if any(search.explains(pair) for pair in simpler):
         return [*simpler, *(pair for pair in ended if pair not in near)]
     return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
-
-
-def _distinct(pairs: Sequence[Fit]) -> list[Fit]:
-    """The best of every set, in the order of the pairs."""
-    distinct: dict[tuple, Fit] = {}
-    for candidate in pairs:
-        distinct.setdefault(candidate.key, candidate)
-    return list(distinct.values())

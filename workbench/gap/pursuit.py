@@ -90,7 +90,7 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int) -> list[Fi
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 
 
-def followed(search: Search, effects: tuple[Effect, ...], iterations: int = 25) -> Fit:
+def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to predictions one sample ahead, which go smoothly with its numbers, then to whole records.
 
     Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way.

@@ -21,7 +21,6 @@ WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect mode
 ELSEWHERE = 0.1  # of the length: nearer, two places are in one valley of the cost at first
 SAME_PLACE = 0.02  # of the length: nearer, fits go on to the same end
 COARSE = 2.0  # times the noise: below, rounding errors are all but white and of no signal
-FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +102,8 @@ class Search:
 
     def beside(self, figures: Effect) -> "Search":
         """The same search beside believed figures, which give way to every candidate to first order."""
-
-        def giving_way(data: FitData) -> FitData:
-            return data.giving_way(sensitivity(self.rig, (figures,), data))
-
-        data, quick, first = self.pool.map(giving_way, (self.data, self.quick, self.first))
-        return replace(self, data=data, quick=quick, first=first, held=(figures,))
+        data = self.data.giving_way(sensitivity(self.rig, (figures,), self.data))
+        return replace(self, data=data, held=(figures,))
 
     @cached_property
     def ahead(self) -> FitData:
