@@ -56,6 +56,17 @@ def test_hard_pairs_are_named_and_placed(seed, kinds):
     assert told == {e["kind"]: pytest.approx(e["at"], abs=0.005 * case.rig.modes.length) for e in label["effects"]}
 
 
+@pytest.mark.parametrize(("kind", "exponent"), [("quadratic_spring", 2.0), ("cubic_damper", 3.0)])
+def test_a_law_beyond_the_catalogue_is_unknown_and_shown(kind, exponent):
+    case, _ = make_trial(401, kinds=(kind,))
+    verdict = verdict_on(case)
+    (shown,) = verdict.to_json()["nearest"]
+    assert verdict.outcome == "unknown" and verdict.to_json()["effects"][0]["kind"] == "unknown"
+    assert shown["parameters"]["exponent"] == pytest.approx(exponent, abs=0.05)
+    assert "another power" in verdict.sentence and verdict.shrinkage.overall > 0.95
+    assert shown["at"] == pytest.approx(verdict.where.at, abs=0.05 * case.rig.modes.length)
+
+
 def test_nothing_hidden_nothing_told():
     case, _ = make_trial(12)
     verdict = verdict_on(case)

@@ -12,11 +12,14 @@ from workbench.rig.elements import (
     Clearance,
     CoulombFriction,
     CubicSpring,
+    EvenSpring,
     LinearDamper,
     LinearSpring,
     MidplaneStretching,
     OneSidedStop,
     PeriodicForce,
+    PowerDamper,
+    PowerSpring,
     UserLaw,
 )
 from workbench.rig.rig import Rig
@@ -110,6 +113,9 @@ def test_both_lag_and_delay_in_one_actuator():
     ("element", "force", "size"),
     [
         (CubicSpring(4.0, 0.3), lambda w, v: -0.3 * w**3, 0.3),
+        (PowerSpring(4.0, 0.02, 0.2, 1.5), lambda w, v: -0.02 * np.sign(w) * abs(w / 0.2) ** 1.5, 0.3),
+        (EvenSpring(4.0, 0.01, 0.2, 2.0), lambda w, v: -0.01 * abs(w / 0.2) ** 2.0, 0.3),
+        (PowerDamper(4.0, 0.1, 0.5, 2.4), lambda w, v: -0.1 * np.sign(v) * abs(v / 0.5) ** 2.4, 0.3),
         (Clearance(4.0, 0.2, 0.03), lambda w, v: -0.2 * np.sign(w) * max(abs(w) - 0.03, 0.0), 0.3),
         (OneSidedStop(4.0, 0.2, 0.03), lambda w, v: -0.2 * max(w - 0.03, 0.0), 0.3),
         (CoulombFriction(4.0, 0.1, 0.05), lambda w, v: -0.1 * np.tanh(v / 0.05), 0.3),

@@ -6,7 +6,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.gap.effects.effect import apply_all
 from workbench.gap.effects.structural import known_places, place_name
+from workbench.gap.evidence import Evidence
 from workbench.gap.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -98,9 +100,12 @@ def _plot_places(ax, verdict: Verdict) -> None:
 
 
 def plot_missing_force(verdict: Verdict) -> Figure:
-    """The missing force at its likeliest place against displacement and velocity."""
+    """The force that is missing at its place, beside other effects and freed figures, over displacement and velocity."""
     evidence = verdict.attribution.evidence
     chosen = [e for e in verdict.effects if "at" in e.values and e.kind.path == "structure"]
+    beside = [e for e in verdict.effects if chosen and e is not chosen[0]]
+    if beside:
+        evidence = Evidence.of(apply_all(verdict.nominal, beside), verdict.attribution.data)
     place = evidence.place(chosen[0].values["at"] if chosen else verdict.where.at)
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
     step = max(1, place.force.size // 4000)
@@ -125,15 +130,22 @@ def _law(chosen, series: np.ndarray, name: str):
         return None
     effect, v = chosen[0], chosen[0].values
     grid = np.linspace(series.min(), series.max(), 400)
+
+    def power(w: np.ndarray) -> np.ndarray:
+        return -v["force_at_rms"] * np.abs(w / v["rms"]) ** v["exponent"]
+
     of_displacement = {
         "ground_spring": lambda w: -v["stiffness"] * w,
         "cubic_spring": lambda w: -v["stiffness"] * w**3,
         "clearance": lambda w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0),
         "one_sided_stop": lambda w: -v["stiffness"] * np.maximum(w - v["gap"], 0.0),
+        "power_spring": lambda w: np.sign(w) * power(w),
+        "even_spring": power,
     }
     of_velocity = {
         "point_damper": lambda u: -v["coefficient"] * u,
         "coulomb_friction": lambda u: -v["force"] * np.tanh(u / v["smoothing_speed"]),
+        "power_damper": lambda u: np.sign(u) * power(u),
     }
     laws = of_velocity if name.startswith("velocity") else of_displacement
     return (grid, laws[effect.kind.name](grid)) if effect.kind.name in laws else None

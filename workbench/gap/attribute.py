@@ -15,6 +15,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.one_law import one_law, weighed_against
 from workbench.gap.outcome import Decision
 from workbench.gap.pairs import Pairs
 from workbench.gap.prediction import FitData
@@ -34,7 +35,8 @@ class Attribution:
 
     Attributes:
         outcome: "none", "explained", "part" or "unknown".
-        best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one.
+        best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one, which may be
+            a law beyond the catalogue.
         random: statistics of a random disturbance, where the set holds one.
         rivals: other sets, best first, with their probabilities against the best.
         nominal_cost: mean square of the nominal residual in noise units.
@@ -126,7 +128,8 @@ def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attributi
             ahead = one_more(search, (), evidence, weighed)
             report("one effect, on whole records", 0.3)
             singles = on_whole_records(search, ahead, FINALISTS)
-            found = decide(search, start, singles) or _with_a_second(search, start, singles, ahead, weighed)
+            found = decide(search, start, singles)
+            found = found or _with_a_second(search, start, singles, ahead, weighed, evidence)
             singles = _of_every_kind(search, singles, ahead)
     outcome, best, random, rivals = found
     if seen:
@@ -153,10 +156,16 @@ def _of_every_kind(search: Search, singles: Sequence[Fit], ahead: Sequence[Fit])
     return sorted((*singles, *more), key=lambda f: f.cost)
 
 
-def _with_a_second(search: Search, start: Fit, singles: list[Fit], ahead: list[Fit], weighed: Weighed) -> Decision:
-    """What a second effect explains, or figures of the model that are a little off."""
+def _with_a_second(
+    search: Search, start: Fit, singles: list[Fit], ahead: list[Fit], weighed: Weighed, evidence: Evidence
+) -> Decision:
+    """What a second effect explains, or one law that the catalogue does not hold, or figures that are a little off."""
+    law = one_law(search, evidence)
     pairs = Pairs(search)
-    if pairs.at_once(weighed):
+    explained = pairs.at_once(weighed)
+    if law is not None:
+        return weighed_against(law, search, pairs.decision(start))
+    if explained:
         return pairs.decision(start)
     return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, singles, ahead)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from workbench.gap.attribute import Attribution
 from workbench.gap.check import Readiness
+from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.effect import ALL, Effect
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
@@ -94,10 +95,11 @@ class Verdict:
             near = [label for label, probability in self.alternatives if probability > 0.01]
             text += f"; {' and '.join(near)} cannot be excluded." if near else "."
         else:
-            text = (
-                f"No effect of the catalogue, alone or with another, explains the gap; the nearest, {words},"
-                f" would close {closed or 'part of '}it."
-            )
+            text = "No effect of the catalogue, alone or with another, explains the gap; "
+            if any(effect.kind in BEYOND for effect in self.effects):
+                text += f"{words} explains {closed}it."
+            else:
+                text += f"the nearest, {words}, would close {closed or 'part of '}it."
         return text[0].upper() + text[1:]
 
     def to_json(self) -> dict:
@@ -184,8 +186,8 @@ def _described(effect: Effect, nominal: Rig) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
     units = {p.name: p.unit for p in effect.parameters(nominal)}
     numbers = [
-        " ".join((name.replace("_", " "), _with_deviation(value, effect.deviations.get(name, 0.0)), units[name]))
-        for name, value in effect.values.items()
+        " ".join((name.replace("_", " "), _with_deviation(effect.values[name], effect.deviations.get(name, 0.0)), unit))
+        for name, unit in units.items()
         if name != "at"
     ]
     text = effect.kind.words

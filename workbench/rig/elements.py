@@ -31,6 +31,36 @@ class CubicSpring:
 
 
 @dataclass(frozen=True)
+class PowerSpring:
+    """-F |w / w_r|^p in the direction of w, at x: F (N), negative to soften, at the displacement w_r (m); p at least 1."""
+
+    at: float
+    force: float
+    reference: float
+    exponent: float
+
+
+@dataclass(frozen=True)
+class EvenSpring:
+    """-F |w / w_r|^p to one side, whichever way w points, at x: F (N) at the displacement w_r (m), p at least 1."""
+
+    at: float
+    force: float
+    reference: float
+    exponent: float
+
+
+@dataclass(frozen=True)
+class PowerDamper:
+    """-F |v / v_r|^p in the direction of v, at x: F (N) at the velocity v_r (m/s), p at least 1."""
+
+    at: float
+    force: float
+    reference: float
+    exponent: float
+
+
+@dataclass(frozen=True)
 class Clearance:
     """Springs k (N/m) that touch at w > gap and at w < -gap (m)."""
 
@@ -114,6 +144,16 @@ class RandomForce:
 
 
 PointElement = (
-    LinearSpring | LinearDamper | CubicSpring | Clearance | OneSidedStop | CoulombFriction | BoucWen | UserLaw
+    LinearSpring
+    | LinearDamper
+    | CubicSpring
+    | PowerSpring
+    | EvenSpring
+    | PowerDamper
+    | Clearance
+    | OneSidedStop
+    | CoulombFriction
+    | BoucWen
+    | UserLaw
 )
 Element = PointElement | AirDrag | MidplaneStretching | PeriodicForce | RandomForce

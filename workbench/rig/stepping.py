@@ -11,7 +11,8 @@ from types import FunctionType
 import numpy as np
 from numba import njit
 
-LINEAR_SPRING, LINEAR_DAMPER, CUBIC, CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(8)
+LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = range(6)
+CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
 SETTLED = 1e-10  # of a force: what is left between it and its law
 FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
 
@@ -74,6 +75,14 @@ def yield_update(z, dw, limit):
 
 
 @njit(cache=True, nogil=True)
+def _power(w, p):
+    """-F |w / w_r|^e against w, with (F, w_r, e) = p, and its slope."""
+    level = abs(w) / p[1]
+    less = p[0] * level ** (p[2] - 1.0) / p[1]
+    return -less * w, -p[2] * less
+
+
+@njit(cache=True, nogil=True)
 def element_force(kind, parameters, i, w, v, z, w_old):
     """The force of element i, and its derivatives with respect to w and v."""
     a, b = parameters[i, 0], parameters[i, 1]
@@ -98,6 +107,15 @@ def element_force(kind, parameters, i, w, v, z, w_old):
         pulled, slope = yield_update(z, w - w_old, b)
         return -a * pulled, -a * slope, 0.0
     p = parameters[i]
+    if kind == POWER_SPRING:
+        force, slope = _power(w, p)
+        return force, slope, 0.0
+    if kind == EVEN_SPRING:
+        force, slope = _power(w, p)
+        return (force, slope, 0.0) if w > 0 else (-force, -slope, 0.0)
+    if kind == POWER_DAMPER:
+        force, slope = _power(v, p)
+        return force, 0.0, slope
     force = user_law(w, v, p)
     dw, dv = 1e-6 * abs(w) + 1e-12, 1e-6 * abs(v) + 1e-12
     return force, (user_law(w + dw, v, p) - force) / dw, (user_law(w, v + dv, p) - force) / dv

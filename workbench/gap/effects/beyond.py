@@ -1,0 +1,45 @@
+"""Laws at a point that the catalogue does not hold: springs and dampers of any power."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from workbench.gap.effects.effect import Kind, Parameter
+from workbench.gap.effects.nonlinear import with_element
+from workbench.gap.effects.structural import place_parameter
+from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
+
+EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # to start from
+
+
+def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
+    def starts(evidence, _) -> Iterator[dict[str, float]]:
+        for place in evidence.at_peaks:
+            path = getattr(place, motion)
+            rms = float(np.sqrt(np.mean(path**2)))
+            for exponent in EXPONENTS:
+                basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
+                force = float(-(place.force @ basis) / max(basis @ basis, 1e-300))
+                yield {"at": place.at, "force_at_rms": force, "exponent": exponent, "rms": rms}
+
+    return Kind(
+        name=name,
+        path="structure",
+        parameters=lambda rig, _: (
+            place_parameter(rig),
+            Parameter("force_at_rms", "N", -1e15, 1e15),
+            Parameter("exponent", "", 1.0, 9.0),
+        ),
+        apply=lambda rig, _, v: with_element(rig, element(v["at"], v["force_at_rms"], v["rms"], v["exponent"])),
+        starts=starts,
+        nonlinear=True,
+        phrase=words,
+    )
+
+
+POWER_SPRING = _power_law(PowerSpring, "power_spring", "displacement", "a spring of another power of the displacement")
+EVEN_SPRING = _power_law(
+    EvenSpring, "even_spring", "displacement", "a spring to one side, of a power of the displacement", even=True
+)
+POWER_DAMPER = _power_law(PowerDamper, "power_damper", "velocity", "a damper of another power of the velocity")
+BEYOND = (POWER_SPRING, EVEN_SPRING, POWER_DAMPER)

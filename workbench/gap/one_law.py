@@ -1,0 +1,31 @@
+"""Whether one force at a point, of a law that the catalogue does not hold, explains the records as effects do."""
+
+from dataclasses import replace
+
+from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.evidence import Evidence
+from workbench.gap.finish import ranked
+from workbench.gap.fit import Fit
+from workbench.gap.outcome import Decision
+from workbench.gap.pursuit import on_whole_records, one_more
+from workbench.gap.search import Search
+
+TRIED = 2
+
+
+def one_law(search: Search, evidence: Evidence) -> Fit | None:
+    """The force that explains the records alone, or None.
+
+    Two effects side by side bend to many a law between them, so it is sought before any two are believed.
+    """
+    search.report("one force of another law", 0.35)
+    beyond = replace(search, catalogue=BEYOND)
+    fits = on_whole_records(beyond, one_more(beyond, (), evidence), TRIED)
+    return next((f for f in fits if search.explains(f)), None)
+
+
+def weighed_against(law: Fit, search: Search, decision: Decision) -> Decision:
+    """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
+    told = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
+    best, rivals = ranked(search, [law, *told])
+    return Decision("unknown" if best is law else "explained", best, rivals=rivals)
