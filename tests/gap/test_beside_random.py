@@ -10,9 +10,11 @@ from workbench.gap.beside_random import looks_random
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.evidence import Evidence
+from workbench.gap.following import Follower
 from workbench.gap.prediction import FitData
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import CoulombFriction
+from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
+from workbench.rig.simulate import simulate
 
 LEVELS = (0.1, 0.4, 1.6)
 
@@ -50,6 +52,20 @@ def test_only_what_keeps_its_level_looks_random(rig, records):
     assert not looks_random(evidence(told, records(gripped, 0.0)))
     stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.05})
     assert not looks_random(evidence(told, records(stiffer, 0.0)))
+
+
+@pytest.mark.parametrize("law", [OneSidedStop(0.9, 80.0, 0.002), AirDrag(10.0), CoulombFriction(0.9, 0.05, 0.02)])
+def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig, records, law):
+    told, real = (replace(r, elements=(law,)) for r in (replace(rig, actuators=rig.actuators[:1]), rig))
+    noise = np.array([s.noise_std for s in rig.sensors])
+    (weak, *_), (plain, *_) = records(real, 0.05), records(rig, 0.05)
+    quiet = simulate(replace(rig, actuators=rig.actuators[:1]), plain.inputs, sample_time=0.01).outputs
+    truth = plain.outputs - quiet  # the same wind on the structure without the law
+    follower = Follower.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
+    left = follower.left(told, weak, 8)
+    whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
+    error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]
+    assert error[0] < 0.02 < 0.1 < error[1]
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ def _plot_places(ax, verdict: Verdict) -> None:
 
 
 def plot_missing_force(verdict: Verdict) -> Figure:
-    """The force that is missing at its place, beside other effects and freed figures, over displacement and velocity."""
+    """The force missing at its place beside other effects and freed figures, over displacement and velocity."""
     evidence = verdict.attribution.evidence
     chosen = [e for e in verdict.effects if "at" in e.values and e.kind.path == "structure"]
     beside = [e for e in verdict.effects if chosen and e is not chosen[0]]

@@ -11,10 +11,12 @@ from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.following import Follower
 from workbench.gap.outcome import Decision
 from workbench.gap.pursuit import on_whole_records, one_more
 from workbench.gap.search import Search, spread_over_kinds
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped
 
 NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
 FINALISTS = 4  # effects beside it that are fitted to whole records
@@ -48,7 +50,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     alone = with_random(search, _nothing(search), evidence)
     if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
         return None, []
-    beside = search.through(model_filter(evidence.model, search.rig, alone[1]))
+    beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _follower(search, search.rig, alone[1]))
     cost = cost_of(search.rig, (), beside.data)
     search.report("beside a random disturbance", 0.2)
     singles = spread_over_kinds(on_whole_records(beside, one_more(beside, (), evidence), FINALISTS), 1)
@@ -67,6 +69,7 @@ def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decisi
         evidence: of the rig with the given effects.
     """
     search, evidence = _heard(search, given.effects, evidence)
+    evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, evidence.rig))
     if not looks_random(evidence):
         return None
     return _likeliest(search, [with_random(search, given, evidence), with_random(search, _nothing(search))])
@@ -107,21 +110,38 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
     Args:
         evidence: of the rig with the given effects, where it is at hand.
     """
-    rig = apply_all(search.rig, given.effects)
-    evidence = evidence or Evidence.of(rig, search.data, 20)
-    found = _random_beside(search, given, rig, evidence)
+    if evidence is None:
+        rig = apply_all(search.rig, given.effects)
+        evidence = Evidence.of(rig, search.data, 20)
+        evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, rig))
+    found = _random_beside(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], NEAR):
-        data = search.data.through(model_filter(evidence.model, rig, found[1]))
+        follower = _follower(search, evidence.rig, found[1])
+        data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), follower)
         refitted = fit(search.rig, given.effects, data, iterations=8)
-        left = search.data.by_channel(search.data.residual(apply_all(search.rig, refitted.effects)))
-        again = replace(refitted, cost_by_channel=left)
-        rig = apply_all(search.rig, again.effects)
-        found = _random_beside(search, again, rig, Evidence.of(rig, search.data, 20))
+        rig = apply_all(search.rig, refitted.effects)
+        again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
+        evidence = _by_laws_on_measured_motion(search, Evidence.of(rig, search.data, 20), follower)
+        found = _random_beside(search, again, evidence)
     return found
 
 
-def _random_beside(search: Search, given: Fit, rig: Rig, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
-    found = fit_random_force(rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.data.force_rms)
+def _follower(search: Search, rig: Rig, found: RandomForceFit | None = None) -> Follower:
+    """What holds a rig beside the records, a random force and all."""
+    data = search.data
+    force, at = (0.0, 0.0) if found is None else (found.rms, found.at)
+    return Follower.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
+
+
+def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Follower) -> Evidence:
+    """The evidence as it is where laws have not made much else of a force that the rig lacks."""
+    if not is_stepped(evidence.rig):
+        return evidence
+    return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, follower)))
+
+
+def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
+    found = fit_random_force(evidence.rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.data.force_rms)
     rms, rms_std = found.seen_rms
     effect = Effect(RANDOM_DISTURBANCE, None, {"at": found.at, "rms": rms}, {"at": found.at_std, "rms": rms_std})
     combined = Fit(

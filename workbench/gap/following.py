@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
 from workbench.gap.effects.structural import known_places
 from workbench.gap.missing_force import force_filter, sampled_model
@@ -27,13 +28,16 @@ class Follower:
     whitening: np.ndarray
 
     @classmethod
-    def of(cls, rig: Rig, noise: np.ndarray, force: float, sample_time: float) -> "Follower":
-        """For sensors of that noise (n_outputs,), and inputs of that rms, N."""
+    def of(
+        cls, rig: Rig, noise: np.ndarray, force: float, sample_time: float, *, at: float = 0.0, rms: float = 0.0
+    ) -> "Follower":
+        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, m, N."""
         modes, n = rig.modes, rig.modes.n_modes
         places = known_places(rig)
         along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
         forces = LOOSE * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
-        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), np.eye(n), forces**2, 0.0)
+        patterns, variances = np.column_stack([np.eye(n), modes.phi(at)[0]]), np.r_[forces**2, rms**2]
+        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), patterns, variances, 0.0)
         gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
         return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
 
@@ -42,13 +46,29 @@ class Follower:
 
         What sensors lose by lag or clipping is not followed: it is made up for as the whole record has it.
         """
+        return self.whitening @ self._followed(rig, record, substeps)
+
+    def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """What a rig leaves of a whole record (n_outputs, n_samples) whose laws act on the motion that was measured.
+
+        The laws then make no more of what else is missing than they really did: what is left is the structure's linear
+        answer to it. That of a rig without laws is measured less predicted.
+        """
+        errors = self._followed(rig, record, substeps)
+        model = sampled_model(rig.modes, rig.sensors, np.ones(len(rig.sensors)), record.sample_time)
+        gain = self._gain_for(rig.modes.n_modes).reshape(-1, errors.shape[0])
+        a, h = np.ascontiguousarray(model.transition), np.ascontiguousarray(model.output)
+        return _carried_on(a, h, a @ gain, errors)
+
+    def _followed(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """Errors one sample ahead, in the sensors' units."""
         slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
         quick = _at_once(slow)
         if quick.sensors != slow.sensors:
             motion = move(rig, record.inputs, sample_time=dt, substeps=substeps)
             measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
         gain = self._gain_for(rig.modes.n_modes)
-        return self.whitening @ follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps)
+        return follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps)
 
     def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
         """What the errors of a linear rig over a whole record leave of themselves when every sample sets it right.
@@ -72,6 +92,17 @@ class Follower:
         known = min(n_modes, self.gain.shape[1])
         gain[:, :known] = self.gain[:, :known]
         return gain
+
+
+@njit(cache=True, nogil=True)
+def _carried_on(a: np.ndarray, h: np.ndarray, gain: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """The errors with what every correction goes on to be: y_k = h x_k + e_k, x_{k+1} = a x_k + gain e_k."""
+    x, out = np.zeros(a.shape[0]), np.empty_like(errors)
+    for k in range(errors.shape[1]):
+        e = np.ascontiguousarray(errors[:, k])
+        out[:, k] = h @ x + e
+        x = a @ x + gain @ e
+    return out
 
 
 def _unrounded(rig: Rig) -> Rig:

@@ -27,7 +27,7 @@ class FitData:
         lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
             rest that the simulation assumes to the motion it really had.
         whitener: filter of a random force on the structure, through which every residual is seen; None where there is
-            none.
+            none. With a follower, laws then act on the motion that was measured: that of the rig has no such force.
         given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
             believed figures that are fitted along with every candidate to first order; None where none are.
         follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
@@ -62,9 +62,9 @@ class FitData:
         """The same yardstick with other substeps."""
         return replace(self, substeps=substeps)
 
-    def through(self, whitener: ForceFilter) -> "FitData":
+    def through(self, whitener: ForceFilter, follower: Follower) -> "FitData":
         """The same yardstick beside a random force."""
-        return replace(self, whitener=whitener)
+        return replace(self, whitener=whitener, follower=follower)
 
     def giving_way(self, sensitivity: np.ndarray) -> "FitData":
         """The same yardstick with residuals as small as believed figures make them, to first order.
@@ -131,17 +131,25 @@ class FitData:
 
     def _left(self, rig: Rig) -> np.ndarray:
         follower = self.follower
-        if follower is not None and is_stepped(rig):
+        if self.whitener is not None:
+            return np.concatenate([whiten(self.whitener, r).ravel() for r in self.left_beside(rig, follower)])
+        if follower is None:
+            return np.concatenate([(r / self.noise[:, None]).ravel() for r in self._whole(rig)])
+        if is_stepped(rig):
             ahead = [follower.errors(rig, record, self.substeps)[:, self.lead :] for record in self.records]
             return np.concatenate([errors.ravel() for errors in ahead])
+        dt = self.records[0].sample_time
+        return np.concatenate([follower.errors_of_linear(rig, r, dt, self.substeps).ravel() for r in self._whole(rig)])
+
+    def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
+        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
+        if follower is None or not is_stepped(rig) or rig.stiffness_rate:
+            return self._whole(rig)
+        return [follower.left(rig, record, self.substeps)[:, self.lead :] for record in self.records]
+
+    def _whole(self, rig: Rig) -> list[np.ndarray]:
         both = zip(self.counted, self.predictions(rig), strict=True)
-        left = [record.outputs - prediction for record, prediction in both]
-        if follower is not None:
-            dt = self.records[0].sample_time
-            return np.concatenate([follower.errors_of_linear(rig, r, dt, self.substeps).ravel() for r in left])
-        if self.whitener is None:
-            return np.concatenate([(r / self.noise[:, None]).ravel() for r in left])
-        return np.concatenate([whiten(self.whitener, r).ravel() for r in left])
+        return [record.outputs - prediction for record, prediction in both]
 
     def by_channel(self, residual: np.ndarray) -> np.ndarray:
         """Mean square of a residual by record and channel: (n_records, n_outputs)."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.fit import HOPELESS, Fit, sensitivity
+from workbench.gap.following import Follower
 from workbench.gap.missing_force import ForceFilter
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
@@ -84,10 +85,10 @@ class Search:
         """Whether at most this share of the gap's power is left."""
         return candidate.cost - 1.0 < share * (self.nominal.mean() - 1.0)
 
-    def through(self, whitener: ForceFilter) -> "Search":
+    def through(self, whitener: ForceFilter, follower: Follower) -> "Search":
         """The same search beside a random force."""
-        quick, first = self.quick.through(whitener), self.first.through(whitener)
-        return replace(self, data=self.data.through(whitener), quick=quick, first=first)
+        data, quick, first = (data.through(whitener, follower) for data in (self.data, self.quick, self.first))
+        return replace(self, data=data, quick=quick, first=first)
 
     def hearing(self) -> "Search":
         """The same search without sensors that clip or round coarsely: what they do not show would pass for a force."""

@@ -32,7 +32,7 @@ class CubicSpring:
 
 @dataclass(frozen=True)
 class PowerSpring:
-    """-F |w / w_r|^p in the direction of w, at x: F (N), negative to soften, at the displacement w_r (m); p at least 1."""
+    """-F |w / w_r|^p in the direction of w, at x: F (N), negative to soften, at the displacement w_r (m); p ≥ 1."""
 
     at: float
     force: float
