@@ -462,8 +462,11 @@ def diagnose(
         f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on level"
     )
     console.print(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if where.path == "structure" and known_places(found.rig) is None and verdict.place_stands:
-        console.print(f"  place      x = {where.at:.4g} ± {where.at_std:.1g} m, were it one force, of any law")
+    if where.path in ("structure", "environment") and known_places(found.rig) is None:
+        if verdict.place_stands:
+            console.print(f"  place      x = {where.at:.4g} ± {where.at_std:.1g} m, of one force of any law")
+        elif where.place.holds is False:
+            console.print("  place      the gap is not that of one force at a point")
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
         console.print(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, floor {floor[name]:.4g}")

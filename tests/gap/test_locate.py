@@ -7,9 +7,10 @@ import pytest
 
 from workbench.gap.evidence import Evidence
 from workbench.gap.locate import locate
+from workbench.gap.place import placed
 from workbench.gap.prediction import FitData
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import CoulombFriction, PeriodicForce
+from workbench.rig.elements import AirDrag, Clearance, CoulombFriction, CubicSpring, LinearDamper, PeriodicForce
 
 DT, SAMPLES, NOISE = 0.01, 2000, 1e-5
 
@@ -28,8 +29,16 @@ def measured(record_of):
     return make
 
 
+def evidence(rig, records):
+    return Evidence.of(rig, FitData(tuple(records), np.full(len(rig.sensors), NOISE)))
+
+
 def where(rig, records, **options):
-    return locate(Evidence.of(rig, FitData(tuple(records), np.full(4, NOISE))), (), **options)
+    return locate(evidence(rig, records), (), **options)
+
+
+def placed_by(rig, records):
+    return placed(evidence(rig, records))
 
 
 def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
@@ -52,7 +61,7 @@ def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig
     found = where(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
     assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
     assert found.at_std < 0.005 * rig.modes.length
-    assert 2 in found.modes and found.point_share > 0.95
+    assert 2 in found.modes and found.place.holds and found.place.share > 0.999
     assert found.path == "structure" and found.linear_share < 0.1
 
 
@@ -64,7 +73,39 @@ def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
     misled, found = where(rig, records), where(rig, records, faulty=[faulty.name])
     assert abs(misled.at - 1.37) > 0.02 * rig.modes.length
     assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
-    assert found.point_share > 0.95 and found.sensor_shares[1] == misled.sensor_shares[1]
+    assert found.place.holds and not misled.place.holds and found.sensor_shares[1] == misled.sensor_shares[1]
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        CoulombFriction(1.37, 0.02, 0.005),
+        CubicSpring(1.37, 300.0),
+        Clearance(1.37, 1.0, 0.01),
+        LinearDamper(1.37, 0.02),
+    ],
+    ids=lambda law: type(law).__name__,
+)
+def test_the_deviation_of_a_place_is_true(rig, measured, law):
+    real = replace(rig, elements=(law,))
+    places = [placed_by(rig, [measured(real, str(s), 0.3, s) for s in (seed, seed + 100)]) for seed in range(10)]
+    z = np.array([(place.at - 1.37) / place.at_std for place in places])
+    assert all(place.holds for place in places)
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 2.0 and np.abs(z).max() < 4.0
+
+
+@pytest.mark.parametrize("elsewhere", [CubicSpring(0.5, 300.0), AirDrag(1.0)], ids=lambda law: type(law).__name__)
+def test_a_gap_that_is_not_of_one_force_is_not_placed(rig, measured, elsewhere):
+    real = replace(rig, elements=(CubicSpring(1.37, 300.0), elsewhere))
+    place = placed_by(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert not place.holds
+
+
+def test_one_sensor_tells_no_place(rig, measured):
+    real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
+    records = [measured(real, str(seed), 0.3, seed).only(("d2",)) for seed in (2, 3)]
+    place = placed_by(replace(rig, sensors=rig.sensors[1:2]), records)
+    assert place.holds is None and place.at_std > 0.2 * rig.modes.length
 
 
 def test_no_gap_has_no_path(rig, measured):

@@ -84,8 +84,13 @@ def plot_where(verdict: Verdict) -> Figure:
 def _plot_places(ax, verdict: Verdict) -> None:
     """How likely each place is for one missing force: a curve along the structure, or bars at named places."""
     place = verdict.where.place
-    profile = place.profile - place.log_likelihood
-    ax.set(title="where a missing force would stand", ylabel="log-likelihood, less its peak")
+    profile = place.profile
+    told = {
+        True: "where one missing force stands",
+        False: "not one force at a point: where one would do best",
+        None: "one sensor tells no place of a force",
+    }
+    ax.set(title=told[place.holds], ylabel="log-likelihood, less its peak")
     if known_places(verdict.nominal) is not None:
         ax.bar([place_name(verdict.nominal, at) for at in place.places], profile, color=COLOURS[3])
         return

@@ -19,7 +19,8 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
-FINALISTS = 4  # effects beside it that are fitted to whole records
+RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
+FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
 SPREAD = 0.5  # of the missing force's level over records: most forces of the rig's own follow the level of the inputs
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
@@ -51,15 +52,30 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
         return None, []
     beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _follower(search, search.rig, alone[1]))
-    cost = cost_of(search.rig, (), beside.data)
     search.report("beside a random disturbance", 0.2)
-    singles = spread_over_kinds(on_whole_records(beside, one_more(beside, (), evidence), FINALISTS), 1)
-    gaining = [f for f in singles[:3] if beside.surely_better(f, cost, f.n_parameters)]
-    gaining = beside.side_by_side(simplest, gaining)
+    gaining = beside.side_by_side(simplest, _gaining(beside, evidence)[:TRIED])
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]
     return _likeliest(search, tried), [found[0] for found in tried]
+
+
+def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
+    """The fits of single effects that the filter of a random force leaves something to explain, best first.
+
+    The missing force stands where the random one does; where the best of them stands, all laws are tried again.
+    """
+    cost = cost_of(beside.rig, (), beside.data)
+
+    def fitted(evidence: Evidence) -> list[Fit]:
+        fits = on_whole_records(beside, one_more(beside, (), evidence), FINALISTS)
+        return [f for f in fits if beside.surely_better(f, cost, f.n_parameters)]
+
+    found = fitted(evidence)
+    places = [f.effects[0].values["at"] for f in found if "at" in f.effects[0].values]
+    if places:
+        found = sorted((*found, *fitted(replace(evidence, told=(places[0],)))), key=lambda f: f.cost)
+    return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RIVAL]
 
 
 def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decision | None:

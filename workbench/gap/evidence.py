@@ -52,6 +52,8 @@ class Evidence:
         data: fit records with their noise.
         motions: its motion, one a record.
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
+        n_places: where a force is looked for.
+        told: places of the force, m, where they are known from elsewhere.
     """
 
     rig: Rig
@@ -59,6 +61,7 @@ class Evidence:
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
     n_places: int = field(default=40)
+    told: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, rig: Rig, data: FitData, n_places: int = 40) -> "Evidence":
@@ -120,6 +123,8 @@ class Evidence:
     @cached_property
     def peaks(self) -> tuple[float, ...]:
         """The likeliest places of a missing force, best first, refined between the grid points."""
+        if self.told:
+            return self.told
         profile, places = self.profile, self.places
         if known_places(self.rig) is not None:
             return tuple(places[np.argsort(-profile)])

@@ -33,8 +33,7 @@ class Where:
         record_gaps: (n_records,) gap as the case format defines it.
         input_levels: (n_records,) root mean square of the inputs.
         linear_share: of the gap's power, what one linear reply to the inputs explains.
-        place: of a missing force at a point, whatever its law: `at` and `at_std`, m.
-        point_share: share of the gap's log-likelihood that one force at that place accounts for.
+        place: of a missing force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
     """
 
     path: str
@@ -50,7 +49,6 @@ class Where:
     input_levels: np.ndarray
     linear_share: float
     place: Placed
-    point_share: float
 
     @property
     def at(self) -> float:
@@ -81,8 +79,6 @@ def locate(evidence: Evidence, effects: Sequence[Effect], *, faulty: Collection[
     between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
     mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
     octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - OCTAVES, 1)]
-    hearing = evidence.without(faulty)
-    place = placed(hearing)
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     return Where(
@@ -98,8 +94,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect], *, faulty: Collection[
         record_gaps=gaps,
         input_levels=levels,
         linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
-        place=place,
-        point_share=_share(hearing, place),
+        place=placed(evidence.without(faulty)),
     )
 
 
@@ -119,16 +114,6 @@ def _shares_between(edges: np.ndarray, evidence: Evidence, scaled: list[np.ndarr
 def _by_eighths(scaled: np.ndarray) -> np.ndarray:
     power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
     return power / max(power.sum(), 1e-300)
-
-
-def _share(evidence: Evidence, place: Placed) -> float:
-    """Share of the gap's log-likelihood that one force at the place accounts for."""
-    data = evidence.data
-    n_samples = sum(record.n_samples for record in data.counted)
-    chi2 = sum(float(np.sum((r / data.noise[:, None]) ** 2)) for r in evidence.residuals)
-    none = -0.5 * (chi2 + n_samples * np.sum(np.log(data.noise**2)))
-    floor = -0.5 * n_samples * (data.noise.size + np.sum(np.log(data.noise**2)))
-    return float(np.clip((place.log_likelihood - none) / max(floor - none, 1e-300), 0.0, 1.0))
 
 
 def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> str:

@@ -3,61 +3,132 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
+from workbench.gap.any_force import Lines, lines_of
 from workbench.gap.effects.structural import known_places
 from workbench.gap.evidence import Evidence
-from workbench.gap.missing_force import log_likelihoods
 
-STEP = 0.05  # of the spacing of places: of differences along the structure
-TOGETHER = 100  # samples whose scores are taken for one: the filter is not quite that of the force
+VALLEYS = 3  # of the misfit that are gone into
+ROUNDS = 3  # in each: where the force is, which lines tell of it
+BESIDE, RESOLVED = 0.95, 1e-3  # of the spacing of places
+TWO_SIGMA = 4.0  # rise of the misfit
+NOISE, ALL_BUT = 0.1, 1e-5  # left by what may be one force: of the noise, and of the gap
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """How likely one force is at each place, and where it is likeliest.
+    """How likely one force, of any law, is at each place, and where it is likeliest.
 
     Attributes:
         places: (n_places,) m.
-        profile: (n_places,) log-likelihood there.
+        profile: (n_places,) log-likelihood there, less that of the likeliest place.
         at: the likeliest place, m.
-        at_std: its standard deviation, m: of a fit whose noise is not what it takes it for (White, Econometrica 50
-            (1982) 1).
-        log_likelihood: there.
+        at_std: half the way between where the misfit is two deviations higher, over two, m; 0 for named places.
+        share: of the gap's power above the noise, what one force there accounts for.
+        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None: one sensor cannot tell.
     """
 
     places: np.ndarray
     profile: np.ndarray
     at: float
     at_std: float
-    log_likelihood: float
+    share: float
+    holds: bool | None
 
 
 def placed(evidence: Evidence) -> Placed:
-    """Where one force, of any law, would make the simulation agree with the test."""
-    at = evidence.peaks[0]
-    height = float(_by_stretch(evidence, at).sum())
-    return Placed(evidence.places, evidence.profile, at, _deviation(evidence, at), height)
+    """Where one force, of any law, would make the simulation agree with the test.
+
+    One sensor tells no place: a force anywhere accounts for all that it reads.
+    """
+    lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
+    named = known_places(evidence.rig) is not None
+    guess, places, length = evidence.peaks[0], evidence.places, evidence.length
+    if len(evidence.rig.sensors) < 2:
+        return Placed(places, np.zeros(places.size), guess, 0.0 if named else length / np.sqrt(12.0), 0.0, None)
+    search = _Search(evidence, lines)
+    telling = search.telling(guess)
+    profile = np.array([search.misfit(telling, x) for x in places])
+    if named:
+        at, std = float(places[int(np.argmin(profile))]), 0.0
+    else:
+        at, telling = min((search.refined(top) for top in _valleys(places, profile)), key=search.judged)
+        profile, std = np.array([search.misfit(telling, x) for x in places]), search.deviation(telling, at)
+    lowest = min(search.misfit(telling, at), profile.min())
+    freedom = max(sum(each.freedom for each in lines), 1)
+    left = search.misfit(lines, at) / freedom - 1.0
+    gap = sum(float(2.0 * np.sum(np.abs(each.left) ** 2)) for each in lines) / freedom - 1.0
+    share = float(np.clip(1.0 - left / gap, 0.0, 1.0)) if gap > 0 else 0.0
+    holds = left < max(NOISE, ALL_BUT * gap)
+    return Placed(places, -0.5 * (profile - lowest), at, std * np.sqrt(max(1.0 + left, 1.0)), share, bool(holds))
 
 
-def _deviation(evidence: Evidence, at: float) -> float:
-    """From the curvature of the log-likelihood and the scatter of its slope from one stretch of time to the next."""
-    if known_places(evidence.rig) is not None:
-        return 0.0
-    spacing = evidence.places[1] - evidence.places[0]
-    step = STEP * spacing
-    left, middle, right = (_by_stretch(evidence, x) for x in (at - step, at, at + step))
-    curvature = -(left - 2.0 * middle + right).sum() / step**2
-    slopes = (right - left) / (2.0 * step)
-    if not curvature > 0:
-        return spacing
-    return float(np.sqrt(np.sum((slopes - slopes.mean()) ** 2)) / curvature)
+def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+    """The places of the deepest valleys."""
+    padded = np.r_[np.inf, misfit, np.inf]
+    bottoms = np.flatnonzero((misfit <= padded[:-2]) & (misfit <= padded[2:]))
+    return places[bottoms[np.argsort(misfit[bottoms])][:VALLEYS]]
 
 
-def _by_stretch(evidence: Evidence, at: float) -> np.ndarray:
-    """Log-likelihood of a force at a place, by stretches of `TOGETHER` samples of every record."""
-    kalman = evidence.filter_at(at, *evidence.size)
-    pieces = []
-    for residual in evidence.residuals:
-        by_sample = log_likelihoods(kalman, residual)
-        pieces.append(np.add.reduceat(by_sample, np.arange(0, by_sample.size, TOGETHER)))
-    return np.concatenate(pieces)
+@dataclass(frozen=True, eq=False)
+class _Search:
+    evidence: Evidence
+    lines: list[Lines]
+
+    def shape(self, x: float) -> np.ndarray:
+        return self.evidence.rig.modes.phi(x)[0]
+
+    def telling(self, x: float) -> list[Lines]:
+        """The lines by how much they tell of a force at x."""
+        shape = self.shape(x)
+        return [each.weighed(each.telling(shape)) for each in self.lines]
+
+    def misfit(self, lines: list[Lines], x: float) -> float:
+        shape = self.shape(x)
+        return sum(each.misfit(shape) for each in lines)
+
+    def refined(self, top: float) -> tuple[float, list[Lines]]:
+        """The bottom of a valley, and the lines by what they tell there."""
+        at, telling = float(top), self.telling(top)
+        spacing = self.evidence.places[1] - self.evidence.places[0]
+        for _ in range(ROUNDS):
+            found = minimize_scalar(
+                lambda x, lines: self.misfit(lines, x),
+                bounds=self._inside(at - BESIDE * spacing, at + BESIDE * spacing),
+                args=(telling,),
+                method="bounded",
+                options={"xatol": RESOLVED * spacing},
+            )
+            moved, at = abs(found.x - at), float(found.x)
+            telling = self.telling(at)
+            if moved < RESOLVED * spacing:
+                break
+        return at, telling
+
+    def judged(self, found: tuple[float, list[Lines]]) -> float:
+        """The misfit of a valley by all lines alike: those that one of them weighs would favour it."""
+        return self.misfit(self.lines, found[0])
+
+    def deviation(self, lines: list[Lines], at: float) -> float:
+        """Half of one standard deviation either way, from where the misfit is two higher."""
+        lowest = self.misfit(lines, at)
+        return sum(self._rises(lines, at, side, lowest + TWO_SIGMA) for side in (-1.0, 1.0)) / 4.0
+
+    def _rises(self, lines: list[Lines], at: float, side: float, level: float) -> float:
+        """How far on one side the misfit comes to a level."""
+        length = self.evidence.length
+        inside, outside = 0.0, 1e-5 * length
+        while outside < length and 0 < at + side * outside < length:
+            if self.misfit(lines, at + side * outside) > level:
+                break
+            inside, outside = outside, 2.0 * outside
+        for _ in range(6):
+            middle = 0.5 * (inside + outside)
+            beyond = not 0 < at + side * middle < length or self.misfit(lines, at + side * middle) > level
+            inside, outside = (inside, middle) if beyond else (middle, outside)
+        return outside
+
+    def _inside(self, low: float, high: float) -> tuple[float, float]:
+        edge = 1e-4 * self.evidence.length
+        return max(low, edge), min(high, self.evidence.length - edge)

@@ -65,7 +65,9 @@ class Verdict:
 
     @property
     def place_stands(self) -> bool:
-        """Whether the place of one force, of any law, is not contradicted by effects that explain the gap."""
+        """Whether one force, of any law, makes the gap, and effects that explain it do not contradict its place."""
+        if not self.where.place.holds:
+            return False
         if self.outcome != "explained":
             return True
         near = max(3.0 * self.where.at_std, BESIDE * self.nominal.modes.length)
@@ -166,7 +168,12 @@ def where_json(where: Where) -> dict:
         "modes": list(where.modes),
         "amplitude_dependent": where.amplitude_dependent,
         "linear_share": _rounded(where.linear_share),
-        "point": {"at": _rounded(where.at), "at_std": _rounded(where.at_std), "share": _rounded(where.point_share)},
+        "point": {
+            "at": _rounded(where.at),
+            "at_std": _rounded(where.at_std),
+            "share": _rounded(where.place.share),
+            "one_force": where.place.holds,
+        },
         "by_mode": [_rounded(s) for s in where.mode_shares],
         "by_band": {
             "edges_hz": [_rounded(f) for f in where.band_edges_hz],

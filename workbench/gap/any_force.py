@@ -1,0 +1,152 @@
+"""One force at a point, of any law: what it leaves of a residual, line by line of the spectrum.
+
+At a line of frequency ω the residual of a record is
+
+    r = h(x) g + T d + noise        h(x) = Φ_s (Ω² - ω² + iω C)⁻¹ φ(x),  T = Φ_s (z - A)⁻¹ z,  z = e^{iωΔt}
+
+with g, the force there, any number at all; d is the state at the start of the record less that at its end, one for all
+lines. What no g accounts for is noise where x is right. A line counts by how far the force stands out of the noise in
+it, with weights that do not depend on x: a wrong idea of the force's spectrum then costs precision, and biases nothing.
+
+Projections on one unknown source: Stoica & Nehorai, IEEE Trans. Acoust. Speech Signal Process. 37 (1989) 720.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from workbench.gap.missing_force import SampledModel
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED
+
+TOP = 0.9  # of half the sample rate: above, what is folded down is no longer small
+WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
+CHANCE = 2.0  # deviations by which noise may pass for a force in them
+COUNTING = 0.02  # weight below which a line tells nothing
+ROUNDS = 4  # of the spectrum of the force, each weighed by the one before
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """A record's residual at the lines of its spectrum, in units of the noise, and what it is made of.
+
+    Attributes:
+        compliance: (n_lines, n_sensors, n_modes) of modal forces.
+        tail: (n_lines, n_sensors, 2 n_modes) of the state at the start less that at the end.
+        left: (n_lines, n_sensors) the residual; its noise has unit variance.
+    """
+
+    compliance: np.ndarray
+    tail: np.ndarray
+    left: np.ndarray
+
+    @cached_property
+    def _products(self) -> tuple[np.ndarray, np.ndarray, float]:
+        tail = self.tail.reshape(-1, self.tail.shape[2])
+        left = self.left.ravel()
+        return _real(tail, tail), _real(tail, left), float(2.0 * np.sum(np.abs(left) ** 2))
+
+    @property
+    def freedom(self) -> int:
+        """Values that stay noise once a force, of any law, and the ends are accounted for."""
+        n_lines, n_sensors = self.left.shape
+        return 2 * n_lines * (n_sensors - 1) - self.tail.shape[2]
+
+    def weighed(self, weights: np.ndarray) -> "Lines":
+        """The lines by weights (n_lines,), without those that tell nothing."""
+        kept = weights > COUNTING
+        root = np.sqrt(weights[kept])[:, None]
+        return Lines(self.compliance[kept], self.tail[kept] * root[:, :, None], self.left[kept] * root)
+
+    def misfit(self, shape: np.ndarray) -> float:
+        """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
+        u, a, _ = self._along(shape)
+        own, along, whole = self._products
+        end = np.linalg.lstsq(own - _real(u, u), along - _real(u, a), rcond=1e-12)[0]
+        return whole - 2.0 * float(np.sum(np.abs(a) ** 2)) - float((along - _real(u, a)) @ end)
+
+    def telling(self, shape: np.ndarray) -> np.ndarray:
+        """Share (n_lines,) of a force there in what is read along it: how much each line tells of its place."""
+        u, a, power = self._along(shape)
+        own, along, _ = self._products
+        share = np.ones_like(power)
+        for _ in range(ROUNDS):
+            root = np.sqrt(share)
+            seen, heard = u * root[:, None], a * root
+            end = np.linalg.lstsq(own - _real(seen, seen), along - _real(seen, heard), rcond=1e-12)[0]
+            read = (np.abs(a - u @ end) ** 2 - 1.0) / power
+            sure = (power * (1.0 - share) if share.min() < 1.0 else np.ones_like(power)) ** 2
+            chance = CHANCE * np.sqrt(_smooth((sure / power) ** 2))
+            spectrum = np.maximum(_smooth(sure * read) - chance, 0.0) / _smooth(sure)
+            share = spectrum * power / (1.0 + spectrum * power)
+        return share
+
+    def _along(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The tail and the residual along the reading of a force, and that reading's power."""
+        h = self.compliance @ shape
+        power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
+        h = (h / np.sqrt(power)[:, None]).conj()
+        return (h[:, None, :] @ self.tail)[:, 0], np.sum(h * self.left, axis=1), power
+
+
+def _real(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    width = min(WIDTH, values.size)
+    return np.convolve(np.pad(values, (width // 2, width - 1 - width // 2), mode="edge"), np.ones(width), mode="valid")
+
+
+def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sample_time: float) -> list[Lines]:
+    """The lines of every record.
+
+    Args:
+        rig: nominal.
+        model: its sampled form, with the variance of each sensor's noise.
+        residuals: (n_sensors, n_samples) a record, in the sensors' units.
+        sample_time: s.
+    """
+    noise = np.sqrt(model.noise_variance)
+    made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    lines = []
+    for residual in residuals:
+        n = residual.shape[1]
+        if n not in made:
+            omega = 2.0 * np.pi * np.arange(1, max(int(0.5 * TOP * n), 2)) / (n * sample_time)
+            made[n] = _compliance(rig, omega) / noise[:, None], _tail(rig, model, omega * sample_time) / noise[:, None]
+        compliance, tail = made[n]
+        left = np.fft.rfft(residual, axis=1)[:, 1 : 1 + compliance.shape[0]].T / noise
+        lines.append(Lines(compliance, tail / np.sqrt(n), left / np.sqrt(n)))
+    return lines
+
+
+def _compliance(rig: Rig, omega: np.ndarray) -> np.ndarray:
+    """What the sensors read of modal forces: (n_lines, n_sensors, n_modes)."""
+    modes = rig.modes
+    dynamic = 1j * omega[:, None, None] * modes.damping
+    each = np.arange(modes.n_modes)
+    dynamic[:, each, each] += modes.omega**2 - omega[:, None] ** 2
+    inverse = np.linalg.inv(dynamic)
+    rows = []
+    for sensor in rig.sensors:
+        derivative, order = MEASURED[sensor.quantity]
+        shape = sensor.gain * modes.phi(sensor.at, derivative)[0]
+        rows.append((1j * omega[:, None]) ** order * (shape @ inverse))
+    return np.stack(rows, axis=1)
+
+
+def _tail(rig: Rig, model: SampledModel, turn: np.ndarray) -> np.ndarray:
+    """What the sensors read of a state that is there at the start and not at the end: (n_lines, n_sensors, 2 n_modes).
+
+    Velocities in units of the modes' own, so that no column is far larger than another.
+    """
+    z = np.exp(1j * turn)[:, None, None]
+    size = model.transition.shape[0]
+    transposed = z * np.eye(size) - model.transition.T
+    outputs = np.broadcast_to(model.output.T, (turn.size, *model.output.T.shape))
+    tail = z * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2)
+    omega = rig.modes.omega
+    return tail * np.r_[np.ones(omega.size), np.maximum(omega, 0.1 * omega[-1])]
