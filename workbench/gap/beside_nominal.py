@@ -8,7 +8,7 @@ import numpy as np
 from workbench.gap.beside_random import NEAR
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
-from workbench.gap.evidence import Evidence
+from workbench.gap.evidence import FEWER_PLACES, Evidence
 from workbench.gap.finish import ranked, simplest
 from workbench.gap.fit import Fit, fit
 from workbench.gap.outcome import Decision, unexplained
@@ -20,7 +20,6 @@ from workbench.rig.rig import Rig
 
 WITHIN_REACH = 3.0  # times the noise one sample ahead: what may come to it on whole records
 TRIED, PAIRS_TRIED = 4, 3  # sets of one effect and of two that are fitted with the figures
-N_PLACES = 20  # of a second force
 
 
 def figures(rig: Rig) -> Effect:
@@ -89,7 +88,7 @@ class _Beside:
         rig = apply_all(search.rig, (*given, self.freed))
         left = search.ahead.by_channel(search.ahead.residual(rig)).mean(axis=1)
         telling = search.quick.records[int(np.argmax(left))].name
-        evidence = Evidence.of(rig, self.plain.data, N_PLACES)
+        evidence = Evidence.of(rig, self.plain.data, FEWER_PLACES)
         return one_more(replace(search, first=search.quick.only((telling,))), given, evidence)
 
     def _fitted(self, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:

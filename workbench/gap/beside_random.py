@@ -8,7 +8,7 @@ import numpy as np
 from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
-from workbench.gap.evidence import Evidence
+from workbench.gap.evidence import FEWER_PLACES, Evidence
 from workbench.gap.finish import finished, ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.following import Follower
@@ -102,7 +102,7 @@ def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tup
     deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in hearing.rig.sensors}
     if not deaf or any(effect.target in deaf for effect in effects):
         return search, evidence
-    return hearing, Evidence.of(apply_all(hearing.rig, effects), hearing.data, 20)
+    return hearing, Evidence.of(apply_all(hearing.rig, effects), hearing.data, FEWER_PLACES)
 
 
 def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
@@ -128,7 +128,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
     """
     if evidence is None:
         rig = apply_all(search.rig, given.effects)
-        evidence = Evidence.of(rig, search.data, 20)
+        evidence = Evidence.of(rig, search.data, FEWER_PLACES)
         evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, rig))
     found = _random_beside(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], NEAR):
@@ -137,7 +137,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         refitted = fit(search.rig, given.effects, data, iterations=8)
         rig = apply_all(search.rig, refitted.effects)
         again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
-        evidence = _by_laws_on_measured_motion(search, Evidence.of(rig, search.data, 20), follower)
+        evidence = _by_laws_on_measured_motion(search, Evidence.of(rig, search.data, FEWER_PLACES), follower)
         found = _random_beside(search, again, evidence)
     return found
 

@@ -1,7 +1,7 @@
 """What the records say before any effect is guessed: the missing force, its place, and the motion there."""
 
 from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,7 @@ from workbench.rig.simulate import Motion
 LEVELS = (1e-3, 1e-2, 1e-1, 1.0)  # rms of a missing force over that of the inputs
 MEMORIES = (10.0, 1000.0)  # its correlation time, in samples
 MOST_PEAKS = 3
+PLACES, FEWER_PLACES = 40, 20  # where a force is looked for: the first, and one beside what is given
 BESIDE, RESOLVED = 0.95, 2e-3  # of the spacing of places
 
 
@@ -60,11 +61,11 @@ class Evidence:
     data: FitData
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
-    n_places: int = field(default=40)
+    n_places: int = PLACES
     told: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, rig: Rig, data: FitData, n_places: int = 40) -> "Evidence":
+    def of(cls, rig: Rig, data: FitData, n_places: int = PLACES) -> "Evidence":
         """Simulate the rig on the fit records."""
         motions = data.motions(rig)
         predictions = data.predictions(rig)

@@ -14,6 +14,7 @@ from workbench.rig.rig import Rig
 
 WEAKER, STRONGER = 0.03, 30.0  # than at its start: what an effect may turn out to be
 RUNAWAY = 1e10  # mean square, in noise units, of errors that tell nothing
+NOTHING = 1e-300  # square of a move that given effects make up for whole
 MOST_VALUES = 20_000  # of the errors that are weighed
 
 
@@ -79,7 +80,7 @@ class Weighed:
 
     def likeliest(self) -> list[Effect]:
         """The best start of every kind and target, and the best elsewhere, in the order of what they can come to."""
-        own, along = np.einsum("ij,ij->i", self.moves, self.moves), self.moves @ self.left
+        own, along = np.einsum("ij,ij->i", self.moves, self.moves).clip(NOTHING), self.moves @ self.left
         a = (-along / own).clip(self.least, self.most)
         # of places that are one and the same, the first comes first
         costs = np.round(a * (2.0 * along + a * own) / max(self.left @ self.left, 1e-300), 9)
@@ -123,7 +124,8 @@ class Weighed:
         """min |left + a m_i + b m_j|² - |left|² over a and b within their bounds: (n_starts, n_starts)."""
         products, along = self.moves @ self.moves.T, self.moves @ self.left
         i, j = along[:, None], along
-        own_i, own_j = np.diag(products)[:, None], np.diag(products)
+        own_j = np.diag(products).clip(NOTHING)
+        own_i = own_j[:, None]
         least, most = self.least[:, None], self.most[:, None]
         with np.errstate(divide="ignore", invalid="ignore"):
             a = (j * products - i * own_j) / (own_i * own_j - products**2)
