@@ -147,6 +147,11 @@ def test_records_that_cannot_be_of_the_rig_are_refused():
     turned = [replace(r, outputs=r.outputs * np.r_[-1.0, np.ones(r.n_outputs - 1)][:, None]) for r in case.fit]
     with pytest.raises(RecordsError, match="wrong sign"):
         diagnose(case.rig, turned)
+    millimetres = [replace(r, outputs=r.outputs * np.r_[1e3, np.ones(r.n_outputs - 1)][:, None]) for r in case.fit]
+    with pytest.raises(RecordsError, match=r"about 1000 times what the model predicts, the others about 1 times"):
+        diagnose(case.rig, millimetres)
+    with pytest.raises(RecordsError, match=r"outputs read about 0.001 times what the model makes of the inputs"):
+        diagnose(case.rig, [replace(r, inputs=r.inputs * 1e3) for r in case.fit])
     with pytest.raises(ValueError, match="in that order"):
         diagnose(Rig(case.rig.modes, case.rig.actuators, case.rig.sensors[1:]), case.fit)
     with pytest.raises(ValueError, match="at least one record"):

@@ -17,6 +17,7 @@ from workbench.rig.simulate import simulate
 ALIKE = 0.995
 SEEN = 25.0  # of chi-squared: five standard deviations
 TURNED = -0.95
+FAR_OFF, HEARD = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
 STUCK = 0.5
 THINNING = 3
 STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
@@ -47,12 +48,12 @@ def check_records(rig: Rig, records: Sequence[Record]) -> None:
     """Refuse records whose channels cannot be what the rig says they are.
 
     Raises:
-        RecordsError: a sensor that reads with the wrong sign, a saturated or flat channel, a record shorter than a
-            period of the first mode, inputs that are all at rest.
+        RecordsError: a sensor that reads with the wrong sign or in other units, a saturated or flat channel, a record
+            shorter than a period of the first mode, inputs that are all at rest.
     """
     elastic = rig.modes.omega[rig.modes.omega > 0]
     _check_not_stuck(rig, records)
-    signs = []
+    signs, sizes = [], []
     for record in records:
         if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
             raise RecordsError(
@@ -68,8 +69,10 @@ def check_records(rig: Rig, records: Sequence[Record]) -> None:
                 raise RecordsError(f"record {record.name!r}: output {sensor.name!r} is flat; is the sensor alive?")
             row.append(np.corrcoef(measured, expected)[0, 1] if np.ptp(expected) > 0 else 0.0)
         signs.append(row)
+        sizes.append(_sizes(rig, record.outputs, predicted))
     if not signs:
         raise RecordsError("every input of every record is at rest; there is nothing to compare")
+    _check_units(rig, records[0], np.array(sizes))
     turned = np.flatnonzero((np.array(signs) < TURNED).all(axis=0))
     if turned.size and turned.size < len(rig.sensors):
         name = rig.sensors[turned[0]].name
@@ -77,6 +80,48 @@ def check_records(rig: Rig, records: Sequence[Record]) -> None:
             f"output {name!r} reads with the wrong sign: its correlation with the model is"
             f" {np.array(signs)[:, turned[0]].mean():.2f} in every record; turn it round"
         )
+
+
+def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """Each sensor's reading over the model's (n_sensors,); one where the model's is lost in the noise."""
+    noise = np.array([sensor.noise_std for sensor in rig.sensors])
+    expected = predicted.std(axis=1)
+    told = expected > HEARD * noise
+    return np.where(told, measured.std(axis=1) / np.where(told, expected, 1.0), 1.0)
+
+
+def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
+    """No effect makes a channel read fifty times too much in every record, nor fifty times too little.
+
+    Args:
+        record: any, for its units.
+        sizes: (n_records, n_sensors) readings over the model's.
+    """
+    common = np.median(sizes, axis=1, keepdims=True)
+    if _always_far_off(common):
+        raise RecordsError(
+            f"the outputs read about {_about(common)} times what the model makes of the inputs: are outputs,"
+            f" inputs and model in units that fit, {_units(record)}?"
+        )
+    for j, sensor in enumerate(rig.sensors):
+        if _always_far_off(sizes[:, j] / common[:, 0]):
+            raise RecordsError(
+                f"output {sensor.name!r} reads about {_about(sizes[:, j])} times what the model predicts, the"
+                f" others about {_about(common)} times: is it in {record.output_channels[j].unit or 'its unit'}?"
+            )
+
+
+def _always_far_off(ratios: np.ndarray) -> bool:
+    return bool((ratios > FAR_OFF).all() or (ratios < 1.0 / FAR_OFF).all())
+
+
+def _about(ratios: np.ndarray) -> str:
+    return f"{float(f'{np.median(ratios):.2g}'):g}"
+
+
+def _units(record: Record) -> str:
+    units = (channel.unit for channel in (*record.input_channels, *record.output_channels))
+    return ", ".join(dict.fromkeys(unit for unit in units if unit))
 
 
 def check_modes(rig: Rig) -> None:
