@@ -101,6 +101,16 @@ def test_a_gap_that_is_not_of_one_force_is_not_placed(rig, measured, elsewhere):
     assert not place.holds
 
 
+def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch):
+    real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
+    records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]
+    every = placed_by(rig, records)
+    monkeypatch.setattr("workbench.gap.any_force.MOST_LINES", 300)
+    fewer = placed_by(rig, records)
+    assert fewer.holds and every.at_std < fewer.at_std < 8.0 * every.at_std
+    assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std
+
+
 def test_one_sensor_tells_no_place(rig, measured):
     real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
     records = [measured(real, str(seed), 0.3, seed).only(("d2",)) for seed in (2, 3)]

@@ -22,6 +22,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
 
 TOP = 0.9  # of half the sample rate: above, what is folded down is no longer small
+MOST_LINES = 8192  # of a record: of a longer one every so many, which costs precision alone
 WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
 CHANCE = 2.0  # deviations by which noise may pass for a force in them
 COUNTING = 0.02  # weight below which a line tells nothing
@@ -110,15 +111,18 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
         sample_time: s.
     """
     noise = np.sqrt(model.noise_variance)
-    made: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    made: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
     lines = []
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
-            omega = 2.0 * np.pi * np.arange(1, max(int(0.5 * TOP * n), 2)) / (n * sample_time)
-            made[n] = _compliance(rig, omega) / noise[:, None], _tail(rig, model, omega * sample_time) / noise[:, None]
-        compliance, tail = made[n]
-        left = np.fft.rfft(residual, axis=1)[:, 1 : 1 + compliance.shape[0]].T / noise
+            top = max(int(0.5 * TOP * n), 2)
+            taken = np.arange(1, top, 1 + top // MOST_LINES)
+            omega = 2.0 * np.pi * taken / (n * sample_time)
+            tail = _tail(rig, model, omega * sample_time)
+            made[n] = taken, _compliance(rig, omega) / noise[:, None], tail / noise[:, None]
+        taken, compliance, tail = made[n]
+        left = np.fft.rfft(residual, axis=1)[:, taken].T / noise
         lines.append(Lines(compliance, tail / np.sqrt(n), left / np.sqrt(n)))
     return lines
 

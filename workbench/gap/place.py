@@ -42,11 +42,11 @@ def placed(evidence: Evidence) -> Placed:
 
     One sensor tells no place: a force anywhere accounts for all that it reads.
     """
-    lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
     named = known_places(evidence.rig) is not None
     guess, places, length = evidence.peaks[0], evidence.places, evidence.length
     if len(evidence.rig.sensors) < 2:
         return Placed(places, np.zeros(places.size), guess, 0.0 if named else length / np.sqrt(12.0), 0.0, None)
+    lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
     search = _Search(evidence, lines)
     telling = search.telling(guess)
     profile = np.array([search.misfit(telling, x) for x in places])
