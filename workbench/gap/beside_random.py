@@ -9,12 +9,12 @@ from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, f
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import FEWER_PLACES, Evidence
-from workbench.gap.finish import finished, ranked, simplest
+from workbench.gap.finish import finished, plainest, ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.following import Follower
 from workbench.gap.outcome import Decision
 from workbench.gap.pursuit import on_whole_records, one_more
-from workbench.gap.search import Search, spread_over_kinds
+from workbench.gap.search import WORTHWHILE, Search, spread_over_kinds
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
@@ -106,13 +106,14 @@ def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tup
 
 
 def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
-    """The likeliest that holds; one effect more must be worth its numbers."""
+    """The likeliest that holds; one effect more must be worth its numbers, and so must a law over a simpler one."""
     holding = [found for found in tried if found[1].holds]
     if not holding:
         return None
     fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
     worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
-    best, rivals = ranked(search, [found[0] for found in worth])
+    plain = plainest(search, [found[0] for found in worth], worth=WORTHWHILE)
+    best, rivals = ranked(search, plain)
     return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
 
 

@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.gap.effects.containment import fewer, simpler_forms
-from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.pursuit import FINE
 from workbench.gap.search import Search, promise
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped
 
+FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on they are tried
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
-NO_NEARER = 0.9
+NO_NEARER, NEARER = 0.9, 0.5
 TRIED = 2  # iterations at each other place, before the likeliest are chosen
 LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
 APART = 0.02  # of the length: nearer, a place is the same valley
@@ -25,8 +27,19 @@ def finished(search: Search, candidate: Fit) -> Fit:
     if candidate.falling == 0 and not search.explains(candidate):
         finely = cost_of(search.rig, candidate.effects, search.data.stepped(FINE))
         if finely - 1.0 > NO_NEARER * (candidate.cost - 1.0):
-            return candidate
-    return fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=25, tolerance=1e-7)
+            return _by_finest_steps(search, candidate)
+    ended = fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=25, tolerance=1e-7)
+    return _by_finest_steps(search, ended)
+
+
+def _by_finest_steps(search: Search, ended: Fit) -> Fit:
+    """The fit by the finest substeps, where it explains the records but for errors of stepping."""
+    if search.explains(ended) or ended.cost > ALL_BUT or not is_stepped(apply_all(search.rig, ended.effects)):
+        return ended
+    finest = search.data.stepped(FINEST)
+    if cost_of(search.rig, ended.effects, finest) - 1.0 > NEARER * (ended.cost - 1.0):
+        return ended
+    return fit(search.rig, ended.effects, finest, iterations=6, tolerance=1e-5)
 
 
 def simplified(search: Search, candidate: Fit) -> Fit:
@@ -89,14 +102,19 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
     return [*(f.effects for f in elsewhere[:2]), moved(length - effect.values["at"])]
 
 
-def plainest(search: Search, fits: Sequence[Fit]) -> list[Fit]:
-    """The fits without those that come to another of them at a bound, and are no better than it."""
+def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list[Fit]:
+    """The fits without those that come to another of them at a bound, and are no better than it.
+
+    Args:
+        worth: of the noise power, what a fit must be better by at least.
+    """
     by_key = {candidate.key: candidate for candidate in fits}
 
     def needless(candidate: Fit) -> bool:
         forms = (*fewer(candidate.effects), *_simpler_forms(search.rig, candidate.effects))
         others = (by_key.get(tuple(sorted(effect.label for effect in form))) for form in forms)
-        return any(other and not _pays(search, candidate, other) for other in others if other is not candidate)
+        simpler = (other for other in others if other is not None and other is not candidate)
+        return any(not (_pays(search, candidate, f) and f.cost - candidate.cost > worth) for f in simpler)
 
     return [candidate for candidate in fits if not needless(candidate)]
 
