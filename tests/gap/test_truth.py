@@ -38,6 +38,12 @@ def test_hinged_beam_has_sines():
     np.testing.assert_allclose(modes.gram, np.diag((r * np.pi / 2.0) ** 2 / 3.0), rtol=1e-5, atol=1e-4)
 
 
+def test_thin_elements_do_not_round_off_the_lowest_modes():
+    beside_nodes = (8.0 * np.arange(1, 30) + 0.31) / 240.0 * 2.0
+    omega = element_modes(_beam(), beside_nodes, 3).omega
+    np.testing.assert_allclose(omega, WAVE * (np.arange(1, 4) * np.pi) ** 2, rtol=1e-8)
+
+
 @pytest.mark.parametrize(
     ("left", "right", "secular", "brackets"),
     [

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import eigsh
-from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, MeshLine
+from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functional, MeshLine
 from skfem.helpers import d, dd
 
 from workbench.structure.member import Bar, Beam, Structure
@@ -80,15 +80,16 @@ def element_modes(
     special += [*member.mass_per_length.breaks, *profile.breaks, *(part.at for part in member.attachments)]
     nodes = _nodes(np.array(special, float), member.length, elements)
     basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
-    stiffness, mass, slopes = _matrices(basis, member, altered)
-    held = _hold_ends(stiffness, basis, member, altered)
+    strain, mass, slopes, strain_energy = _matrices(basis, member, altered)
+    beside = (member.tension + altered.tension if isinstance(member, Beam) else 0.0) * slopes.tolil()
+    held = _hold_ends(beside, basis, member, altered)
     displacement = basis.nodal_dofs[0]
     for at, value in (*altered.masses, *_attached(member, "mass")):
         mass[displacement[_node(nodes, at)], displacement[_node(nodes, at)]] += value
     for at, value in (*altered.springs, *_attached(member, "stiffness")):
-        stiffness[displacement[_node(nodes, at)], displacement[_node(nodes, at)]] += value
+        beside[displacement[_node(nodes, at)], displacement[_node(nodes, at)]] += value
     free = np.setdiff1d(np.arange(basis.N), held)
-    stiffness, mass = csr_matrix(stiffness)[free][:, free].tocsc(), csr_matrix(mass)[free][:, free].tocsc()
+    stiffness, mass = csr_matrix(strain + beside)[free][:, free].tocsc(), csr_matrix(mass)[free][:, free].tocsc()
     # the shift makes the pencil definite with rigid-body modes, and stands far below the first elastic one
     shift = -1e-3 * _typical(member) ** 2
     values, vectors = eigsh(stiffness, k=n_modes, M=mass, sigma=shift, which="LM", v0=np.ones(free.size))
@@ -96,7 +97,10 @@ def element_modes(
     full = np.zeros((basis.N, n_modes))
     full[free] = vectors[:, order]
     full /= np.sqrt(np.einsum("ir,ir->r", full[free], mass @ full[free]))
-    omega2 = np.where(np.abs(values[order]) < 1e-6 * abs(shift), 0.0, values[order])
+    # the matrix of hundreds of elements is rounded by as much as the lowest modes are stiff; their strains are not
+    energy = [strain_energy.assemble(basis, shape=basis.interpolate(shape)) for shape in full.T]
+    values = np.array(energy) + np.einsum("ir,ir->r", full, beside @ full)
+    omega2 = np.where(np.abs(values) < 1e-6 * abs(shift), 0.0, values)
     if (omega2 < 0).any():
         raise ValueError("the altered member is unstable: it buckles; draw a weaker compression")
     at_places = full[displacement[[_node(nodes, x) for x in places]]] if len(places) else np.zeros((0, n_modes))
@@ -136,7 +140,9 @@ def _node(nodes: np.ndarray, at: float) -> int:
 
 
 def _matrices(basis: Basis, member: Structure, altered: Alterations):
-    profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
+    """Of strain, mass and slopes, and the strain energy of one shape, twice."""
+    bar = isinstance(member, Bar)
+    profile = member.axial_stiffness if isinstance(member, Bar) else member.bending_stiffness
 
     def rigidity(x: np.ndarray) -> np.ndarray:
         values = altered.stiffness_factor * profile(x)
@@ -160,12 +166,12 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations):
     def inertia(u, v, w):
         return member.mass_per_length(w.x[0]) * u * v
 
-    slopes = slope.assemble(basis)
-    if isinstance(member, Bar):
-        stiffness = stretching.assemble(basis)
-    else:
-        stiffness = bending.assemble(basis) + (member.tension + altered.tension) * slopes
-    return stiffness.tolil(), inertia.assemble(basis).tolil(), slopes
+    @Functional
+    def energy(w):
+        return rigidity(w.x[0]) * (d(w["shape"])[0] if bar else dd(w["shape"])[0, 0]) ** 2
+
+    strain = (stretching if bar else bending).assemble(basis)
+    return strain, inertia.assemble(basis).tolil(), slope.assemble(basis), energy
 
 
 def _hold_ends(stiffness, basis: Basis, member: Structure, altered: Alterations) -> list[int]:
