@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.gap.any_force import lines_of
 from workbench.gap.evidence import Evidence
 from workbench.gap.locate import locate
+from workbench.gap.missing_force import sampled_model
 from workbench.gap.place import placed
 from workbench.gap.prediction import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, Clearance, CoulombFriction, CubicSpring, LinearDamper, PeriodicForce
+from workbench.structure.damping import ModalDamping
 
 DT, SAMPLES, NOISE = 0.01, 2000, 1e-5
 
@@ -109,6 +112,34 @@ def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch
     fewer = placed_by(rig, records)
     assert fewer.holds and every.at_std < fewer.at_std < 8.0 * every.at_std
     assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std
+
+
+def test_no_gap_tells_no_place(rig, measured):
+    place = placed_by(rig, [measured(rig, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert place.holds is None and place.share == 0.0
+
+
+def test_short_records_of_one_force_are_of_one_force(rig, measured):
+    real = replace(rig, elements=(CubicSpring(1.37, 3000.0),))
+    records = [measured(real, str(s), 1.0, s) for s in range(10)]
+    short = [record.between(0.0, 4.0) for record in records]
+    assert all(placed_by(rig, pair).holds for pair in zip(short[::2], short[1::2], strict=True))
+
+
+def test_an_undamped_mode_on_a_line_is_no_obstacle(rig):
+    still = replace(rig, modes=replace(rig.structure, damping=ModalDamping(0.0)).modes(6))
+    dt = 2.0 * np.pi * 3.0 / (still.modes.omega[0] * 400)
+    model = sampled_model(still.modes, still.sensors, np.full(4, NOISE), dt)
+    (lines,) = lines_of(still, model, [np.full((4, 400), NOISE)], dt)
+    assert np.isfinite(lines.compliance).all() and np.isfinite(lines.tail).all()
+    assert np.isfinite(lines.misfit(still.modes.phi(1.37)[0]))
+
+
+def test_a_sensor_that_lags_misleads_no_place(rig, measured):
+    sensors = (replace(rig.sensors[0], time_constant=0.01), *rig.sensors[1:])
+    known, real = replace(rig, sensors=sensors), replace(rig, sensors=sensors, elements=(CubicSpring(1.37, 3000.0),))
+    place = placed_by(known, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert place.holds and abs(place.at - 1.37) < 4.0 * place.at_std
 
 
 def test_one_sensor_tells_no_place(rig, measured):

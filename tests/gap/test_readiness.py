@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap.check import check_modes, readiness
+from workbench.gap.check import RecordsError, check_modes, check_records, readiness
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Kind
 from workbench.gap.evidence import Evidence
 from workbench.gap.prediction import FitData
 from workbench.rig.actuators import Actuator
+from workbench.rig.elements import PeriodicForce
 
 NOISE = 1e-5
 
@@ -47,6 +48,26 @@ def test_two_effects_that_do_the_same_are_told_to_be_alike(rig, data):
     twin = Kind(**{**vars(gain), "name": "another_gain"})
     found = readiness(Evidence.of(rig, data), catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE)))
     assert found.alike == (("actuator_gain[F1]", "another_gain[F1]", pytest.approx(1.0)),)
+
+
+@pytest.mark.parametrize("kept", [(0, 1), (0, 1, 2, 3)])
+def test_the_channel_in_other_units_is_named(rig, data, kept):
+    names = [rig.sensors[j].name for j in kept]
+    few = replace(rig, sensors=tuple(rig.sensors[j] for j in kept))
+    (record,) = data.of_outputs(names).records
+    check_records(few, [record])
+    factors = np.ones((len(kept), 1))
+    factors[1] = 1e-3
+    with pytest.raises(RecordsError, match=rf"output '{names[1]}' reads about 0.001 times"):
+        check_records(few, [replace(record, outputs=factors * record.outputs)])
+    with pytest.raises(RecordsError, match="the outputs read about 1000 times"):
+        check_records(few, [replace(record, outputs=1e3 * record.outputs)])
+
+
+def test_a_strong_force_that_nobody_modelled_is_no_wrong_unit(rig, record_of):
+    rng = np.random.default_rng(6)
+    commands = 0.003 * np.vstack([np.repeat(rng.normal(size=100), 10), np.zeros(1000)])
+    check_records(rig, [record_of(replace(rig, elements=(PeriodicForce(1.37, 0.47, 1.0, 0.0),)), commands, rng)])
 
 
 def test_modes_changed_behind_the_back_of_their_structure_are_refused(rig):

@@ -89,7 +89,7 @@ def _plot_places(ax, verdict: Verdict) -> None:
     told = {
         True: "where one missing force stands",
         False: "not one force at a point: where one would do best",
-        None: "one sensor tells no place of a force",
+        None: "no place of a force can be told",
     }
     ax.set(title=told[place.holds], ylabel="log-likelihood, less its peak")
     if known_places(verdict.nominal) is not None:

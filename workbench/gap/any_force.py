@@ -25,6 +25,7 @@ TOP = 0.9  # of half the sample rate: above, what is folded down is no longer sm
 MOST_LINES = 8192  # of a record: of a longer one every so many, which costs precision alone
 WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
 CHANCE = 2.0  # deviations by which noise may pass for a force in them
+UNDAMPED = 1e-9j  # of the stiffness: what keeps a mode without damping finite on a line of its own
 COUNTING = 0.02  # weight below which a line tells nothing
 ROUNDS = 4  # of the spectrum of the force, each weighed by the one before
 
@@ -53,7 +54,12 @@ class Lines:
     def freedom(self) -> int:
         """Values that stay noise once a force, of any law, and the ends are accounted for."""
         n_lines, n_sensors = self.left.shape
-        return 2 * n_lines * (n_sensors - 1) - self.tail.shape[2]
+        return max(2 * n_lines * (n_sensors - 1) - self.tail.shape[2], 0)
+
+    @property
+    def power(self) -> float:
+        """Sum of squares of the residual."""
+        return self._products[2]
 
     def weighed(self, weights: np.ndarray) -> "Lines":
         """The lines by weights (n_lines,), without those that tell nothing."""
@@ -132,7 +138,7 @@ def _compliance(rig: Rig, omega: np.ndarray) -> np.ndarray:
     modes = rig.modes
     dynamic = 1j * omega[:, None, None] * modes.damping
     each = np.arange(modes.n_modes)
-    dynamic[:, each, each] += modes.omega**2 - omega[:, None] ** 2
+    dynamic[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 - omega[:, None] ** 2
     inverse = np.linalg.inv(dynamic)
     rows = []
     for sensor in rig.sensors:
@@ -147,7 +153,7 @@ def _tail(rig: Rig, model: SampledModel, turn: np.ndarray) -> np.ndarray:
 
     Velocities in units of the modes' own, so that no column is far larger than another.
     """
-    z = np.exp(1j * turn)[:, None, None]
+    z = (1.0 + abs(UNDAMPED)) * np.exp(1j * turn)[:, None, None]
     size = model.transition.shape[0]
     transposed = z * np.eye(size) - model.transition.T
     outputs = np.broadcast_to(model.output.T, (turn.size, *model.output.T.shape))

@@ -46,6 +46,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     It takes much upon itself: where an effect explains the records without it, there is none.
     """
     search, evidence = _heard(search, (), evidence)
+    evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, evidence.rig))
     if not looks_random(evidence):
         return None, []
     alone = with_random(search, _nothing(search), evidence)

@@ -18,6 +18,7 @@ ALIKE = 0.995
 SEEN = 25.0  # of chi-squared: five standard deviations
 TURNED = -0.95
 FAR_OFF, HEARD = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
+ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
 STUCK = 0.5
 THINNING = 3
 STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
@@ -44,8 +45,11 @@ class Readiness:
     alike: tuple[tuple[str, str, float], ...]
 
 
-def check_records(rig: Rig, records: Sequence[Record]) -> None:
+def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> None:
     """Refuse records whose channels cannot be what the rig says they are.
+
+    Args:
+        settle: seconds at the start of each record that are not compared.
 
     Raises:
         RecordsError: a sensor that reads with the wrong sign or in other units, a saturated or flat channel, a record
@@ -54,22 +58,24 @@ def check_records(rig: Rig, records: Sequence[Record]) -> None:
     elastic = rig.modes.omega[rig.modes.omega > 0]
     _check_not_stuck(rig, records)
     signs, sizes = [], []
+    lead = round(settle / records[0].sample_time)
     for record in records:
         if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
             raise RecordsError(
                 f"record {record.name!r} lasts {record.n_samples * record.sample_time:g} s, less than a period of the"
                 f" first mode ({2 * np.pi / elastic[0]:g} s); take a longer record"
             )
-        if record.n_inputs and not np.any(record.inputs):
+        if (record.n_inputs and not np.any(record.inputs)) or record.n_samples < lead + 2:
             continue
-        predicted = simulate(rig, record.inputs, sample_time=record.sample_time).outputs
+        predicted = simulate(rig, record.inputs, sample_time=record.sample_time).outputs[:, lead:]
+        outputs = record.outputs[:, lead:]
         row = []
-        for sensor, measured, expected in zip(rig.sensors, record.outputs, predicted, strict=True):
+        for sensor, measured, expected in zip(rig.sensors, outputs, predicted, strict=True):
             if np.ptp(measured) == 0:
                 raise RecordsError(f"record {record.name!r}: output {sensor.name!r} is flat; is the sensor alive?")
             row.append(np.corrcoef(measured, expected)[0, 1] if np.ptp(expected) > 0 else 0.0)
         signs.append(row)
-        sizes.append(_sizes(rig, record.outputs, predicted))
+        sizes.append(_sizes(rig, outputs, predicted, np.array(row)))
     if not signs:
         raise RecordsError("every input of every record is at rest; there is nothing to compare")
     _check_units(rig, records[0], np.array(sizes))
@@ -82,33 +88,40 @@ def check_records(rig: Rig, records: Sequence[Record]) -> None:
         )
 
 
-def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """Each sensor's reading over the model's (n_sensors,); one where the model's is lost in the noise."""
+def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """Each sensor's reading over the model's (n_sensors,); NaN where the model's is lost in the noise, or is another's.
+
+    Args:
+        alike: (n_sensors,) correlation of the two. What nobody modelled may be far stronger than the inputs, but does
+            not go as their reply does.
+    """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     expected = predicted.std(axis=1)
-    told = expected > HEARD * noise
-    return np.where(told, measured.std(axis=1) / np.where(told, expected, 1.0), 1.0)
+    told = (expected > HEARD * noise) & (np.abs(alike) > ALIKE_IN_SHAPE)
+    return np.where(told, measured.std(axis=1) / np.where(told, expected, 1.0), np.nan)
 
 
 def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
-    """No effect makes a channel read fifty times too much in every record, nor fifty times too little.
+    """A channel that goes as the model does, and reads fifty times too much or too little in every record.
 
     Args:
         record: any, for its units.
         sizes: (n_records, n_sensors) readings over the model's.
     """
-    common = np.median(sizes, axis=1, keepdims=True)
-    if _always_far_off(common):
+    heard = [column[np.isfinite(column)] for column in sizes.T]
+    off = [j for j, ratios in enumerate(heard) if ratios.size and _always_far_off(ratios)]
+    if not off:
+        return
+    if len(off) == sum(ratios.size > 0 for ratios in heard) > 1:
         raise RecordsError(
-            f"the outputs read about {_about(common)} times what the model makes of the inputs: are outputs,"
-            f" inputs and model in units that fit, {_units(record)}?"
+            f"the outputs read about {_about(np.concatenate(heard))} times what the model makes of the inputs: are"
+            f" outputs, inputs and model in units that fit, {_units(record)}?"
         )
-    for j, sensor in enumerate(rig.sensors):
-        if _always_far_off(sizes[:, j] / common[:, 0]):
-            raise RecordsError(
-                f"output {sensor.name!r} reads about {_about(sizes[:, j])} times what the model predicts, the"
-                f" others about {_about(common)} times: is it in {record.output_channels[j].unit or 'its unit'}?"
-            )
+    name, unit = rig.sensors[off[0]].name, record.output_channels[off[0]].unit or "its unit"
+    raise RecordsError(
+        f"output {name!r} reads about {_about(heard[off[0]])} times what the model predicts in every record: is it in"
+        f" {unit}?"
+    )
 
 
 def _always_far_off(ratios: np.ndarray) -> bool:

@@ -6,6 +6,7 @@ from threadpoolctl import threadpool_limits
 
 from workbench.gap.attribute import Attribution, attribute
 from workbench.gap.check import check_modes, check_records, readiness
+from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Kind, apply_all
 from workbench.gap.experiment import Experiment, next_experiment
@@ -16,7 +17,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 RIVAL = 0.01  # probability from which a rival is worth an experiment
-HELD_OUT, BEYOND = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
+HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
 
 
 def diagnose(
@@ -56,7 +57,7 @@ def diagnose(
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_modes(rig)
-    check_records(rig, records)
+    check_records(rig, records, settle=settle)
     # the threads of the search and those of the linear algebra would wait for one another
     with threadpool_limits(1, user_api="blas"):
         found = attribute(
@@ -107,7 +108,7 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None) -> bool:
     """
     if shrinkage is None or _unpredictable(found):
         return False
-    left = any(shrinkage.after[n] ** 2 > (1.0 + BEYOND) * shrinkage.floor[n] ** 2 for n in shrinkage.after)
+    left = any(shrinkage.after[n] ** 2 > (1.0 + LEFT) * shrinkage.floor[n] ** 2 for n in shrinkage.after)
     return left and shrinkage.overall < HELD_OUT
 
 
@@ -130,8 +131,9 @@ def _check(rig: Rig, record: Record) -> None:
 
 def _next(rig: Rig, found: Attribution) -> Experiment | None:
     """The experiment that would separate the best set from its likeliest rival."""
+    explained = found.outcome == "explained" or any(effect.kind in BEYOND for effect in found.best.effects)
     for rival, probability in found.rivals:
-        if found.outcome == "explained" and probability > RIVAL:
+        if explained and probability > RIVAL:
             return next_experiment(rig, found.best, rival, found.data)
     return None
 

@@ -14,6 +14,7 @@ ROUNDS = 3  # in each: where the force is, which lines tell of it
 BESIDE, RESOLVED = 0.95, 1e-3  # of the spacing of places
 TWO_SIGMA = 4.0  # rise of the misfit
 NOISE, ALL_BUT = 0.1, 1e-5  # left by what may be one force: of the noise, and of the gap
+CHANCE = 3.0  # deviations of a sum of squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,9 +25,11 @@ class Placed:
         places: (n_places,) m.
         profile: (n_places,) log-likelihood there, less that of the likeliest place.
         at: the likeliest place, m.
-        at_std: half the way between where the misfit is two deviations higher, over two, m; 0 for named places.
+        at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
+            beyond the noise; 0 for named places.
         share: of the gap's power above the noise, what one force there accounts for.
-        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None: one sensor cannot tell.
+        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing tells:
+            no gap, one sensor, or records too short.
     """
 
     places: np.ndarray
@@ -40,8 +43,9 @@ class Placed:
 def placed(evidence: Evidence) -> Placed:
     """Where one force, of any law, would make the simulation agree with the test.
 
-    One sensor tells no place: a force anywhere accounts for all that it reads.
+    One sensor tells no place: a force anywhere accounts for all that it reads. Sensors that lag are left out.
     """
+    evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
     named = known_places(evidence.rig) is not None
     guess, places, length = evidence.peaks[0], evidence.places, evidence.length
     if len(evidence.rig.sensors) < 2:
@@ -56,12 +60,8 @@ def placed(evidence: Evidence) -> Placed:
         at, telling = min((search.refined(top) for top in _valleys(places, profile)), key=search.judged)
         profile, std = np.array([search.misfit(telling, x) for x in places]), search.deviation(telling, at)
     lowest = min(search.misfit(telling, at), profile.min())
-    freedom = max(sum(each.freedom for each in lines), 1)
-    left = search.misfit(lines, at) / freedom - 1.0
-    gap = sum(float(2.0 * np.sum(np.abs(each.left) ** 2)) for each in lines) / freedom - 1.0
-    share = float(np.clip(1.0 - left / gap, 0.0, 1.0)) if gap > 0 else 0.0
-    holds = left < max(NOISE, ALL_BUT * gap)
-    return Placed(places, -0.5 * (profile - lowest), at, std * np.sqrt(max(1.0 + left, 1.0)), share, bool(holds))
+    std *= np.sqrt(max(search.left(at), 0.0) + 1.0)
+    return Placed(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
 
 
 def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
@@ -87,6 +87,24 @@ class _Search:
     def misfit(self, lines: list[Lines], x: float) -> float:
         shape = self.shape(x)
         return sum(each.misfit(shape) for each in lines)
+
+    @property
+    def freedom(self) -> int:
+        return sum(each.freedom for each in self.lines)
+
+    def left(self, at: float) -> float:
+        """What a force there leaves beyond the noise, per value, in units of the noise."""
+        return self.misfit(self.lines, at) / max(self.freedom, 1) - 1.0
+
+    def of_one_force(self, at: float) -> tuple[float, bool | None]:
+        """Share of the gap's power that a force there accounts for, and whether it is all of it."""
+        values = 2 * sum(each.left.size for each in self.lines)
+        gap = sum(each.power for each in self.lines) - values
+        if self.freedom == 0 or gap < CHANCE * np.sqrt(2.0 * values):
+            return 0.0, None
+        left, chance = self.left(at), CHANCE * np.sqrt(2.0 / self.freedom)
+        share = float(np.clip(1.0 - left * self.freedom / gap, 0.0, 1.0))
+        return share, bool(left < NOISE + chance or share > 1.0 - ALL_BUT)
 
     def refined(self, top: float) -> tuple[float, list[Lines]]:
         """The bottom of a valley, and the lines by what they tell there."""

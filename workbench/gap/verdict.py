@@ -97,11 +97,15 @@ class Verdict:
             near = [label for label, probability in self.alternatives if probability > 0.01]
             text += f"; {' and '.join(near)} cannot be excluded." if near else "."
         else:
-            text = "No effect of the catalogue, alone or with another, explains the gap; "
-            if any(effect.kind in BEYOND for effect in self.effects):
-                text += f"{words} explains {closed}it."
+            text = "No effect of the catalogue, alone or with another, explains the gap"
+            if not any(effect.kind in BEYOND for effect in self.effects):
+                text += f"; the nearest, {words}, would close {closed or 'part of '}it."
+            elif self.alternatives:
+                near = [label for label, probability in self.alternatives if probability > 0.01]
+                text += f" as likely as {words}, which explains {closed}it"
+                text += f"; {' and '.join(near)} cannot be excluded." if near else "."
             else:
-                text += f"the nearest, {words}, would close {closed or 'part of '}it."
+                text += f"; {words} explains {closed}it."
         return text[0].upper() + text[1:]
 
     def to_json(self) -> dict:

@@ -17,7 +17,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
         for place in evidence.at_peaks:
             path = getattr(place, motion)
             rms = float(np.sqrt(np.mean(path**2)))
-            for exponent in EXPONENTS:
+            for exponent in EXPONENTS if rms > 0 else ():
                 basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
                 force = float(-(place.force @ basis) / max(basis @ basis, 1e-300))
                 yield {"at": place.at, "force_at_rms": force, "exponent": exponent, "rms": rms}
