@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.effects.structural import known_places, place_name
 from workbench.gap.evidence import Evidence
@@ -160,7 +160,7 @@ def _law(chosen, series: np.ndarray, name: str):
 def plot_rivals(verdict: Verdict) -> Figure:
     """What each effect alone would leave of the gap, and a law beyond the catalogue where one explains it."""
     best = verdict.attribution.best
-    beyond = [best] if any(effect.kind in BEYOND for effect in best.effects) else []
+    beyond = [best] if any_beyond(best.effects) else []
     singles = [*beyond, *verdict.attribution.singles[:8]]
     figure, ax = new_figure(1, 1, width=10, height=0.42 * len(singles) + 1.6)
     labels = [" + ".join(fit.labels) for fit in singles]

@@ -19,7 +19,7 @@ import numpy as np
 
 from workbench.gap.missing_force import SampledModel
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import MEASURED
+from workbench.rig.simulate import reading_of
 
 TOP = 0.9  # of half the sample rate: above, what is folded down is no longer small
 MOST_LINES = 8192  # of a record: of a longer one every so many, which costs precision alone
@@ -70,25 +70,28 @@ class Lines:
     def misfit(self, shape: np.ndarray) -> float:
         """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
         u, a, _ = self._along(shape)
-        own, along, whole = self._products
-        end = np.linalg.lstsq(own - _real(u, u), along - _real(u, a), rcond=1e-12)[0]
-        return whole - 2.0 * float(np.sum(np.abs(a) ** 2)) - float((along - _real(u, a)) @ end)
+        end, along = self._end(u, a)
+        return self.power - 2.0 * float(np.sum(np.abs(a) ** 2)) - float(along @ end)
 
     def telling(self, shape: np.ndarray) -> np.ndarray:
         """Share (n_lines,) of a force there in what is read along it: how much each line tells of its place."""
         u, a, power = self._along(shape)
-        own, along, _ = self._products
-        share = np.ones_like(power)
+        share, sure = np.ones_like(power), np.ones_like(power)
         for _ in range(ROUNDS):
             root = np.sqrt(share)
-            seen, heard = u * root[:, None], a * root
-            end = np.linalg.lstsq(own - _real(seen, seen), along - _real(seen, heard), rcond=1e-12)[0]
+            end, _ = self._end(u * root[:, None], a * root)
             read = (np.abs(a - u @ end) ** 2 - 1.0) / power
-            sure = (power * (1.0 - share) if share.min() < 1.0 else np.ones_like(power)) ** 2
             chance = CHANCE * np.sqrt(_smooth((sure / power) ** 2))
             spectrum = np.maximum(_smooth(sure * read) - chance, 0.0) / _smooth(sure)
             share = spectrum * power / (1.0 + spectrum * power)
+            sure = (power * (1.0 - share)) ** 2
         return share
+
+    def _end(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The ends by what a force leaves of the record, given the tail and the residual along it; and their pull."""
+        own, along, _ = self._products
+        along = along - _real(u, a)
+        return np.linalg.lstsq(own - _real(u, u), along, rcond=1e-12)[0], along
 
     def _along(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tail and the residual along the reading of a force, and that reading's power."""
@@ -140,12 +143,8 @@ def _compliance(rig: Rig, omega: np.ndarray) -> np.ndarray:
     each = np.arange(modes.n_modes)
     dynamic[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 - omega[:, None] ** 2
     inverse = np.linalg.inv(dynamic)
-    rows = []
-    for sensor in rig.sensors:
-        derivative, order = MEASURED[sensor.quantity]
-        shape = sensor.gain * modes.phi(sensor.at, derivative)[0]
-        rows.append((1j * omega[:, None]) ** order * (shape @ inverse))
-    return np.stack(rows, axis=1)
+    rate = 1j * omega[:, None, None]
+    return sum(rate**order * (rows @ inverse) for order, rows in enumerate(reading_of(rig)))
 
 
 def _tail(rig: Rig, model: SampledModel, turn: np.ndarray) -> np.ndarray:

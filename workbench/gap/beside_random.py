@@ -46,7 +46,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     It takes much upon itself: where an effect explains the records without it, there is none.
     """
     search, evidence = _heard(search, (), evidence)
-    evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, evidence.rig))
+    evidence = _by_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
     alone = with_random(search, _nothing(search), evidence)
@@ -86,7 +86,7 @@ def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decisi
         evidence: of the rig with the given effects.
     """
     search, evidence = _heard(search, given.effects, evidence)
-    evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, evidence.rig))
+    evidence = _by_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None
     return _likeliest(search, [with_random(search, given, evidence), with_random(search, _nothing(search))])
@@ -129,9 +129,8 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         evidence: of the rig with the given effects, where it is at hand.
     """
     if evidence is None:
-        rig = apply_all(search.rig, given.effects)
-        evidence = Evidence.of(rig, search.data, FEWER_PLACES)
-        evidence = _by_laws_on_measured_motion(search, evidence, _follower(search, rig))
+        evidence = Evidence.of(apply_all(search.rig, given.effects), search.data, FEWER_PLACES)
+        evidence = _by_laws_on_measured_motion(search, evidence)
     found = _random_beside(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], NEAR):
         follower = _follower(search, evidence.rig, found[1])
@@ -151,10 +150,11 @@ def _follower(search: Search, rig: Rig, found: RandomForceFit | None = None) -> 
     return Follower.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
 
 
-def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Follower) -> Evidence:
+def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Follower | None = None) -> Evidence:
     """The evidence as it is where laws have not made much else of a force that the rig lacks."""
     if not is_stepped(evidence.rig):
         return evidence
+    follower = follower or _follower(search, evidence.rig)
     return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, follower)))
 
 

@@ -6,7 +6,7 @@ from threadpoolctl import threadpool_limits
 
 from workbench.gap.attribute import Attribution, attribute
 from workbench.gap.check import check_modes, check_records, readiness
-from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Kind, apply_all
 from workbench.gap.experiment import Experiment, next_experiment
@@ -131,7 +131,7 @@ def _check(rig: Rig, record: Record) -> None:
 
 def _next(rig: Rig, found: Attribution) -> Experiment | None:
     """The experiment that would separate the best set from its likeliest rival."""
-    explained = found.outcome == "explained" or any(effect.kind in BEYOND for effect in found.best.effects)
+    explained = found.outcome == "explained" or any_beyond(found.best.effects)
     for rival, probability in found.rivals:
         if explained and probability > RIVAL:
             return next_experiment(rig, found.best, rival, found.data)

@@ -6,7 +6,7 @@ import numpy as np
 
 from workbench.gap.attribute import Attribution
 from workbench.gap.check import Readiness
-from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import ALL, Effect
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
@@ -94,19 +94,22 @@ class Verdict:
             text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
             freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES and e not in self._told]
             text += f", with nominal figures a little off ({_off_by(freed[0])})" if freed else ""
-            near = [label for label, probability in self.alternatives if probability > 0.01]
-            text += f"; {' and '.join(near)} cannot be excluded." if near else "."
+            text += self._not_excluded
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
-            if not any(effect.kind in BEYOND for effect in self.effects):
+            if not any_beyond(self.effects):
                 text += f"; the nearest, {words}, would close {closed or 'part of '}it."
             elif self.alternatives:
-                near = [label for label, probability in self.alternatives if probability > 0.01]
-                text += f" as likely as {words}, which explains {closed}it"
-                text += f"; {' and '.join(near)} cannot be excluded." if near else "."
+                text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
             else:
                 text += f"; {words} explains {closed}it."
         return text[0].upper() + text[1:]
+
+    @property
+    def _not_excluded(self) -> str:
+        """The end of the sentence: rivals that remain."""
+        near = [label for label, probability in self.alternatives if probability > 0.01]
+        return f"; {' and '.join(near)} cannot be excluded." if near else "."
 
     def to_json(self) -> dict:
         """The verdict as the case format asks for it, and what stands behind it."""

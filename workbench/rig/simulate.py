@@ -227,7 +227,7 @@ def follow(
     return _stepped(rig, inputs, outputs, gain, sample_time, substeps)[3]
 
 
-def _reading(rig: Rig) -> np.ndarray:
+def reading_of(rig: Rig) -> np.ndarray:
     """What the sensors read of displacement, velocity and acceleration of the modes: (3, n_sensors, n_modes)."""
     rows = np.zeros((3, len(rig.sensors), rig.modes.n_modes))
     for j, sensor in enumerate(rig.sensors):
@@ -264,7 +264,7 @@ def _stepped(
     q, v, f = (np.zeros((modes.n_modes, n_samples)) for _ in range(3))
     known, reading, errors = outputs, NOTHING, np.empty_like(outputs)
     if outputs.size:
-        reading, time = _reading(rig), np.linspace(0.0, 1.0, n_samples)
+        reading, time = reading_of(rig), np.linspace(0.0, 1.0, n_samples)
         offset = np.array([[s.bias] for s in rig.sensors]) + np.outer([s.drift for s in rig.sensors], time)
         known = outputs - offset - reading[2] @ (participation @ at_samples)
     _stepper(tuple(e.law for e in points if isinstance(e, UserLaw)))(

@@ -1,11 +1,11 @@
 """Laws at a point that the catalogue does not hold: springs and dampers of any power."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from workbench.gap.effects.effect import Kind, Parameter
-from workbench.gap.effects.nonlinear import with_element
+from workbench.gap.effects.effect import Effect, Kind, Parameter
+from workbench.gap.effects.nonlinear import strength_along, with_element
 from workbench.gap.effects.structural import place_parameter
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
@@ -19,7 +19,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
             rms = float(np.sqrt(np.mean(path**2)))
             for exponent in EXPONENTS if rms > 0 else ():
                 basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
-                force = float(-(place.force @ basis) / max(basis @ basis, 1e-300))
+                force = strength_along(place.force, basis)
                 yield {"at": place.at, "force_at_rms": force, "exponent": exponent, "rms": rms}
 
     return Kind(
@@ -43,3 +43,8 @@ EVEN_SPRING = _power_law(
 )
 POWER_DAMPER = _power_law(PowerDamper, "power_damper", "velocity", "a damper of another power of the velocity")
 BEYOND = (POWER_SPRING, EVEN_SPRING, POWER_DAMPER)
+
+
+def any_beyond(effects: Iterable[Effect]) -> bool:
+    """Whether one of the effects is a law that the catalogue does not hold."""
+    return any(effect.kind in BEYOND for effect in effects)

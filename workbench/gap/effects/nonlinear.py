@@ -25,7 +25,8 @@ def with_element(rig: Rig, element) -> Rig:
     return replace(rig, elements=(*rig.elements, element))
 
 
-def _slope(force: np.ndarray, basis: np.ndarray) -> float:
+def strength_along(force: np.ndarray, basis: np.ndarray) -> float:
+    """The k for which -k basis is nearest to a force."""
     return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
 
 
@@ -42,7 +43,7 @@ def _stiffness(name: str, typical: float = 1.0) -> Parameter:
 
 def _cubic_starts(evidence, _):
     for place in evidence.at_peaks:
-        k = _slope(place.force, place.displacement**3)
+        k = strength_along(place.force, place.displacement**3)
         for share in (0.3, 1.0, 3.0):
             yield {"at": place.at, "stiffness": share * k}
             if share == 1.0:
@@ -134,7 +135,7 @@ def _contact_starts(two_sided: bool):
             levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
             for gap in levels:
                 over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
-                k = _slope(place.force, over)
+                k = strength_along(place.force, over)
                 if k > 0:
                     yield {"at": place.at, "stiffness": k, "gap": float(gap)}
                     yield {"at": place.at, "stiffness": 4 * k, "gap": float(gap)}
@@ -170,7 +171,7 @@ def _friction_starts(evidence, _):
     for place in evidence.at_peaks:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
-            force = _slope(place.force, np.tanh(place.velocity / (share * speed)))
+            force = strength_along(place.force, np.tanh(place.velocity / (share * speed)))
             if force > 0:
                 yield {"at": place.at, "force": force, "smoothing_speed": share * speed}
                 yield {"at": place.at, "force": 2 * force, "smoothing_speed": share * speed}
@@ -207,7 +208,7 @@ def _bouc_wen_starts(evidence, _):
     for place in evidence.at_peaks[:2]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
-            k = _slope(place.force, _hysteresis(place.displacement, share * size))
+            k = strength_along(place.force, _hysteresis(place.displacement, share * size))
             if k > 0:
                 yield {"at": place.at, "stiffness": k, "yield_displacement": share * size}
                 yield {"at": place.at, "stiffness": 2 * k, "yield_displacement": share * size}
