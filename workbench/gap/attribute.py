@@ -165,7 +165,7 @@ def _with_a_second(
     explained = pairs.at_once(weighed)
     if law is not None:
         return weighed_against(law, search, pairs.decision(start))
-    if explained:
+    if explained or pairs.by_exchange():
         return pairs.decision(start)
     return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, singles, ahead)
 

@@ -14,8 +14,9 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on they are tried
+STEPPING = 1e-4  # of the gap's power: what coarser substeps may leave of it
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
-NO_NEARER, NEARER = 0.9, 0.5
+NO_NEARER = 0.9
 TRIED = 2  # iterations at each other place, before the likeliest are chosen
 LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
 APART = 0.02  # of the length: nearer, a place is the same valley
@@ -34,12 +35,12 @@ def finished(search: Search, candidate: Fit) -> Fit:
 
 def _by_finest_steps(search: Search, ended: Fit) -> Fit:
     """The fit by the finest substeps, where it explains the records but for errors of stepping."""
-    if search.explains(ended) or ended.cost > ALL_BUT or not is_stepped(apply_all(search.rig, ended.effects)):
+    near = ended.cost < ALL_BUT or search.near(ended, STEPPING)
+    if search.explains(ended) or not near or not is_stepped(apply_all(search.rig, ended.effects)):
         return ended
-    finest = search.data.stepped(FINEST)
-    if cost_of(search.rig, ended.effects, finest) - 1.0 > NEARER * (ended.cost - 1.0):
-        return ended
-    return fit(search.rig, ended.effects, finest, iterations=6, tolerance=1e-5)
+    # its numbers have made up for errors of stepping, so its cost by finer steps tells nothing before a fit
+    finely = fit(search.rig, ended.effects, search.data.stepped(FINEST), iterations=6, tolerance=1e-5)
+    return finely if finely.cost < ended.cost else ended
 
 
 def simplified(search: Search, candidate: Fit) -> Fit:

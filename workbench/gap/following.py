@@ -29,13 +29,25 @@ class Follower:
 
     @classmethod
     def of(
-        cls, rig: Rig, noise: np.ndarray, force: float, sample_time: float, *, at: float = 0.0, rms: float = 0.0
+        cls,
+        rig: Rig,
+        noise: np.ndarray,
+        force: float,
+        sample_time: float,
+        *,
+        at: float = 0.0,
+        rms: float = 0.0,
+        loose: float = LOOSE,
     ) -> "Follower":
-        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, m, N."""
+        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, m, N.
+
+        Args:
+            loose: how far the rig may go its own way: random forces on it, as a share of the inputs, the less the more.
+        """
         modes, n = rig.modes, rig.modes.n_modes
         places = known_places(rig)
         along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
-        forces = LOOSE * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
+        forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
         patterns, variances = np.column_stack([np.eye(n), modes.phi(at)[0]]), np.r_[forces**2, rms**2]
         found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), patterns, variances, 0.0)
         gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T

@@ -7,7 +7,7 @@ from workbench.gap.evidence import Evidence
 from workbench.gap.finish import ranked
 from workbench.gap.fit import Fit
 from workbench.gap.outcome import Decision
-from workbench.gap.pursuit import on_whole_records, one_more
+from workbench.gap.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search import Search
 
 TRIED = 2
@@ -20,7 +20,8 @@ def one_law(search: Search, evidence: Evidence) -> Fit | None:
     """
     search.report("one force of another law", 0.35)
     beyond = replace(search, catalogue=BEYOND)
-    fits = on_whole_records(beyond, one_more(beyond, (), evidence), TRIED)
+    hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < HOPEFUL]
+    fits = on_whole_records(beyond, hopeful, TRIED)
     return next((f for f in fits if search.explains(f)), None)
 
 

@@ -12,19 +12,19 @@ from workbench.gap.evidence import FEWER_PLACES, Evidence
 from workbench.gap.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.outcome import Decision, unexplained
-from workbench.gap.pursuit import on_whole_records, one_more, pairs_at_once
+from workbench.gap.pursuit import HOPEFUL, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search import Search, apart, in_one_valley, spread_over_kinds
 from workbench.gap.weighing import Weighed
 
 FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
 FIRSTS = 4  # single effects that a second one is looked for beside
 FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
-HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
 ASTRAY = 1e4  # times the gap's power
 MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
 NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
 SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
 VERY_NEAR = 0.2 * NEAR  # what is tried from other places at once; what is near, where nothing else explains the records
+EXCHANGES = 2  # rounds of keeping either half of the best pair ahead
 TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
 TOLD = 4  # sets, best first, that may be named or be rivals
 
@@ -35,8 +35,9 @@ class Pairs:
 
     Attributes:
         search: what it works on.
+        ahead: pairs fitted one sample ahead, best first.
+        followed: those of them that were fitted to whole records too.
         found: pairs fitted to whole records, best first.
-        followed: what they were one sample ahead.
         ended: those taken to their ends, before and after.
         given: single effects that a second one was looked for beside.
         missed: near misses of which each half was kept and the other sought anew.
@@ -44,8 +45,9 @@ class Pairs:
     """
 
     search: Search
-    found: list[Fit] = field(default_factory=list)
+    ahead: list[Fit] = field(default_factory=list)
     followed: list[Fit] = field(default_factory=list)
+    found: list[Fit] = field(default_factory=list)
     ended: list[Fit] = field(default_factory=list)
     given: list[Effect] = field(default_factory=list)
     missed: list[Fit] = field(default_factory=list)
@@ -59,6 +61,22 @@ class Pairs:
         """
         self.search.report("all pairs at once", 0.4)
         return self._explained_by(pairs_at_once(self.search, weighed))
+
+    def by_exchange(self) -> bool:
+        """Whether a pair with either half of the best one sample ahead explains the records.
+
+        A strong effect is found beside whatever stands in for the other; what it leaves tells the other's place.
+        """
+        for _ in range(EXCHANGES):
+            if not self.ahead:
+                return False
+            best = self.ahead[0]
+            fresh = (h for h in _weightiest_first(self.search, best) if not any(_unmoved(h, g) for g in self.given))
+            if any(self.beside(half) for half in fresh):
+                return True
+            if self.ahead[0].cost > NEARER * best.cost:
+                break
+        return self._from_elsewhere(VERY_NEAR)
 
     def beside(self, effect: Effect, evidence: Evidence | None = None) -> bool:
         """Whether a pair with this effect explains the records.
@@ -84,8 +102,7 @@ class Pairs:
         """
         for first in _firsts(self.search, ahead, singles):
             (effect,) = first.effects
-            halves = (half for pair in self.missed for half in pair.effects)
-            if any(_alike(effect, half, self.search) for half in halves):
+            if any(_alike(effect, half, self.search) for pair in self.missed for half in pair.effects):
                 continue
             evidence = _evidence(self.search, effect)
             if evidence.rig is not self.search.rig:
@@ -93,11 +110,15 @@ class Pairs:
                 beside = decide_with_random(self.search, on_all, evidence)
                 if beside is not None:
                     return beside
+            if any(_alike(effect, other, self.search) for other in self.given):
+                continue
             if self.beside(effect, evidence):
                 break
-            if not self.missed and self._near() and (self._by_exchange() or self._from_elsewhere()):
+            if not self.missed and self._near() and (self._by_halves() or self._from_elsewhere()):
                 break
         else:
+            if not self.found:
+                self._add(on_whole_records(self.search, self.ahead, 1))
             if self.found:
                 self._from_elsewhere()
         return self.decision(start)
@@ -121,9 +142,11 @@ class Pairs:
         return bool(self.found) and self.search.near(self.found[0], NEAR)
 
     def _explained_by(self, ahead: Sequence[Fit]) -> bool:
+        self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
         length = self.search.rig.modes.length
-        fresh = [f for f in ahead if not any(in_one_valley(f, other, length) for other in self.followed)]
-        most = FINALISTS if not self.found else MORE if fresh and fresh[0].cost < HOPEFUL else 1
+        hopeful = [f for f in ahead if f.cost < HOPEFUL]
+        fresh = [f for f in hopeful if not any(in_one_valley(f, other, length) for other in self.followed)]
+        most = MORE if self.found else FINALISTS
         self.followed += fresh[:most]
         self._add(on_whole_records(self.search, fresh, most))
         near = [pair for pair in self.found[:TRIED_FURTHER] if not _done(pair, self.ended)]
@@ -132,26 +155,24 @@ class Pairs:
         self._add(taken)
         return any(self.search.explains(pair) for pair in taken)
 
-    def _by_exchange(self) -> bool:
-        """Whether a pair with either half of the best explains the records."""
+    def _by_halves(self) -> bool:
+        """Whether a pair with either half of the best on whole records explains them."""
         self.missed.append(self.found[0])
         halves = self.found[0].effects[::-1]
         return any(self.beside(h) for h in halves if not any(_unmoved(h, other) for other in self.given))
 
-    def _from_elsewhere(self) -> bool:
+    def _from_elsewhere(self, share: float = NEAR) -> bool:
         """Whether one of the best pairs explains the records with other places, or leads to one that does."""
         search = self.search
-        fresh = [
-            f for f in best_of_each(self.found)[:TRIED_FURTHER] if search.near(f, NEAR) and not _done(f, self.moved)
-        ]
-        fresh = [f for f in fresh if not (search.near(f, VERY_NEAR) and _done(f, self.ended))]
+        likeliest = best_of_each(self.found)[:TRIED_FURTHER]
+        fresh = [f for f in likeliest if search.near(f, share) and not _done(f, self.moved)]
         elsewhere = search.side_by_side(relocated, fresh)
         self.moved += [*fresh, *elsewhere]
         self._add(elsewhere)
         if any(search.explains(pair) for pair in elsewhere):
             return True
         nearer = all(self.found[0].cost - 1.0 < NEARER * (missed.cost - 1.0) for missed in self.missed)
-        return self._near() and nearer and self._by_exchange()
+        return self._near() and nearer and self._by_halves()
 
     def _add(self, pairs: Sequence[Fit]) -> None:
         self.found = sorted((*pairs, *self.found), key=lambda f: f.cost)
@@ -173,6 +194,15 @@ def _evidence(search: Search, effect: Effect) -> Evidence:
     return Evidence.of(search.rig if astray else apply_all(search.rig, (effect,)), search.data, FEWER_PLACES)
 
 
+def _weightiest_first(search: Search, pair: Fit) -> list[Effect]:
+    """The effects of a pair, first the one that most is left without."""
+
+    def left_without(effect: Effect) -> float:
+        return cost_of(search.rig, (*(e for e in pair.effects if e is not effect), *search.held), search.ahead)
+
+    return sorted(pair.effects, key=left_without, reverse=True)
+
+
 def _alike(one: Effect, other: Effect, search: Search) -> bool:
     """Whether two effects are the same but for their numbers."""
     if one.label != other.label:
@@ -191,12 +221,9 @@ def _done(pair: Fit, ended: Sequence[Fit]) -> bool:
 
 
 def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
-    """The pairs, and where none explains the records yet, from elsewhere and in simpler forms."""
+    """The pairs, and where none explains the records yet, in simpler forms."""
     ended = search.side_by_side(finished, pairs)
     if any(search.explains(pair) for pair in ended):
         return ended
     near = [pair for pair in ended if search.near(pair, VERY_NEAR)]
-    simpler = search.side_by_side(simplified, near)
-    if any(search.explains(pair) for pair in simpler):
-        return [*simpler, *(pair for pair in ended if pair not in near)]
-    return [*search.side_by_side(relocated, near), *(pair for pair in ended if pair not in near)]
+    return [*search.side_by_side(simplified, near), *(pair for pair in ended if pair not in near)]

@@ -7,7 +7,7 @@ from threading import Lock
 
 import numpy as np
 
-from workbench.gap.following import Follower
+from workbench.gap.following import LOOSE, Follower
 from workbench.gap.missing_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -77,11 +77,15 @@ class FitData:
         directions, sizes, _ = np.linalg.svd(sensitivity, full_matrices=False)
         return replace(self, given_way=(directions, 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)))
 
-    def following(self, rig: Rig) -> "FitData":
-        """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be."""
+    def following(self, rig: Rig, loose: float = LOOSE) -> "FitData":
+        """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be.
+
+        Args:
+            loose: random forces on it, as a share of the inputs: the less, the more it goes its own way.
+        """
         if self.whitener is not None:  # its innovations are errors one sample ahead as they are
             return replace(self, given_way=None)
-        follower = Follower.of(rig, self.noise, self.force_rms, self.records[0].sample_time)
+        follower = Follower.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
         return replace(self, follower=follower, given_way=None)
 
     @cached_property

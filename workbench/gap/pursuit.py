@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
-from workbench.gap.fit import Fit, fit
+from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.following import LOOSE
 from workbench.gap.prediction import FitData
 from workbench.gap.search import Search, in_one_valley, promise
 from workbench.gap.weighing import Weighed
@@ -13,6 +14,9 @@ from workbench.rig.simulate import is_stepped
 FINE = 8  # substeps of a sample
 TARGETS_A_KIND = 3  # of single effects that are tried
 TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
+HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
+LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
+AT_HAND = 10.0  # times the noise: so near, whole records tell the way
 CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
 RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
 RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
@@ -93,16 +97,20 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int) -> list[Fi
 def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to predictions one sample ahead, which go smoothly with its numbers, then to whole records.
 
-    Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way.
+    Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way;
+    where a thousandth of a percent is, the rig is let go by degrees.
 
     Args:
         iterations: on whole records, at most.
     """
     rig = apply_all(search.rig, effects)
     if is_stepped(rig) and not search.held and search.data.whitener is None:
-        effects = fit(
-            search.rig, effects, search.data.following(rig).stepped(FINE), iterations=8, tolerance=1e-4
-        ).effects
+        for loose in LETTING_GO:
+            data = search.data.following(rig, loose).stepped(FINE)
+            held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
+            effects = held.effects
+            if held.cost > HOPEFUL or cost_of(search.rig, effects, search.data.stepped(FINE)) < AT_HAND:
+                break
     return whole(search, effects, iterations)
 
 

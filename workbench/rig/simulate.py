@@ -1,6 +1,6 @@
 """Simulation of a rig from rest: exact where it is linear, stepped with exact modes where it is not."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -125,13 +125,9 @@ def is_stepped(rig: Rig) -> bool:
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
-    for order, quantity in enumerate((motion.displacement, motion.velocity, motion.acceleration)):
-        rows = [j for j, s in enumerate(rig.sensors) if MEASURED[s.quantity][1] == order]
-        for derivative in (0, 1):
-            here = [j for j in rows if MEASURED[rig.sensors[j].quantity][0] == derivative]
-            if here:
-                places = [rig.sensors[j].at for j in here]
-                outputs[here] = rig.modes.phi(places, derivative) @ quantity
+    quantities = (motion.displacement, motion.velocity, motion.acceleration)
+    for order, here, shapes in _shapes_at_sensors(rig):
+        outputs[here] = shapes @ quantities[order]
     for j, sensor in enumerate(rig.sensors):
         outputs[j] = sensor_reading(sensor, outputs[j], sample_time)
     return outputs
@@ -230,10 +226,17 @@ def follow(
 def reading_of(rig: Rig) -> np.ndarray:
     """What the sensors read of displacement, velocity and acceleration of the modes: (3, n_sensors, n_modes)."""
     rows = np.zeros((3, len(rig.sensors), rig.modes.n_modes))
-    for j, sensor in enumerate(rig.sensors):
-        derivative, order = MEASURED[sensor.quantity]
-        rows[order, j] = sensor.gain * rig.modes.phi(sensor.at, derivative)[0]
-    return rows
+    for order, here, shapes in _shapes_at_sensors(rig):
+        rows[order, here] = shapes
+    return np.array([sensor.gain for sensor in rig.sensors])[:, None] * rows
+
+
+def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
+    """Order in time, sensors and shapes (n_here, n_modes), of sensors of a kind at a time."""
+    measured = [MEASURED[sensor.quantity] for sensor in rig.sensors]
+    for derivative, order in set(measured):
+        here = [j for j, kind in enumerate(measured) if kind == (derivative, order)]
+        yield order, here, rig.modes.phi([rig.sensors[j].at for j in here], derivative)
 
 
 def _stepped(
@@ -336,6 +339,8 @@ def _forces_on_substeps(
 
 
 def _delayed_and_lagged(held: np.ndarray, actuator: Actuator, h: float) -> tuple[np.ndarray, np.ndarray]:
+    if actuator.delay == 0 and actuator.time_constant == 0:
+        return held, held
     shift, rest = divmod(actuator.delay, h)
     padded = np.r_[np.zeros(int(shift) + 1), held][: held.size + 1]
     older, newer = padded[:-1], padded[1:]

@@ -15,6 +15,7 @@ LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = r
 CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
 SETTLED = 1e-10  # of a force: what is left between it and its law
 FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
+LANES = 8  # modes that are worked on at once; a number of them that is no multiple is rounded up, with modes at rest
 
 
 @njit(cache=True, nogil=True)
@@ -222,6 +223,29 @@ def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, co
                 out[r] -= coupling[r, s] * v[s]
 
 
+@njit(cache=True, nogil=True)
+def _widened(values, n, rest):
+    wide = np.full(n, rest)
+    wide[: values.size] = values
+    return wide
+
+
+@njit(cache=True, nogil=True)
+def _widened_rows(values, n):
+    wide = np.zeros((n, values.shape[1]))
+    wide[: values.shape[0]] = values
+    return wide
+
+
+@njit(cache=True, nogil=True)
+def _widened_square(values, n):
+    if values.size == 0:
+        return values
+    wide = np.zeros((n, n))
+    wide[: values.shape[0], : values.shape[1]] = values
+    return wide
+
+
 @njit(cache=True, nogil=True, fastmath=FAST)
 def step_record(
     omega,
@@ -255,13 +279,22 @@ def step_record(
     Where something is measured, (n_sensors, n_samples), its error against reading (3, n_sensors, n_modes) of
     displacement, velocity and acceleration fills error_out, and sets the motion right by gain (2, n_modes, n_sensors).
     """
-    n, n_samples, n_elements, n_inputs = omega.size, q_out.shape[1], kinds.size, forces.shape[0]
+    n_modes, n_samples, n_elements, n_inputs = omega.size, q_out.shape[1], kinds.size, forces.shape[0]
+    n = LANES * ((n_modes + LANES - 1) // LANES)
+    omega, c, coupling = _widened(omega, n, 1.0), _widened(c, n, 0.0), _widened_square(coupling, n)
+    stretching, drag_shapes = _widened_square(stretching, n), _widened_rows(drag_shapes, n)
+    shapes, into = _widened_rows(shapes.T, n).T.copy(), _widened_rows(participation, n).T.copy()
+    n_sensors = measured.shape[0]
+    seen, held = np.zeros((3, n_sensors, n)), np.zeros((2, n_sensors, n))
+    for j in range(n_sensors):
+        for r in range(n_modes):
+            seen[:, j, r] = reading[:, j, r]
+            held[:, j, r] = gain[:, r, j]
     h = dt / n_sub
     e = np.empty((2, 4, n))
     propagators(omega, c, h, e)
     q, v, base_q, base_v = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
     old, new, spread, drive = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    into = np.ascontiguousarray(participation.T)
     point, earlier = np.zeros(n_elements), np.zeros(n_elements)
     w_free, v_free, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
@@ -281,7 +314,7 @@ def step_record(
                     for r in range(n):
                         aw[i, j] += shapes[i, r] * e[0, 3, r] * shapes[j, r]
                         av[i, j] += shapes[i, r] * e[1, 3, r] * shapes[j, r]
-        for r in range(n):
+        for r in range(n_modes):
             q_out[r, k] = q[r]
             v_out[r, k] = v[r]
             f_out[r, k] = old[r]
@@ -289,15 +322,15 @@ def step_record(
             stiffer = 1.0 + rate * k * dt
             for r in range(n):
                 new[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
-            for j in range(measured.shape[0]):
+            for j in range(n_sensors):
                 error = measured[j, k]
                 for r in range(n):
-                    error -= reading[0, j, r] * q[r] + reading[1, j, r] * v[r] + reading[2, j, r] * new[r]
+                    error -= seen[0, j, r] * q[r] + seen[1, j, r] * v[r] + seen[2, j, r] * new[r]
                 error_out[j, k] = error
-            for j in range(measured.shape[0]):
+            for j in range(n_sensors):
                 for r in range(n):
-                    q[r] += gain[0, r, j] * error_out[j, k]
-                    v[r] += gain[1, r, j] * error_out[j, k]
+                    q[r] += held[0, j, r] * error_out[j, k]
+                    v[r] += held[1, j, r] * error_out[j, k]
             for i in range(n_elements):
                 w_old[i] = 0.0
                 for r in range(n):

@@ -134,7 +134,7 @@ def _point_starts(name: str, series: str, typical):
                 if k > 0:
                     yield {"at": place.at, name: share * k}
         for x in evidence.places[::2]:
-            for share in (0.02, 0.1, 0.4):
+            for share in (0.004, 0.02, 0.1, 0.4):
                 yield {"at": float(x), name: share * size}
 
     return starts
