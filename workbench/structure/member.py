@@ -16,7 +16,7 @@ from workbench.structure.supports import HELD, Attachment, End, PointDamper, Poi
 
 HIGHEST_DEGREE = 48
 MOST_FUNCTIONS = 2400
-MANY_SEGMENTS, MOST_SEGMENTS = 200, 600  # so many carry a mode at a low degree; more would take minutes and gigabytes
+MOST_SEGMENTS = 600  # more would take minutes and gigabytes
 THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
 NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or another stands there
 TIP = 1e-9  # of the stiffness at midspan: an end that is no stiffer ends in a point
@@ -81,12 +81,12 @@ class _Member:
                 f"the profiles and attachments of the structure make {nodes.size - 1} segments; at most"
                 f" {MOST_SEGMENTS} are solved: give fewer points, or a smooth function"
             )
-        spare = 12 if nodes.size < MANY_SEGMENTS else 6
-        degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / self.length)) + spare + extra
+        most = n_modes * np.diff(nodes).max() / self.length
+        degree = _carrying(most) + extra
         pieces = int(np.ceil(degree / HIGHEST_DEGREE))
         if pieces > 1:
             nodes = np.unique(np.concatenate([np.linspace(a, b, pieces + 1) for a, b in zip(nodes, nodes[1:])]))
-            degree = int(np.ceil(1.7 * n_modes / pieces)) + 12 + extra // pieces
+            degree = _carrying(most / pieces) + extra // pieces
         return Segments(nodes, min(degree, HIGHEST_DEGREE), continuity)
 
     def _graded(self, at: float, stiffness: Profile) -> list[float]:
@@ -231,6 +231,11 @@ class _Member:
                         row = self._seen_at(segments, part.at, derivative) @ coefficients
                         matrix = matrix + value * row.T @ row
         return matrix
+
+
+def _carrying(half_waves: float) -> int:
+    """The degree of a polynomial that carries so many half waves to ten digits: Bessel's J_k(z) < 1e-10 beyond it."""
+    return int(np.ceil(0.5 * np.pi * half_waves + 10.0 * half_waves ** (1.0 / 3.0))) + 3
 
 
 def _unstable(tension: float) -> str:
