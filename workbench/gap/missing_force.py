@@ -12,6 +12,7 @@ from numba import njit
 from scipy.linalg import cho_factor, cho_solve, expm
 
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.stepping import FAST
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
@@ -166,22 +167,22 @@ def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_varianc
     return 0.5 * (hk + hk.T)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _innovations(a, h, gain, residual, out):
     n, m = a.shape[0], h.shape[0]
-    x, new = np.zeros(n), np.zeros(n)
+    x, new, e = np.zeros(n), np.zeros(n), np.zeros(m)
     for k in range(residual.shape[1]):
         for j in range(m):
             total = residual[j, k]
             for i in range(n):
                 total -= h[j, i] * x[i]
-            out[j, k] = total
+            out[j, k] = e[j] = total
         for i in range(n):
             total = 0.0
             for s in range(n):
                 total += a[i, s] * x[s]
             for j in range(m):
-                total += gain[i, j] * out[j, k]
+                total += gain[i, j] * e[j]
             new[i] = total
         x, new = new, x
 
