@@ -10,18 +10,18 @@ from scipy.optimize import lsq_linear
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.gap.evidence import Evidence
-from workbench.gap.fit import Fit, slopes
+from workbench.gap.fit import Fit, fit, slopes
 from workbench.gap.following import Follower
-from workbench.gap.pairs import _evidence
+from workbench.gap.pairs import Pairs, _evidence
 from workbench.gap.prediction import FitData
-from workbench.gap.pursuit import one_more, pairs_at_once
+from workbench.gap.pursuit import HOPEFUL, one_more, pairs_at_once
 from workbench.gap.search import Search
 from workbench.gap.weighing import Weighed
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import follow
 
 NOISE, DT = 1e-5, 0.01
-CLEARANCE, GAIN = kind_named("clearance"), kind_named("sensor_gain")
+CLEARANCE, GAIN, SPRING = (kind_named(name) for name in ("clearance", "sensor_gain", "ground_spring"))
 
 
 @pytest.fixture(scope="module")
@@ -125,3 +125,19 @@ def test_a_force_is_sought_beside_no_motion_that_runs_away(rig, search):
     assert _evidence(search, softening).rig is rig
     hardening = replace(softening, values={"at": 0.62, "stiffness": 2000.0})
     assert _evidence(search, hardening).rig.elements
+
+
+def test_what_one_half_of_a_wrong_pair_leaves_tells_the_other(search):
+    wrong = (
+        Effect(SPRING, None, {"at": 0.6, "stiffness": 30.0}),
+        Effect(GAIN, "d3", {"gain": 0.85}),
+    )
+    pairs = Pairs(search)
+    pairs.ahead = [fit(search.rig, wrong, search.ahead, iterations=4)]
+    assert pairs.ahead[0].cost > HOPEFUL
+    assert pairs.by_exchange()
+    found = pairs.found[0]
+    assert found.key == ("cubic_spring", "sensor_gain[d3]")
+    cubic = next(effect for effect in found.effects if effect.kind.name == "cubic_spring")
+    assert cubic.values["at"] == pytest.approx(0.62, abs=1e-3)
+    assert cubic.values["stiffness"] == pytest.approx(3000.0, rel=0.01)

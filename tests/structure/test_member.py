@@ -9,6 +9,7 @@ from workbench.structure.damping import ProportionalDamping, ViscousDamping
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import mac
 from workbench.structure.modification import attach
+from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
 from workbench.structure.supports import End, PointDamper, PointMass, PointSpring
 
@@ -301,3 +302,14 @@ def test_nothing_stands_on_a_tip():
     with pytest.raises(ValueError, match="stands on a tip"):
         pointed(PointMass(1.0 - 1e-7, 0.1))
     assert pointed(PointDamper(1.0, 0.1)).modes(2).omega.size == 2
+
+
+@pytest.mark.parametrize("n_modes", [3, 8, 14, 24])
+@pytest.mark.parametrize("attachments", [(), (PointMass(0.7, 2.0),)])
+def test_modes_settle_at_the_first_solution(monkeypatch, n_modes, attachments):
+    left_open = []
+    unresolved = Segments.unresolved
+    monkeypatch.setattr(Segments, "unresolved", lambda *a: left_open.append(unresolved(*a)) or left_open[-1])
+    uniform("clamped", "free", attachments=attachments).modes(n_modes)
+    assert len(left_open) == 1
+    assert left_open[0] > 1e-15  # a degree that carries no more than it must
