@@ -40,7 +40,7 @@ def coupled_figures(
     gain = b.T @ p / weight
     loop = a - b @ gain
     values, vectors = np.linalg.eig(loop)
-    if not values.real.max() < 0:
+    if not values.real.max() < -ON_THE_AXIS * np.abs(values).max():
         return _impossible(positions, modes.n_modes - n)
     held = np.linalg.solve(vectors, start.astype(complex))
     force = -(gain @ vectors) * held @ (1.0 / (1j * modes.omega[None, n:] - values[:, None]))
