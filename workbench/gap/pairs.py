@@ -71,8 +71,7 @@ class Pairs:
             if not self.ahead:
                 return False
             best = self.ahead[0]
-            fresh = (h for h in _weightiest_first(self.search, best) if not any(_unmoved(h, g) for g in self.given))
-            if any(self.beside(half) for half in fresh):
+            if self._beside_any(_weightiest_first(self.search, best)):
                 return True
             if self.ahead[0].cost > NEARER * best.cost:
                 break
@@ -158,7 +157,10 @@ class Pairs:
     def _by_halves(self) -> bool:
         """Whether a pair with either half of the best on whole records explains them."""
         self.missed.append(self.found[0])
-        halves = self.found[0].effects[::-1]
+        return self._beside_any(self.found[0].effects[::-1])
+
+    def _beside_any(self, halves: Sequence[Effect]) -> bool:
+        """Whether a pair with one of these effects explains the records; those given before are not tried again."""
         return any(self.beside(h) for h in halves if not any(_unmoved(h, other) for other in self.given))
 
     def _from_elsewhere(self, share: float = NEAR) -> bool:
