@@ -1,6 +1,5 @@
 """How a set of effects is brought from predictions one sample ahead to whole records."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +11,7 @@ from workbench.gap.fit import fit
 from workbench.gap.prediction import FitData
 from workbench.gap.pursuit import followed
 from workbench.gap.search import Search
+from workbench.gap.workers import ALONE
 from workbench.rig.elements import CubicSpring
 
 CUBIC, NOISE = kind_named("cubic_spring"), 1e-5
@@ -25,19 +25,16 @@ def rig(hinged_rig):
 @pytest.fixture(scope="module")
 def search(rig, record_of):
     """A search beside a spring so stiff that motions a millionth apart part within the record."""
-    with ThreadPoolExecutor(1) as pool:
 
-        def make(stiffness: float, level: float, seed: int) -> Search:
-            rng = np.random.default_rng(seed)
-            command = level * np.repeat(rng.normal(size=200), 10)[None]
-            real = replace(rig, elements=(CubicSpring(0.62, stiffness),))
-            data = FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
-            nominal = data.by_channel(data.residual(rig))
-            return Search(
-                rig, data, data.stepped(2), data.stepped(2), CATALOGUE, lambda text, share: None, pool, nominal
-            )
+    def make(stiffness: float, level: float, seed: int) -> Search:
+        rng = np.random.default_rng(seed)
+        command = level * np.repeat(rng.normal(size=200), 10)[None]
+        real = replace(rig, elements=(CubicSpring(0.62, stiffness),))
+        data = FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
+        quick, nominal = data.stepped(2), data.by_channel(data.residual(rig))
+        return Search(rig, data, quick, quick, CATALOGUE, lambda text, share: None, ALONE, nominal)
 
-        yield make
+    return make
 
 
 def test_rigs_let_go_by_degrees_come_to_whole_records_where_those_let_go_at_once_do_not(rig, search):

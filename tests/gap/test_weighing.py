@@ -1,6 +1,5 @@
 """What sets of effects can come to, weighed by how predictions one sample ahead move with each."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +16,7 @@ from workbench.gap.prediction import FitData
 from workbench.gap.pursuit import HOPEFUL, one_more, pairs_at_once
 from workbench.gap.search import Search
 from workbench.gap.weighing import Weighed
+from workbench.gap.workers import ALONE
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import follow
 
@@ -42,8 +42,7 @@ def search(rig, record_of):
     data = FitData(tuple(records), np.full(4, NOISE))
     quick = data.stepped(2)
     nominal = data.by_channel(data.residual(rig))
-    with ThreadPoolExecutor(1) as pool:
-        yield Search(rig, data, quick, quick.only(("1.0",)), CATALOGUE, lambda text, share: None, pool, nominal)
+    return Search(rig, data, quick, quick.only(("1.0",)), CATALOGUE, lambda text, share: None, ALONE, nominal)
 
 
 def weighed(n_starts: int, seed: int) -> Weighed:

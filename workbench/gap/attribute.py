@@ -1,7 +1,6 @@
 """Which effects: every kind of the catalogue tried alone, then in pairs, until the residual is noise."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +21,7 @@ from workbench.gap.prediction import FitData
 from workbench.gap.pursuit import on_whole_records, one_more
 from workbench.gap.search import Search, spread_over_kinds
 from workbench.gap.weighing import Weighed
+from workbench.gap.workers import ALONE, Workers
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
@@ -61,7 +61,7 @@ def attribute(
     *,
     catalogue: tuple[Kind, ...] = CATALOGUE,
     report: Callable[[str, float], None] = lambda text, share: None,
-    workers: int = 2,
+    workers: Workers = ALONE,
     settle: float = 0.0,
     free_nominal: bool = False,
 ) -> Attribution:
@@ -76,7 +76,7 @@ def attribute(
         records: to fit; validation records have no business here.
         catalogue: kinds of effects to try.
         report: told (what, share done) as the search proceeds.
-        workers: threads.
+        workers: processes that share the work.
         settle: seconds at the start of each record that are simulated but not counted.
         free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
             a little off; otherwise they are freed where no set explains the records without.
@@ -87,8 +87,7 @@ def attribute(
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
     plain = FitData(tuple(records), noise, lead=round(settle / records[0].sample_time))
     seen, data = _plain_to_see(rig, plain)
-    with ThreadPoolExecutor(workers) as pool:
-        return _search(rig, seen, data, catalogue, report, pool, free_nominal)
+    return _search(rig, seen, data, catalogue, report, workers, free_nominal)
 
 
 def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
@@ -108,15 +107,15 @@ def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]
     return tuple(seen), replace(data, noise=noise)
 
 
-def _search(rig, seen, data, catalogue, report, pool, free_nominal) -> Attribution:
+def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attribution:
     base = apply_all(rig, seen)
     nominal = data.by_channel(data.residual(rig))
     start = Fit(seen, cost_of(base, (), data), data.by_channel(data.residual(base)), 0, "read off the records")
     telling = _telling(data, start)
     quick, first = data.only(telling).stepped(2), data.only(telling[:1]).stepped(2)
-    search = Search(base, data, quick, first, catalogue, report, pool, nominal)
+    search = Search(base, data, quick, first, catalogue, report, workers, nominal)
     report("looking for the missing force", 0.02)
-    evidence = Evidence.of(base, data)
+    evidence = Evidence.of(base, data, workers=workers)
     found: Decision | None
     if free_nominal and not search.explains(start):
         found, singles = decide_with_figures_freed(search, start)
@@ -152,7 +151,7 @@ def _of_every_kind(search: Search, singles: Sequence[Fit], ahead: Sequence[Fit])
     """The likeliest kinds alone on whole records, those too that were no rivals one sample ahead."""
     tried = {f.effects[0].kind for f in singles}
     others = [f for f in spread_over_kinds(ahead, 1) if f.effects[0].kind not in tried]
-    more = search.pool.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), others[:SHOWN])
+    more = search.workers.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), others[:SHOWN])
     return sorted((*singles, *more), key=lambda f: f.cost)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from workbench.gap.beside_random import NEAR
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
-from workbench.gap.evidence import FEWER_PLACES, Evidence
+from workbench.gap.evidence import Evidence
 from workbench.gap.finish import ranked, simplest
 from workbench.gap.fit import Fit, fit
 from workbench.gap.outcome import Decision, unexplained
@@ -68,7 +68,7 @@ class _Beside:
         self.plain = search
         (self.freed,) = fit(search.rig, (figures(search.rig),), search.ahead, iterations=6).effects
         self.search = search.beside(self.freed)
-        self.evidence = Evidence.of(apply_all(search.rig, (self.freed,)), search.data)
+        self.evidence = Evidence.of(apply_all(search.rig, (self.freed,)), search.data, workers=search.workers)
         self.weighed = Weighed.of(self.search, (), self.evidence)
         self.ahead = one_more(self.search, (), self.evidence, self.weighed)
 
@@ -88,11 +88,11 @@ class _Beside:
         rig = apply_all(search.rig, (*given, self.freed))
         left = search.ahead.by_channel(search.ahead.residual(rig)).mean(axis=1)
         telling = search.quick.records[int(np.argmax(left))].name
-        evidence = Evidence.of(rig, self.plain.data, FEWER_PLACES)
+        evidence = self.plain.evidence_of(rig)
         return one_more(replace(search, first=search.quick.only((telling,))), given, evidence)
 
     def _fitted(self, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
-        return list(self.search.pool.map(lambda effects: _freed(self.plain, (*effects, self.freed)), sets))
+        return self.search.workers.map(lambda effects: _freed(self.plain, (*effects, self.freed)), sets)
 
 
 def _freed(search: Search, effects: tuple[Effect, ...]) -> Fit:

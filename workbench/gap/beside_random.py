@@ -8,7 +8,7 @@ import numpy as np
 from workbench.gap.disturbance import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
-from workbench.gap.evidence import FEWER_PLACES, Evidence
+from workbench.gap.evidence import Evidence
 from workbench.gap.finish import finished, plainest, ranked, simplest
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.following import Follower
@@ -103,7 +103,7 @@ def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tup
     deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in hearing.rig.sensors}
     if not deaf or any(effect.target in deaf for effect in effects):
         return search, evidence
-    return hearing, Evidence.of(apply_all(hearing.rig, effects), hearing.data, FEWER_PLACES)
+    return hearing, hearing.evidence_of(apply_all(hearing.rig, effects))
 
 
 def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
@@ -129,7 +129,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         evidence: of the rig with the given effects, where it is at hand.
     """
     if evidence is None:
-        evidence = Evidence.of(apply_all(search.rig, given.effects), search.data, FEWER_PLACES)
+        evidence = search.evidence_of(apply_all(search.rig, given.effects))
         evidence = _by_laws_on_measured_motion(search, evidence)
     found = _random_beside(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], NEAR):
@@ -138,7 +138,8 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         refitted = fit(search.rig, given.effects, data, iterations=8)
         rig = apply_all(search.rig, refitted.effects)
         again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
-        evidence = _by_laws_on_measured_motion(search, Evidence.of(rig, search.data, FEWER_PLACES), follower)
+        evidence = search.evidence_of(rig)
+        evidence = _by_laws_on_measured_motion(search, evidence, follower)
         found = _random_beside(search, again, evidence)
     return found
 

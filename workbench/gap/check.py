@@ -184,18 +184,15 @@ def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) ->
     rig, data = evidence.rig, evidence.data
     base = data.residual(rig)
     labels, signatures, strengths = [], [], {}
-    for kind in catalogue:
-        if kind is RANDOM_DISTURBANCE:
+    things = [(k, target) for k in catalogue if k is not RANDOM_DISTURBANCE for target in k.targets(rig)]
+    for effect, change in evidence.workers.map(lambda thing: _first_seen(*thing, evidence, base), things):
+        if effect is None:
             continue
-        for target in kind.targets(rig):
-            effect, change = _first_seen(kind, target, evidence, base)
-            if effect is None:
-                continue
-            size = float(np.linalg.norm(change))
-            strengths[effect.label] = size * float(np.sqrt(THINNING))
-            if size**2 * THINNING > SEEN:
-                labels.append(effect.label)
-                signatures.append((change / size).astype(np.float32))
+        size = float(np.linalg.norm(change))
+        strengths[effect.label] = size * float(np.sqrt(THINNING))
+        if size**2 * THINNING > SEEN:
+            labels.append(effect.label)
+            signatures.append((change / size).astype(np.float32))
     correlation = np.abs(np.array(signatures) @ np.array(signatures).T) if signatures else np.zeros((0, 0))
     alike = [
         (labels[i], labels[j], float(correlation[i, j]))

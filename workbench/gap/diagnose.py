@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+import joblib
 from threadpoolctl import threadpool_limits
 
 from workbench.gap.attribute import Attribution, attribute
@@ -13,6 +14,7 @@ from workbench.gap.experiment import Experiment, next_experiment
 from workbench.gap.locate import locate
 from workbench.gap.shrinkage import Shrinkage, measure
 from workbench.gap.verdict import Verdict
+from workbench.gap.workers import Workers
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
@@ -28,7 +30,7 @@ def diagnose(
     catalogue: tuple[Kind, ...] = CATALOGUE,
     name: str = "case",
     report: Callable[[str, float], None] = lambda text, share: None,
-    workers: int = 2,
+    workers: int | None = None,
     settle: float = 0.0,
     free_nominal: bool = False,
 ) -> Verdict:
@@ -43,7 +45,7 @@ def diagnose(
         catalogue: kinds of effects to try.
         name: of the case.
         report: told (what, share done) as the search proceeds.
-        workers: threads.
+        workers: processes that share the work; None for one a core.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
         free_nominal: fit the nominal frequencies, damping and modal mass along with every candidate from the first.
@@ -58,6 +60,7 @@ def diagnose(
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_modes(rig)
     check_records(rig, records, settle=settle)
+    sharing = Workers(joblib.cpu_count() if workers is None else workers)
     # the threads of the search and those of the linear algebra would wait for one another
     with threadpool_limits(1, user_api="blas"):
         found = attribute(
@@ -65,11 +68,11 @@ def diagnose(
             records,
             catalogue=catalogue,
             report=report,
-            workers=workers,
+            workers=sharing,
             settle=settle,
             free_nominal=free_nominal,
         )
-        return _verdict(rig, found, validation, catalogue, name, settle)
+        return _verdict(rig, found, validation, catalogue, name, settle, sharing)
 
 
 def _verdict(
@@ -79,6 +82,7 @@ def _verdict(
     catalogue: tuple[Kind, ...],
     name: str,
     settle: float,
+    workers: Workers,
 ) -> Verdict:
     corrected = apply_all(rig, found.best.effects)
     shrinkage = measure(rig, corrected, validation, settle=settle)
@@ -96,7 +100,7 @@ def _verdict(
         nominal=rig,
         attribution=found,
         readiness=readiness(found.evidence, catalogue=catalogue),
-        experiment=_next(rig, found),
+        experiment=_next(rig, found, workers),
         notes=_notes(found, outcome),
     )
 
@@ -129,12 +133,12 @@ def _check(rig: Rig, record: Record) -> None:
             )
 
 
-def _next(rig: Rig, found: Attribution) -> Experiment | None:
+def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
     """The experiment that would separate the best set from its likeliest rival."""
     explained = found.outcome == "explained" or any_beyond(found.best.effects)
     for rival, probability in found.rivals:
         if explained and probability > RIVAL:
-            return next_experiment(rig, found.best, rival, found.data)
+            return next_experiment(rig, found.best, rival, found.data, workers)
     return None
 
 

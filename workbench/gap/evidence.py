@@ -17,6 +17,7 @@ from workbench.gap.missing_force import (
     wandering_force_filter,
 )
 from workbench.gap.prediction import FitData
+from workbench.gap.workers import ALONE, Workers
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
 
@@ -55,6 +56,7 @@ class Evidence:
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
         n_places: where a force is looked for.
         told: places of the force, m, where they are known from elsewhere.
+        workers: processes that share the work.
     """
 
     rig: Rig
@@ -63,14 +65,15 @@ class Evidence:
     residuals: tuple[np.ndarray, ...]
     n_places: int = PLACES
     told: tuple[float, ...] = ()
+    workers: Workers = ALONE
 
     @classmethod
-    def of(cls, rig: Rig, data: FitData, n_places: int = PLACES) -> "Evidence":
+    def of(cls, rig: Rig, data: FitData, n_places: int = PLACES, workers: Workers = ALONE) -> "Evidence":
         """Simulate the rig on the fit records."""
         motions = data.motions(rig)
         predictions = data.predictions(rig)
         residuals = tuple(r.outputs - p for r, p in zip(data.counted, predictions, strict=True))
-        return cls(rig, data, motions, residuals, n_places)
+        return cls(rig, data, motions, residuals, n_places, workers=workers)
 
     def without(self, names: Collection[str]) -> "Evidence":
         """The same evidence without some of the sensors; with all of them where none would be left."""
@@ -113,13 +116,18 @@ class Evidence:
         coarse = self.places[::5] if self.places.size > 8 else self.places
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
         sizes = [(share * self.data.force_rms, memory) for memory in MEMORIES for share in LEVELS]
-        return max(sizes, key=lambda size: max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse))
+
+        def likelihood(size: tuple[float, float]) -> float:
+            return max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse)
+
+        return max(zip(self.workers.map(likelihood, sizes), sizes, strict=True), key=lambda each: each[0])[1]
 
     @cached_property
     def profile(self) -> np.ndarray:
         """Log-likelihood of an unknown force at each of `places`."""
-        residuals = list(self.residuals)
-        return np.array([log_likelihood(self.filter_at(x, *self.size), residuals) for x in self.places])
+        residuals, size = list(self.residuals), self.size
+        along = self.workers.map(lambda x: log_likelihood(self.filter_at(x, *size), residuals), self.places)
+        return np.array(along)
 
     @cached_property
     def peaks(self) -> tuple[float, ...]:
@@ -131,7 +139,7 @@ class Evidence:
             return tuple(places[np.argsort(-profile)])
         padded = np.r_[-np.inf, profile, -np.inf]
         tops = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
-        refined = [self._refined(places[i]) for i in tops[np.argsort(-profile[tops])][:MOST_PEAKS]]
+        refined = self.workers.map(self._refined, places[tops[np.argsort(-profile[tops])][:MOST_PEAKS]])
         return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
 
     def _refined(self, at: float) -> tuple[float, float]:
@@ -148,7 +156,7 @@ class Evidence:
     @cached_property
     def at_peaks(self) -> tuple[Place, ...]:
         """The missing force and the motion at the three likeliest places."""
-        return tuple(self.place(x) for x in self.peaks)
+        return tuple(self.workers.map(self.place, self.peaks))
 
     def place(self, x: float) -> Place:
         """The missing force at x and the motion there, smoothed."""

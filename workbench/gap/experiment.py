@@ -7,6 +7,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.fit import Fit
 from workbench.gap.prediction import FitData
+from workbench.gap.workers import ALONE, Workers
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
@@ -43,25 +44,28 @@ class Experiment:
         )
 
 
-def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData) -> Experiment:
+def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Workers = ALONE) -> Experiment:
     """The experiment among variations of the records that separates two fits in the shortest time.
 
     For each variation both corrected rigs are simulated, and what small changes of either one's parameters could make
     up for is projected out; what is left of their difference, in units of the noise, grows with time.
     """
     names = (" + ".join(best.labels), " + ".join(rival.labels))
-    chosen = Experiment("", (), 1.0, np.inf, names)
-    for record in data.records:
-        driven = [name for name, row in zip(record.input_names, record.inputs, strict=True) if np.any(row)]
-        choices = [tuple(driven)] + ([(name,) for name in driven] if len(driven) > 1 else [])
-        for inputs in choices:
-            for level in LEVELS:
-                trial = _varied(record, inputs, level)
-                rate = _separation(rig, best, rival, replace(data, records=(trial,)))
-                seconds = SEPARATED / rate if rate > 0 else np.inf
-                if seconds < chosen.seconds:
-                    chosen = Experiment(record.name, inputs, level, float(seconds), names)
-    return chosen
+
+    def experiment(record: Record, inputs: tuple[str, ...], level: float) -> Experiment:
+        rate = _separation(rig, best, rival, replace(data, records=(_varied(record, inputs, level),)))
+        return Experiment(record.name, inputs, level, SEPARATED / rate if rate > 0 else np.inf, names)
+
+    choices = [(record, inputs, level) for record in data.records for inputs in _choices(record) for level in LEVELS]
+    tried = workers.map(lambda choice: experiment(*choice), choices)
+    soonest = min(tried, key=lambda each: each.seconds)
+    return soonest if np.isfinite(soonest.seconds) else Experiment("", (), 1.0, np.inf, names)
+
+
+def _choices(record: Record) -> list[tuple[str, ...]]:
+    """All inputs that a record drives, and where they are several each alone."""
+    driven = [name for name, row in zip(record.input_names, record.inputs, strict=True) if np.any(row)]
+    return [tuple(driven)] + ([(name,) for name in driven] if len(driven) > 1 else [])
 
 
 def _varied(record: Record, inputs: tuple[str, ...], level: float) -> Record:

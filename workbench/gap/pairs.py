@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.beside_random import NEAR, decide_with_random
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.evidence import FEWER_PLACES, Evidence
+from workbench.gap.evidence import Evidence
 from workbench.gap.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.outcome import Decision, unexplained
@@ -193,7 +193,8 @@ def _firsts(search: Search, *rankings: Sequence[Fit]) -> list[Fit]:
 def _evidence(search: Search, effect: Effect) -> Evidence:
     """Of the rig with the effect; without it where the motion of whole records would run away with it alone."""
     astray = cost_of(search.rig, (effect,), search.data) > ASTRAY * search.nominal.mean()
-    return Evidence.of(search.rig if astray else apply_all(search.rig, (effect,)), search.data, FEWER_PLACES)
+    rig = search.rig if astray else apply_all(search.rig, (effect,))
+    return search.evidence_of(rig)
 
 
 def _weightiest_first(search: Search, pair: Fit) -> list[Effect]:

@@ -53,12 +53,13 @@ def placed(evidence: Evidence) -> Placed:
     lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
     search = _Search(evidence, lines)
     telling = search.telling(guess)
-    profile = np.array([search.misfit(telling, x) for x in places])
+    profile = search.along(telling, places)
     if named:
         at, std = float(places[int(np.argmin(profile))]), 0.0
     else:
-        at, telling = min((search.refined(top) for top in _valleys(places, profile)), key=search.judged)
-        profile, std = np.array([search.misfit(telling, x) for x in places]), search.deviation(telling, at)
+        at = min(evidence.workers.map(search.refined, _valleys(places, profile)), key=search.judged)
+        telling = search.telling(at)
+        profile, std = search.along(telling, places), search.deviation(telling, at)
     lowest = min(search.misfit(telling, at), profile.min())
     std *= np.sqrt(max(search.left(at), 0.0) + 1.0)
     return Placed(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
@@ -106,8 +107,12 @@ class _Search:
         share = float(np.clip(1.0 - left * self.freedom / gap, 0.0, 1.0))
         return share, bool(left < NOISE + chance or share > 1.0 - ALL_BUT)
 
-    def refined(self, top: float) -> tuple[float, list[Lines]]:
-        """The bottom of a valley, and the lines by what they tell there."""
+    def along(self, lines: list[Lines], places: np.ndarray) -> np.ndarray:
+        """The misfit at each of the places."""
+        return np.array(self.evidence.workers.map(lambda x: self.misfit(lines, x), places))
+
+    def refined(self, top: float) -> float:
+        """The bottom of a valley."""
         at, telling = float(top), self.telling(top)
         spacing = self.evidence.places[1] - self.evidence.places[0]
         for _ in range(ROUNDS):
@@ -122,11 +127,11 @@ class _Search:
             telling = self.telling(at)
             if moved < RESOLVED * spacing:
                 break
-        return at, telling
+        return at
 
-    def judged(self, found: tuple[float, list[Lines]]) -> float:
+    def judged(self, at: float) -> float:
         """The misfit of a valley by all lines alike: those that one of them weighs would favour it."""
-        return self.misfit(self.lines, found[0])
+        return self.misfit(self.lines, at)
 
     def deviation(self, lines: list[Lines], at: float) -> float:
         """Half of one standard deviation either way, from where the misfit is two higher."""

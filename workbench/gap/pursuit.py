@@ -58,12 +58,12 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
     def ahead(effects: tuple[Effect, ...], data: FitData, iterations: int) -> Fit:
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
-    tried = search.pool.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[:TRIED])
+    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[:TRIED])
     likely = sorted(tried, key=promise)[:LIKELY]
     fits = distinct_valleys(
-        search, sorted(search.pool.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
+        search, sorted(search.workers.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
     )
-    longer = search.pool.map(lambda f: ahead(f.effects, search.ahead, 8) if f.falling else f, fits[:LIKELIEST])
+    longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8) if f.falling else f, fits[:LIKELIEST])
     return distinct_valleys(search, sorted((*longer, *fits[LIKELIEST:]), key=lambda f: f.cost))
 
 
@@ -87,10 +87,10 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int) -> list[Fi
     fits = [followed(search, f.effects, 5) for f in close[:1]]
     if fits and search.explains(fits[0]):
         close = [f for f in close if f.cost < ahead[0].cost + RIVAL]
-    fits += search.pool.map(lambda f: followed(search, f.effects, 5), close[1:])
+    fits += search.workers.map(lambda f: followed(search, f.effects, 5), close[1:])
     fits.sort(key=promise)
     running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
-    longer = search.pool.map(lambda f: whole(search, f.effects, 25), running)
+    longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 
 

@@ -1,7 +1,6 @@
 """What every step of a search for effects works on, and what it may call an explanation."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -9,10 +8,12 @@ from itertools import combinations
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.evidence import FEWER_PLACES, Evidence
 from workbench.gap.fit import HOPELESS, Fit, sensitivity
 from workbench.gap.following import Follower
 from workbench.gap.missing_force import ForceFilter
 from workbench.gap.prediction import FitData
+from workbench.gap.workers import Workers
 from workbench.rig.rig import Rig
 
 SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
@@ -35,7 +36,7 @@ class Search:
         first: the most telling one.
         catalogue: kinds of effects to try.
         report: told (what, share done).
-        pool: threads.
+        workers: processes that share the work.
         nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
         held: effects that every candidate stands beside, as they are.
     """
@@ -46,7 +47,7 @@ class Search:
     first: FitData
     catalogue: tuple[Kind, ...]
     report: Callable[[str, float], None]
-    pool: ThreadPoolExecutor
+    workers: Workers
     nominal: np.ndarray
     held: tuple[Effect, ...] = ()
 
@@ -90,6 +91,10 @@ class Search:
         data, quick, first = (data.through(whitener, follower) for data in (self.data, self.quick, self.first))
         return replace(self, data=data, quick=quick, first=first)
 
+    def evidence_of(self, rig: Rig) -> Evidence:
+        """What the records say of a missing force beside what a rig has."""
+        return Evidence.of(rig, self.data, FEWER_PLACES, self.workers)
+
     def hearing(self) -> "Search":
         """The same search without sensors that clip or round coarsely: what they do not show would pass for a force."""
         kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < COARSE * s.noise_std]
@@ -122,7 +127,7 @@ class Search:
 
     def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
         """`function(search, candidate)` of each, in their order."""
-        return list(self.pool.map(lambda candidate: function(self, candidate), candidates))
+        return self.workers.map(lambda candidate: function(self, candidate), candidates)
 
 
 def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:

@@ -5,11 +5,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import finite_residual, slopes
 from workbench.gap.search import ELSEWHERE, Search, apart
+from workbench.gap.workers import shared_array
 from workbench.rig.rig import Rig
 
 WEAKER, STRONGER = 0.03, 30.0  # than at its start: what an effect may turn out to be
@@ -54,21 +56,24 @@ class Weighed:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.length)
         thin = slice(None, None, max(1, before.size // MOST_VALUES))
 
-        def move(start: Effect) -> np.ndarray | None:
-            moved = finite_residual(search.rig, (*given, start, *search.held), data)
-            return None if moved is None else (moved - before)[thin]
-
-        _ = evidence.at_peaks
         tasks = _starts(search, given, evidence)
         starts = [start for task in tasks for start in task]
         bounds = [_bounds(task) for task in tasks for _ in task]
         left = before[thin]
-        telling: list[int] = []
-        moves = np.empty((len(starts), left.size))  # the one large array: rows that tell nothing are closed up in place
-        for i, m in enumerate(search.pool.map(move, starts)):
-            if m is not None and 0 < m @ m < RUNAWAY * m.size:
-                moves[len(telling)] = m
-                telling.append(i)
+        moves = shared_array(len(starts), left.size)  # the one large array
+
+        def tells(i: int) -> bool:
+            moved = finite_residual(search.rig, (*given, starts[i], *search.held), data)
+            if moved is None:
+                return False
+            moves[i] = (moved - before)[thin]
+            return bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size)
+
+        for i in {start.kind: i for i, start in enumerate(starts) if start.kind not in CATALOGUE}.values():
+            tells(i)  # a law of the user's own is compiled here, before processes part that would each compile it
+        telling = [i for i, tell in enumerate(search.workers.map(tells, range(len(starts)))) if tell]
+        for row, i in enumerate(telling):  # those that tell nothing are closed up in place
+            moves[row] = moves[i]
         moves = moves[: len(telling)]
         if given and telling:
             basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[thin])

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -71,6 +72,10 @@ class Kind:
     nonlinear: bool = False
     phrase: str = ""
     last: bool = False
+    known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
+
+    def __post_init__(self) -> None:
+        Kind.known[id(self)] = self
 
     @property
     def words(self) -> str:
