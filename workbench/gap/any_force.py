@@ -144,7 +144,8 @@ def _compliance(rig: Rig, omega: np.ndarray) -> np.ndarray:
     dynamic[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 - omega[:, None] ** 2
     inverse = np.linalg.inv(dynamic)
     rate = 1j * omega[:, None, None]
-    return sum(rate**order * (rows @ inverse) for order, rows in enumerate(reading_of(rig)))
+    rows, orders = reading_of(rig)
+    return rate ** orders[:, None] * (rows @ inverse)
 
 
 def _tail(rig: Rig, model: SampledModel, turn: np.ndarray) -> np.ndarray:

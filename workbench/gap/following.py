@@ -76,7 +76,7 @@ class Follower:
         """Errors one sample ahead, in the sensors' units."""
         slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
         quick = _at_once(slow)
-        if quick.sensors != slow.sensors:
+        if quick is not slow:
             motion = move(rig, record.inputs, sample_time=dt, substeps=substeps)
             measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
         gain = self._gain_for(rig.modes.n_modes)
@@ -118,8 +118,14 @@ def _carried_on(a: np.ndarray, h: np.ndarray, gain: np.ndarray, errors: np.ndarr
 
 
 def _unrounded(rig: Rig) -> Rig:
+    """The rig itself where no sensor rounds."""
+    if not any(sensor.step for sensor in rig.sensors):
+        return rig
     return replace(rig, sensors=tuple(replace(sensor, step=0.0) for sensor in rig.sensors))
 
 
 def _at_once(rig: Rig) -> Rig:
+    """The rig itself where no sensor lags or clips."""
+    if not any(sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors):
+        return rig
     return replace(rig, sensors=tuple(replace(sensor, time_constant=0.0, limit=np.inf) for sensor in rig.sensors))

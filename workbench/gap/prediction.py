@@ -11,7 +11,7 @@ from workbench.gap.following import LOOSE, Follower
 from workbench.gap.missing_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import Motion, is_stepped, move, read
+from workbench.rig.simulate import Motion, is_stepped, move, read, steps_exactly
 
 REMEMBERED = 24
 
@@ -140,10 +140,17 @@ class FitData:
         if follower is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self._whole(rig)])
         if is_stepped(rig):
-            ahead = [follower.errors(rig, record, self.substeps)[:, self.lead :] for record in self.records]
-            return np.concatenate([errors.ravel() for errors in ahead])
-        dt = self.records[0].sample_time
-        return np.concatenate([follower.errors_of_linear(rig, r, dt, self.substeps).ravel() for r in self._whole(rig)])
+            ahead = [follower.errors(rig, record, self.substeps) for record in self.records]
+        elif steps_exactly(rig):
+            ahead = [follower.errors(rig, record, 1) for record in self.records]
+        else:
+            dt, whole = self.records[0].sample_time, self._from_the_first_sample._whole(rig)
+            ahead = [follower.errors_of_linear(rig, left, dt, self.substeps) for left in whole]
+        return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
+
+    @cached_property
+    def _from_the_first_sample(self) -> "FitData":
+        return replace(self, lead=0) if self.lead else self
 
     def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
         """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""

@@ -60,7 +60,7 @@ LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
     UserLaw: (USER, lambda e: e.parameters),
 }
-NOT_MEASURED, NOTHING = np.zeros((0, 0)), np.zeros((0, 0, 0))
+NOT_MEASURED, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +120,13 @@ def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8)
 def is_stepped(rig: Rig) -> bool:
     """Whether the motion has no closed form and is stepped through time."""
     return rig.stiffness_rate != 0 or any(not isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
+
+
+def steps_exactly(rig: Rig) -> bool:
+    """Whether steps of a whole sample are exact: no law, delay, lag or sinusoid, and no damping between the modes."""
+    damping = rig.modes.damping
+    late = any(actuator.delay or actuator.time_constant for actuator in rig.actuators)
+    return not (late or rig.elements or rig.stiffness_rate or np.any(damping - np.diag(np.diag(damping))))
 
 
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
@@ -196,7 +203,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
-    q, v, beside, _ = _stepped(rig, inputs, NOT_MEASURED, NOTHING, sample_time, substeps)
+    q, v, beside, _ = _stepped(rig, inputs, NOT_MEASURED, NO_GAIN, sample_time, substeps)
     modes = rig.modes
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     # the forces beside hold what couples the modes; only each mode's own damping is left
@@ -223,12 +230,12 @@ def follow(
     return _stepped(rig, inputs, outputs, gain, sample_time, substeps)[3]
 
 
-def reading_of(rig: Rig) -> np.ndarray:
-    """What the sensors read of displacement, velocity and acceleration of the modes: (3, n_sensors, n_modes)."""
-    rows = np.zeros((3, len(rig.sensors), rig.modes.n_modes))
+def reading_of(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
+    """What the sensors read of the modes (n_sensors, n_modes), of which derivative in time (n_sensors,)."""
+    rows, orders = np.zeros((len(rig.sensors), rig.modes.n_modes)), np.zeros(len(rig.sensors), np.int64)
     for order, here, shapes in _shapes_at_sensors(rig):
-        rows[order, here] = shapes
-    return np.array([sensor.gain for sensor in rig.sensors])[:, None] * rows
+        rows[here], orders[here] = shapes, order
+    return np.array([sensor.gain for sensor in rig.sensors])[:, None] * rows, orders
 
 
 def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
@@ -256,6 +263,7 @@ def _stepped(
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
             forces, at_samples = np.vstack([forces, mean]), np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi(element.at)[0]])
+    driven = forces.any(axis=1)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
     parameters = np.zeros((len(points), 3))
     for row, element in zip(parameters, points, strict=True):
@@ -265,11 +273,10 @@ def _stepped(
     drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
     drag_shapes, drag_weights = _along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
     q, v, f = (np.zeros((modes.n_modes, n_samples)) for _ in range(3))
-    known, reading, errors = outputs, NOTHING, np.empty_like(outputs)
+    known, reading, orders, errors = outputs, NOT_MEASURED, NO_ORDERS, np.empty_like(outputs)
     if outputs.size:
-        reading, time = reading_of(rig), np.linspace(0.0, 1.0, n_samples)
-        offset = np.array([[s.bias] for s in rig.sensors]) + np.outer([s.drift for s in rig.sensors], time)
-        known = outputs - offset - reading[2] @ (participation @ at_samples)
+        reading, orders = reading_of(rig)
+        known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
     _stepper(tuple(e.law for e in points if isinstance(e, UserLaw)))(
         modes.omega,
         diagonal,
@@ -277,8 +284,8 @@ def _stepped(
         sample_time,
         substeps,
         rig.stiffness_rate,
-        forces,
-        participation,
+        forces[driven],
+        participation[:, driven],
         stretch,
         _stretching(rig) if stretch else np.zeros((0, 0)),
         np.ascontiguousarray(drag_shapes.T),
@@ -287,6 +294,7 @@ def _stepped(
         modes.phi([e.at for e in points]) if points else np.zeros((0, modes.n_modes)),
         parameters,
         known,
+        orders,
         reading,
         gain,
         q,
@@ -296,6 +304,18 @@ def _stepped(
     )
     acting = f if outputs.size else participation @ at_samples + f
     return q, v, acting, errors
+
+
+def _left_to_motion(rig: Rig, outputs: np.ndarray, reading, orders, participation, at_samples) -> np.ndarray:
+    """Outputs (n_sensors, n_samples) without biases, drifts, and the accelerations under the actuators' own forces."""
+    known = outputs.copy()
+    for j, sensor in enumerate(rig.sensors):
+        if sensor.bias or sensor.drift:
+            known[j] -= sensor.bias + sensor.drift * np.linspace(0.0, 1.0, outputs.shape[1])
+    here = np.flatnonzero(orders == 2)
+    if here.size and at_samples.size:
+        known[here] -= reading[here] @ (participation @ at_samples)
+    return known
 
 
 @cache

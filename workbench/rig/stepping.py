@@ -264,6 +264,7 @@ def step_record(
     shapes,
     parameters,
     measured,
+    orders,
     reading,
     gain,
     q_out,
@@ -276,8 +277,9 @@ def step_record(
     forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
     stretching (n_modes, n_modes); drag_shapes (n_modes, n_points); shapes (n_elements, n_modes).
 
-    Where something is measured, (n_sensors, n_samples), its error against reading (3, n_sensors, n_modes) of
-    displacement, velocity and acceleration fills error_out, and sets the motion right by gain (2, n_modes, n_sensors).
+    Where something is measured, (n_sensors, n_samples), its error against reading (n_sensors, n_modes) of displacement,
+    velocity or acceleration, by orders (n_sensors,) 0, 1 or 2, fills error_out, and sets the motion right by gain
+    (2, n_modes, n_sensors).
     """
     n_modes, n_samples, n_elements, n_inputs = omega.size, q_out.shape[1], kinds.size, forces.shape[0]
     n = LANES * ((n_modes + LANES - 1) // LANES)
@@ -285,10 +287,12 @@ def step_record(
     stretching, drag_shapes = _widened_square(stretching, n), _widened_rows(drag_shapes, n)
     shapes, into = _widened_rows(shapes.T, n).T.copy(), _widened_rows(participation, n).T.copy()
     n_sensors = measured.shape[0]
-    seen, held = np.zeros((3, n_sensors, n)), np.zeros((2, n_sensors, n))
+    seen, held = np.zeros((n_sensors, n)), np.zeros((2, n_sensors, n))
+    accelerations = False
     for j in range(n_sensors):
+        accelerations |= orders[j] == 2
         for r in range(n_modes):
-            seen[:, j, r] = reading[:, j, r]
+            seen[j, r] = reading[j, r]
             held[:, j, r] = gain[:, r, j]
     h = dt / n_sub
     e = np.empty((2, 4, n))
@@ -319,18 +323,21 @@ def step_record(
             v_out[r, k] = v[r]
             f_out[r, k] = old[r]
         if measured.size > 0:
-            stiffer = 1.0 + rate * k * dt
-            for r in range(n):
-                new[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
-            for j in range(n_sensors):
-                error = measured[j, k]
+            if accelerations:
+                stiffer = 1.0 + rate * k * dt
                 for r in range(n):
-                    error -= seen[0, j, r] * q[r] + seen[1, j, r] * v[r] + seen[2, j, r] * new[r]
-                error_out[j, k] = error
+                    new[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
             for j in range(n_sensors):
+                motion = q if orders[j] == 0 else v if orders[j] == 1 else new
+                read = 0.0
                 for r in range(n):
-                    q[r] += held[0, j, r] * error_out[j, k]
-                    v[r] += held[1, j, r] * error_out[j, k]
+                    read += seen[j, r] * motion[r]
+                error_out[j, k] = measured[j, k] - read
+            for j in range(n_sensors):
+                error = error_out[j, k]
+                for r in range(n):
+                    q[r] += held[0, j, r] * error
+                    v[r] += held[1, j, r] * error
             for i in range(n_elements):
                 w_old[i] = 0.0
                 for r in range(n):
@@ -373,8 +380,9 @@ def step_record(
                 for r in range(n):
                     new[r] = spread[r]
                 for i in range(n_elements):
+                    force = point[i]
                     for r in range(n):
-                        new[r] += shapes[i, r] * point[i]
+                        new[r] += shapes[i, r] * force
                 for r in range(n):
                     q[r] = base_q[r] + e[0, 3, r] * new[r]
                     v[r] = base_v[r] + e[1, 3, r] * new[r]
