@@ -27,6 +27,7 @@ from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
 SHOWN = 7  # others that are, to be shown beside them
+ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +152,11 @@ def _of_every_kind(search: Search, singles: Sequence[Fit], ahead: Sequence[Fit])
     """The likeliest kinds alone on whole records, those too that were no rivals one sample ahead."""
     tried = {f.effects[0].kind for f in singles}
     others = [f for f in spread_over_kinds(ahead, 1) if f.effects[0].kind not in tried]
-    more = search.workers.map(lambda f: fit(search.rig, f.effects, search.data, iterations=5), others[:SHOWN])
-    return sorted((*singles, *more), key=lambda f: f.cost)
+
+    def on_all(candidate: Fit) -> Fit:
+        return fit(search.rig, candidate.effects, search.data, iterations=5, tolerance=ALIKE)
+
+    return sorted((*singles, *search.workers.map(on_all, others[:SHOWN])), key=lambda f: f.cost)
 
 
 def _with_a_second(

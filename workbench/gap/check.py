@@ -10,6 +10,7 @@ from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.structural import RESOLUTION
 from workbench.gap.evidence import Evidence
+from workbench.gap.prediction import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate
@@ -21,6 +22,7 @@ FAR_OFF, HEARD = 50.0, 5.0  # times the model: in other units; times the noise: 
 ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
 STUCK = 0.5
 THINNING = 3
+COARSELY = 2  # substeps of a sample: whether an effect shows needs no more
 STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
 DECADES = (1e2, 1e-2, 1e4, 1e-4)
 
@@ -181,11 +183,11 @@ def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
 
 def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Readiness:
     """Simulate each effect at a strength that the records show, and compare the responses."""
-    rig, data = evidence.rig, evidence.data
+    rig, data = evidence.rig, evidence.data.stepped(COARSELY)
     base = data.residual(rig)
     labels, signatures, strengths = [], [], {}
     things = [(k, target) for k in catalogue if k is not RANDOM_DISTURBANCE for target in k.targets(rig)]
-    for effect, change in evidence.workers.map(lambda thing: _first_seen(*thing, evidence, base), things):
+    for effect, change in evidence.workers.map(lambda thing: _first_seen(*thing, evidence, data, base), things):
         if effect is None:
             continue
         size = float(np.linalg.norm(change))
@@ -207,13 +209,13 @@ def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) ->
     )
 
 
-def _first_seen(kind: Kind, target, evidence: Evidence, base: np.ndarray):
+def _first_seen(kind: Kind, target, evidence: Evidence, data: FitData, base: np.ndarray):
     """The first strength of a kind that these records show, or the one that they show most; and what it changes."""
     best, change, most = None, np.zeros(0), -1.0
     for effect in _strengths(kind, target, evidence):
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                moved = (evidence.data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
+                moved = (data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
                 size = float(moved @ moved) * THINNING
             except (ValueError, np.linalg.LinAlgError):
                 continue

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import cont2discrete, lfilter
 
 from workbench.gap.prediction import FitData
 from workbench.records.record import Record
+from workbench.rig.linear import held_response, modal_motion, modal_poles
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import participation_of
 
@@ -58,20 +58,13 @@ def _replies(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
     A mode under each input by itself, where its participation has changed; resonators beside it under its modal force,
     where its frequency or damping has.
     """
-    rows = [record.inputs]
+    if not chosen:
+        return record.inputs
     slowest = 2.0 * np.pi / (record.n_samples * record.sample_time)
-    acting = participation_of(rig)
-    for r in chosen:
-        omega, damping = max(rig.modes.omega[r], slowest), rig.modes.damping[r, r]
-        rows += _resonator(omega, damping, record.inputs, record.sample_time)
-        modal_force = acting[r] @ record.inputs
-        for factor in SPREAD:
-            rows += _resonator(factor * omega, damping, modal_force[None], record.sample_time)
-    return np.concatenate(rows)
-
-
-def _resonator(omega: float, damping: float, forces: np.ndarray, sample_time: float) -> list[np.ndarray]:
-    """Displacement and velocity of a resonator under each force, each (n_forces, n_samples)."""
-    system = ([[0.0, 1.0], [1.0, 0.0]], [1.0, max(damping, 1e-3 * omega), omega**2])
-    numerators, denominator, _ = cont2discrete(system, sample_time)
-    return [lfilter(numerator, denominator, forces, axis=1) for numerator in numerators]
+    alone, acting = np.eye(len(rig.actuators)), participation_of(rig)
+    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), SPREAD]
+    damping = np.maximum(np.diag(rig.modes.damping)[chosen, None], 1e-3 * omega)
+    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(SPREAD))])
+    resonators = modal_poles(omega.ravel(), np.diag(damping.ravel()))
+    response, _ = held_response(resonators, record.inputs, driven, record.sample_time)
+    return np.concatenate([record.inputs, *modal_motion(resonators, response)])

@@ -14,6 +14,7 @@ from workbench.rig.simulate import is_stepped
 FINE = 8  # substeps of a sample
 TARGETS_A_KIND = 3  # of single effects that are tried
 TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
+FAR_BEHIND = 30.0  # times the least promise: what is not fitted to its end
 HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
 LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
 AT_HAND = 10.0  # times the noise: so near, whole records tell the way
@@ -63,8 +64,9 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
     fits = distinct_valleys(
         search, sorted(search.workers.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
     )
-    longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8) if f.falling else f, fits[:LIKELIEST])
-    return distinct_valleys(search, sorted((*longer, *fits[LIKELIEST:]), key=lambda f: f.cost))
+    falling = [f for f in fits[:LIKELIEST] if f.falling and promise(f) < FAR_BEHIND * promise(fits[0])]
+    longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8), falling)
+    return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
 
 
 def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
