@@ -18,7 +18,7 @@ from workbench.gap.one_law import one_law, weighed_against
 from workbench.gap.outcome import Decision
 from workbench.gap.pairs import Pairs
 from workbench.gap.prediction import FitData
-from workbench.gap.pursuit import on_whole_records, one_more
+from workbench.gap.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search import Search, spread_over_kinds
 from workbench.gap.weighing import Weighed
 from workbench.gap.workers import ALONE, Workers
@@ -127,9 +127,10 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
             weighed = Weighed.of(search, (), evidence)
             ahead = one_more(search, (), evidence, weighed)
             report("one effect, on whole records", 0.3)
-            singles = on_whole_records(search, ahead, FINALISTS)
+            hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
+            singles = on_whole_records(search, hopeful, FINALISTS)
             found = decide(search, start, singles)
-            found = found or _with_a_second(search, start, singles, ahead, weighed, evidence)
+            found = found or _with_a_second(search, start, ahead, weighed, evidence)
             singles = _of_every_kind(search, singles, ahead)
     outcome, best, random, rivals = found
     if seen:
@@ -159,9 +160,7 @@ def _of_every_kind(search: Search, singles: Sequence[Fit], ahead: Sequence[Fit])
     return sorted((*singles, *search.workers.map(on_all, others[:SHOWN])), key=lambda f: f.cost)
 
 
-def _with_a_second(
-    search: Search, start: Fit, singles: list[Fit], ahead: list[Fit], weighed: Weighed, evidence: Evidence
-) -> Decision:
+def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighed, evidence: Evidence) -> Decision:
     """What a second effect explains, or one law that the catalogue does not hold, or figures that are a little off."""
     law = one_law(search, evidence)
     pairs = Pairs(search)
@@ -170,7 +169,7 @@ def _with_a_second(
         return weighed_against(law, search, pairs.decision(start))
     if explained or pairs.by_exchange():
         return pairs.decision(start)
-    return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, singles, ahead)
+    return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, ahead)
 
 
 def _telling(data: FitData, start: Fit) -> tuple[str, ...]:

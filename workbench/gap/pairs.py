@@ -17,6 +17,7 @@ from workbench.gap.search import Search, apart, in_one_valley, spread_over_kinds
 from workbench.gap.weighing import Weighed
 
 FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
+SINGLES = 8  # that are fitted to whole records before they are gone through
 FIRSTS = 4  # single effects that a second one is looked for beside
 FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
 ASTRAY = 1e4  # times the gap's power
@@ -88,7 +89,7 @@ class Pairs:
         evidence = evidence or _evidence(self.search, effect)
         return self._explained_by(one_more(self.search, (effect,), evidence))
 
-    def one_by_one(self, start: Fit, singles: Sequence[Fit], ahead: Sequence[Fit]) -> Decision:
+    def one_by_one(self, start: Fit, ahead: Sequence[Fit]) -> Decision:
         """The best few single effects, each with a second one or a random disturbance, until a pair explains.
 
         In a near miss the right half has nearly its right numbers, better ones than it had alone: as soon as there is
@@ -96,10 +97,9 @@ class Pairs:
 
         Args:
             start: what is there with no effect.
-            singles: every kind's best fit alone, on whole records.
-            ahead: the same to predictions one sample ahead.
+            ahead: every kind's best fit alone, to predictions one sample ahead.
         """
-        for first in _firsts(self.search, ahead, singles):
+        for first in _firsts(self.search, ahead, on_whole_records(self.search, ahead, SINGLES)):
             (effect,) = first.effects
             if any(_alike(effect, half, self.search) for pair in self.missed for half in pair.effects):
                 continue

@@ -14,7 +14,7 @@ from workbench.rig.simulate import is_stepped
 FINE = 8  # substeps of a sample
 TARGETS_A_KIND = 3  # of single effects that are tried
 TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
-FAR_BEHIND = 30.0  # times the least promise: what is not fitted to its end
+FAR_BEHIND = 10.0  # times the least promise: what is not fitted to its end
 HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
 LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
 AT_HAND = 10.0  # times the noise: so near, whole records tell the way
