@@ -432,6 +432,7 @@ def diagnose(
     free_nominal: Annotated[
         bool, typer.Option("--free-nominal", help="The nominal frequencies and damping are known to be a little off.")
     ] = False,
+    workers: Annotated[int | None, typer.Option(help="Processes that share the work; default one a core.")] = None,
 ) -> None:
     """Say where a simulation and a test disagree, which effect is missing, and how far the gap then shrinks.
 
@@ -453,6 +454,7 @@ def diagnose(
             validation=found.validation,
             name=found.name,
             free_nominal=free_nominal,
+            workers=workers,
             report=lambda text, share: progress.update(task, description=text, completed=share),
         )
     console.print(verdict.sentence, style="bold", markup=False)

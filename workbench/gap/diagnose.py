@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 
-import joblib
 from threadpoolctl import threadpool_limits
 
 from workbench.gap.attribute import Attribution, attribute
@@ -45,7 +44,7 @@ def diagnose(
         catalogue: kinds of effects to try.
         name: of the case.
         report: told (what, share done) as the search proceeds.
-        workers: processes that share the work; None for one a core.
+        workers: processes that share the work, this one included; None for one a core.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
         free_nominal: fit the nominal frequencies, damping and modal mass along with every candidate from the first.
@@ -60,7 +59,7 @@ def diagnose(
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_modes(rig)
     check_records(rig, records, settle=settle)
-    sharing = Workers(joblib.cpu_count() if workers is None else workers)
+    sharing = Workers.at_hand() if workers is None else Workers(workers)
     # the threads of the search and those of the linear algebra would wait for one another
     with threadpool_limits(1, user_api="blas"):
         found = attribute(

@@ -156,6 +156,7 @@ class Evidence:
     @cached_property
     def at_peaks(self) -> tuple[Place, ...]:
         """The missing force and the motion at the three likeliest places."""
+        _ = self.size  # found once, before the work is shared
         return tuple(self.workers.map(self.place, self.peaks))
 
     def place(self, x: float) -> Place:

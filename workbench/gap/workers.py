@@ -12,12 +12,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from mmap import mmap
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
+import joblib
 import numpy as np
 
 from workbench.gap.effects.effect import Kind
 
+MOST = 8  # processes: to fork one takes a hundredth of a second, every time
 FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not survive one, or there is none
 TURN = 4  # bytes of a number in the pipe that turns are taken from
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
@@ -36,6 +38,15 @@ class Workers:
 
     number: int = 1
 
+    def __post_init__(self) -> None:
+        if self.number < 1:
+            raise ValueError(f"workers is a number of processes, this one included: 1 or more; got {self.number}")
+
+    @classmethod
+    def at_hand(cls) -> "Workers":
+        """One a core, as long as they pay for being forked."""
+        return cls(min(joblib.cpu_count(), MOST))
+
     def map(self, function: Callable[[Item], Found], items: Iterable[Item]) -> list[Found]:
         """`function(item)` of each, in their order; each process takes the next item when it is done with one.
 
@@ -46,7 +57,7 @@ class Workers:
             ChildProcessError: a process was killed, for want of memory for instance.
         """
         items = list(items)
-        number = min(self.number, len(items))
+        number = 1 if _Helper.is_this_process else min(self.number, len(items))
         if number < 2:
             return [function(item) for item in items]
         if not FORKS:
@@ -99,7 +110,9 @@ def _taken(function: Callable, items: list, turns: int) -> dict[int, Any]:
 
 
 class _Helper:
-    """A forked process that takes its turns and sends back what it found."""
+    """A forked process that takes its turns and sends back what it found; it has no helpers of its own."""
+
+    is_this_process = False
 
     def __init__(self, function: Callable, items: list, turns: int):
         self._source, sink = os.pipe()
@@ -118,7 +131,7 @@ class _Helper:
         try:
             found = _Receiver(BytesIO(answer)).load()
         except (EOFError, pickle.UnpicklingError):
-            text = "a process of the diagnosis was killed; is there memory for so many? Try workers=1"
+            text = "a process of the diagnosis was killed; is there memory for so many? Try one worker alone"
             raise ChildProcessError(text) from None
         if isinstance(found, BaseException):
             raise found
@@ -132,9 +145,10 @@ class _Helper:
             os.waitpid(self._pid, 0)
 
 
-def _help(function: Callable, items: list, turns: int, sink: int) -> None:
+def _help(function: Callable, items: list, turns: int, sink: int) -> NoReturn:
     """The life of a helper; it ends here, without what a process does at its end for those that it was forked from."""
     try:
+        _Helper.is_this_process = True
         try:
             answer = _sent(_taken(function, items, turns))
         except Exception as error:
@@ -153,7 +167,7 @@ def _sent(found: Any) -> bytes:
 
 
 class _Sender(pickle.Pickler):
-    """Kinds of effects are sent by name: they hold functions, and a search knows them by what they are."""
+    """Kinds of effects are sent as the one that is here: they hold functions, and a search asks which one it is."""
 
     def persistent_id(self, thing: Any) -> int | None:
         return id(thing) if isinstance(thing, Kind) else None
