@@ -25,6 +25,7 @@ figures: $(BIN)/workbench  ## every study that makes its own data, with its figu
 bench: $(BIN)/workbench  ## speeds, as ratios, in ten minutes; the bench to play on is `workbench bench`
 	$(BIN)/workbench study design_scaling
 	$(BIN)/workbench study many_cases
+	$(BIN)/workbench study diagnosis_speed
 
 docs: $(BIN)/workbench  ## README.md and a page a room, workbench/*/README.md: every example, number and name in them checked
 	$(BIN)/python -m pytest -q tests/test_readme.py

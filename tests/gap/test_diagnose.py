@@ -22,6 +22,15 @@ def verdict_on(case, **options):
     return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, **options)
 
 
+def test_the_verdict_does_not_depend_on_how_many_share_the_work(hinged_rig, record_of):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    real = kind_named("cubic_spring").apply(rig, None, {"at": 0.62, "stiffness": 2000.0})
+    commands = [level * np.repeat(rng.normal(size=40), 10)[None] for level in (0.3, 1.0)]
+    records = [record_of(real, command, rng, name=f"r{i}") for i, command in enumerate(commands)]
+    alone, shared = (diagnose(rig, records[:1], validation=records[1:], workers=n).to_json() for n in (1, 2))
+    assert alone == shared and [e["kind"] for e in alone["effects"]] == ["cubic_spring"]
+
+
 def test_a_hidden_contact_is_named_placed_and_closed():
     case, label = make_trial(11, kinds=("one_sided_stop",))
     verdict, hidden = verdict_on(case), label["effects"][0]

@@ -1,5 +1,7 @@
 """Figures of blind trials."""
 
+from collections.abc import Mapping, Sequence
+
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -32,6 +34,19 @@ def plot_confusion(tally: Tally) -> Figure:
     total = sum(of for _, of in tally.shares.values())
     words = "; ".join(f"{_FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items())
     ax.set_title(f"{total} blind cases, numbers of cases, blue right and orange wrong.\n{words}")
+    return figure
+
+
+def plot_times(seconds: Mapping[str, Sequence[float]], limits: Mapping[str, float]) -> Figure:
+    """How long each diagnosis took, a dot a case, and how long it may take, by family of cases."""
+    figure, ax = new_figure(width=9, height=1.2 + 0.7 * len(seconds))
+    for y, (family, times) in enumerate(seconds.items()):
+        ax.plot(times, [y] * len(times), "o", color=COLOURS[0], alpha=0.6, label="a case" if y == 0 else None)
+        ends, label = [y - 0.35, y + 0.35], "limit" if y == 0 else None
+        ax.plot([limits[family]] * 2, ends, color=COLOURS[1], linewidth=2, label=label)
+    ax.set_yticks(range(len(seconds)), [_FAMILY[family].rstrip(":") for family in seconds])
+    ax.set(xlim=(0, None), ylim=(len(seconds) - 0.5, -0.5), xlabel="seconds by the clock, two cores")
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
     return figure
 
 

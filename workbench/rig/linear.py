@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from workbench.structure.modes import Modes
-
 
 @dataclass(frozen=True, eq=False)
 class ModalPoles:
@@ -16,11 +14,13 @@ class ModalPoles:
         poles: (n_poles,) complex λ, one of each conjugate pair.
         weights: (n_poles, n_modes) W, how the modal forces p drive each pole.
         shapes: (n_modes, n_poles) Q, a conjugate pair counted in it.
+        uncoupled: whether each mode has a pole of its own: Q is twice the identity.
     """
 
     poles: np.ndarray
     weights: np.ndarray
     shapes: np.ndarray
+    uncoupled: bool = False
 
 
 def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
@@ -35,7 +35,7 @@ def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
     diagonal = np.diag(damping)
     if np.abs(damping - np.diag(diagonal)).max() == 0 and (diagonal < 2 * omega).all():
         poles = -0.5 * diagonal + 1j * np.sqrt(omega**2 - 0.25 * diagonal**2)
-        return ModalPoles(poles, np.diag(1.0 / (2j * poles.imag)), 2.0 * np.eye(omega.size))
+        return ModalPoles(poles, np.diag(1.0 / (2j * poles.imag)), 2.0 * np.eye(omega.size), uncoupled=True)
     n = omega.size
     a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), -damping]])
     values, vectors = np.linalg.eig(a)
@@ -124,14 +124,10 @@ def sinusoid_response(
 
 def modal_motion(system: ModalPoles, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Modal displacements and velocities (n_modes, n_samples) from pole coordinates."""
-    shapes = system.shapes
-    rates = shapes * system.poles
-    return _real_product(shapes, response), _real_product(rates, response)
-
-
-def system_of(modes: Modes) -> ModalPoles:
-    """`modal_poles` of a set of modes."""
-    return modal_poles(modes.omega, modes.damping)
+    if system.uncoupled:
+        return 2.0 * response.real, 2.0 * (system.poles[:, None] * response).real
+    rates = system.shapes * system.poles
+    return _real_product(system.shapes, response), _real_product(rates, response)
 
 
 def _real_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
