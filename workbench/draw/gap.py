@@ -111,7 +111,7 @@ def plot_missing_force(verdict: Verdict) -> Figure:
     chosen = [e for e in verdict.effects if "at" in e.values and e.kind.path == "structure"]
     beside = [e for e in verdict.effects if chosen and e is not chosen[0]]
     if beside:
-        evidence = Evidence.of(apply_all(verdict.nominal, beside), verdict.attribution.data)
+        evidence = Evidence.of(apply_all(verdict.nominal, beside), verdict.attribution.search.data)
     place = evidence.place(chosen[0].values["at"] if chosen else verdict.where.at)
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
     step = max(1, place.force.size // 4000)

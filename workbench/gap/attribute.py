@@ -2,8 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from workbench.gap.beside_nominal import decide_beside_nominal, decide_with_figures_freed
 from workbench.gap.beside_random import decide_on_random
@@ -26,7 +28,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
-SHOWN = 7  # others that are, to be shown beside them
+SHOWN = 7  # others that are, where they are to be shown beside them
 ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
 
 
@@ -41,9 +43,10 @@ class Attribution:
         random: statistics of a random disturbance, where the set holds one.
         rivals: other sets, best first, with their probabilities against the best.
         nominal_cost: mean square of the nominal residual in noise units.
-        singles: every kind's best fit alone, best first; beside the random disturbance, where one holds.
+        tried: effects alone that were fitted to whole records; beside the random disturbance, where one holds.
+        ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
         evidence: of the nominal rig.
-        data: what was fitted, noise of rounded sensors included.
+        search: what was searched in, the records with the noise of rounded sensors among it.
     """
 
     outcome: str
@@ -51,9 +54,23 @@ class Attribution:
     random: RandomForceFit | None
     rivals: tuple[tuple[Fit, float], ...]
     nominal_cost: float
-    singles: tuple[Fit, ...]
+    tried: tuple[Fit, ...]
+    ahead: tuple[Fit, ...]
     evidence: Evidence
-    data: FitData
+    search: Search
+
+    @cached_property
+    def singles(self) -> tuple[Fit, ...]:
+        """The likeliest kinds alone on whole records, best first; those that were no rivals are fitted now."""
+        kinds = {f.effects[0].kind for f in self.tried if f.effects}
+        others = [f for f in spread_over_kinds(self.ahead, 1) if f.effects[0].kind not in kinds][:SHOWN]
+
+        def on_all(candidate: Fit) -> Fit:
+            return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ALIKE)
+
+        with threadpool_limits(1, user_api="blas"):
+            fitted = self.search.workers.map(on_all, others)
+        return tuple(sorted((*self.tried, *fitted), key=lambda f: f.cost))
 
 
 def attribute(
@@ -118,6 +135,7 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
     report("looking for the missing force", 0.02)
     evidence = Evidence.of(base, data, workers=workers)
     found: Decision | None
+    ahead: list[Fit] = []
     if free_nominal and not search.explains(start):
         found, singles = decide_with_figures_freed(search, start)
     else:
@@ -131,7 +149,6 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
             singles = on_whole_records(search, hopeful, FINALISTS)
             found = decide(search, start, singles)
             found = found or _with_a_second(search, start, ahead, weighed, evidence)
-            singles = _of_every_kind(search, singles, ahead)
     outcome, best, random, rivals = found
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
@@ -143,21 +160,11 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
         random=random,
         rivals=rivals,
         nominal_cost=float(nominal.mean()),
-        singles=tuple(singles),
-        evidence=Evidence.of(rig, data) if seen else evidence,
-        data=data,
+        tried=tuple(singles),
+        ahead=tuple(ahead),
+        evidence=Evidence.of(rig, data, workers=workers) if seen else evidence,
+        search=search,
     )
-
-
-def _of_every_kind(search: Search, singles: Sequence[Fit], ahead: Sequence[Fit]) -> list[Fit]:
-    """The likeliest kinds alone on whole records, those too that were no rivals one sample ahead."""
-    tried = {f.effects[0].kind for f in singles}
-    others = [f for f in spread_over_kinds(ahead, 1) if f.effects[0].kind not in tried]
-
-    def on_all(candidate: Fit) -> Fit:
-        return fit(search.rig, candidate.effects, search.data, iterations=5, tolerance=ALIKE)
-
-    return sorted((*singles, *search.workers.map(on_all, others[:SHOWN])), key=lambda f: f.cost)
 
 
 def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighed, evidence: Evidence) -> Decision:

@@ -137,7 +137,7 @@ def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
     explained = found.outcome == "explained" or any_beyond(found.best.effects)
     for rival, probability in found.rivals:
         if explained and probability > RIVAL:
-            return next_experiment(rig, found.best, rival, found.data, workers)
+            return next_experiment(rig, found.best, rival, found.search.data, workers)
     return None
 
 
