@@ -16,7 +16,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of, fit
-from workbench.gap.one_law import one_law, weighed_against
+from workbench.gap.one_law import one_law, unless_another, weighed_against
 from workbench.gap.outcome import Decision
 from workbench.gap.pairs import Pairs
 from workbench.gap.prediction import FitData
@@ -147,7 +147,8 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
             report("one effect, on whole records", 0.3)
             hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
             singles = on_whole_records(search, hopeful, FINALISTS)
-            found = decide(search, start, singles)
+            alone = decide(search, start, singles)
+            found = unless_another(search, alone, evidence) if alone else None
             found = found or _with_a_second(search, start, ahead, weighed, evidence)
     outcome, best, random, rivals = found
     if seen:

@@ -126,7 +126,7 @@ class _Problem:
                 moved[j] = 2.0 * free[j] - moved[j]
                 beside = self.residual(moved, coarsely=coarsely)
             columns.append(np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j]))
-        return np.array(columns).T
+        return np.array(columns).reshape(-1, residual.size).T
 
 
 def slopes(rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()) -> np.ndarray:

@@ -5,9 +5,9 @@ from dataclasses import replace
 from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.evidence import Evidence
 from workbench.gap.finish import ranked
-from workbench.gap.fit import Fit
+from workbench.gap.fit import Fit, cost_of
 from workbench.gap.outcome import Decision
-from workbench.gap.pursuit import HOPEFUL, on_whole_records, one_more
+from workbench.gap.pursuit import HOPEFUL, RIVAL, on_whole_records, one_more
 from workbench.gap.search import Search
 
 TRIED = 2
@@ -23,6 +23,27 @@ def one_law(search: Search, evidence: Evidence) -> Fit | None:
     hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < HOPEFUL]
     fits = on_whole_records(beyond, hopeful, TRIED)
     return next((f for f in fits if search.explains(f)), None)
+
+
+def unless_another(search: Search, decision: Decision, evidence: Evidence) -> Decision:
+    """The decision for one law of the catalogue at a point, or for another law where the records are sure of that one.
+
+    Args:
+        evidence: of the nominal rig.
+    """
+    best = decision.best
+    if decision.outcome != "explained" or len(best.effects) != 1:
+        return decision
+    (effect,) = best.effects
+    if not effect.kind.nonlinear or "at" not in effect.values:
+        return decision
+    search.report("one force of another law", 0.9)
+    beyond, there = replace(search, catalogue=BEYOND), replace(evidence, told=(effect.values["at"],))
+    as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
+    fits = on_whole_records(beyond, [f for f in one_more(beyond, (), there) if f.cost < as_near], TRIED)
+    sure = (f for f in fits if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
+    law = next(sure, None)
+    return decision if law is None else weighed_against(law, search, decision)
 
 
 def weighed_against(law: Fit, search: Search, decision: Decision) -> Decision:
