@@ -76,6 +76,15 @@ def test_a_law_beyond_the_catalogue_is_unknown_and_shown(kind, exponent):
     assert shown["at"] == pytest.approx(verdict.where.at, abs=0.05 * case.rig.modes.length)
 
 
+def test_a_weak_law_beyond_the_catalogue_does_not_pass_for_one_of_it():
+    """A clearance leaves no more than the noise here; a power of the displacement is likelier by far."""
+    case, _ = make_trial(441050, kinds=("quadratic_spring",))
+    verdict = verdict_on(case)
+    (shown,) = verdict.to_json()["nearest"]
+    assert verdict.outcome == "unknown" and shown["parameters"]["exponent"] == pytest.approx(2.0, abs=0.1)
+    assert verdict.alternatives[0][0] == "clearance"
+
+
 def test_nothing_hidden_nothing_told():
     case, _ = make_trial(12)
     verdict = verdict_on(case)
@@ -100,8 +109,6 @@ def test_an_effect_of_the_users_own_joins_the_catalogue():
     noise = np.array([s.noise_std for s in case.rig.sensors])
     plain = FitData(case.fit, noise, substeps=16)
     rng = np.random.default_rng(0)
-    from dataclasses import replace
-
     hidden = [
         replace(r, outputs=p + noise[:, None] * rng.standard_normal(p.shape))
         for r, p in zip(case.fit, plain.predictions(true.apply(case.rig)), strict=True)
@@ -115,8 +122,6 @@ def test_an_effect_of_the_users_own_joins_the_catalogue():
 
 def test_standard_deviations_are_true():
     """Fits of many noisy copies scatter as one fit says they do."""
-    from dataclasses import replace
-
     case, _ = make_trial(14)
     spring = kind_named("ground_spring")
     true = Effect(spring, None, {"at": 0.3 * case.rig.modes.length, "stiffness": 0.02 * case.rig.modes.omega[1] ** 2})

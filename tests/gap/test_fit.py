@@ -10,7 +10,7 @@ from workbench.gap.disturbance import tonal
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.containment import fewer, simpler_forms
 from workbench.gap.effects.effect import Effect
-from workbench.gap.fit import cost_of, fit
+from workbench.gap.fit import cost_of, fit, slopes
 from workbench.gap.following import LOOSE
 from workbench.gap.missing_force import force_filter, sampled_model, whiten
 from workbench.gap.prediction import FitData
@@ -34,6 +34,14 @@ def measured(record_of):
         return FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
 
     return make
+
+
+def test_an_effect_without_numbers_is_fitted_as_it_is(rig, measured):
+    data, more = measured(rig), kind_named("truncated_modes")
+    effects = (Effect(more, more.targets(rig)[0], {}),)
+    assert slopes(rig, effects, data).shape == (data.n_values, 0)
+    found = fit(rig, effects, data)
+    assert found.n_parameters == 0 and found.cost == cost_of(rig, effects, data)
 
 
 def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(rig, measured):
