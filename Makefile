@@ -22,7 +22,7 @@ test-slow: $(BIN)/workbench  ## the longer trials
 figures: $(BIN)/workbench  ## every study that makes its own data, with its figures and results: hours
 	$(BIN)/workbench study --all
 
-bench: $(BIN)/workbench  ## speeds, as ratios, in ten minutes; the bench to play on is `workbench bench`
+bench: $(BIN)/workbench  ## speeds, as ratios, in a quarter of an hour; the bench to play on is `workbench bench`
 	$(BIN)/workbench study design_scaling
 	$(BIN)/workbench study many_cases
 	$(BIN)/workbench study diagnosis_speed

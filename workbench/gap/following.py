@@ -93,9 +93,8 @@ class Follower:
         """
         sensors = tuple(Sensor(sensor.name, sensor.at, sensor.quantity, gain=sensor.gain) for sensor in rig.sensors)
         bare = replace(rig, actuators=(), elements=(), sensors=sensors)
-        coupled = np.any(rig.modes.damping - np.diag(np.diag(rig.modes.damping)))
         gain, no_inputs = self._gain_for(rig.modes.n_modes), np.zeros((0, left.shape[1]))
-        substeps = substeps if coupled else 1
+        substeps = 1 if rig.modes.proportional else substeps
         return self.whitening @ follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
 
     def _gain_for(self, n_modes: int) -> np.ndarray:

@@ -139,10 +139,9 @@ class FitData:
             return np.concatenate([whiten(self.whitener, r).ravel() for r in self.left_beside(rig, follower)])
         if follower is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self._whole(rig)])
-        if is_stepped(rig):
-            ahead = [follower.errors(rig, record, self.substeps) for record in self.records]
-        elif steps_exactly(rig):
-            ahead = [follower.errors(rig, record, 1) for record in self.records]
+        if is_stepped(rig) or steps_exactly(rig):
+            substeps = self.substeps if is_stepped(rig) else 1
+            ahead = [follower.errors(rig, record, substeps) for record in self.records]
         else:
             dt, whole = self.records[0].sample_time, self._from_the_first_sample._whole(rig)
             ahead = [follower.errors_of_linear(rig, left, dt, self.substeps) for left in whole]

@@ -124,9 +124,8 @@ def is_stepped(rig: Rig) -> bool:
 
 def steps_exactly(rig: Rig) -> bool:
     """Whether steps of a whole sample are exact: no law, delay, lag or sinusoid, and no damping between the modes."""
-    damping = rig.modes.damping
     late = any(actuator.delay or actuator.time_constant for actuator in rig.actuators)
-    return not (late or rig.elements or rig.stiffness_rate or np.any(damping - np.diag(np.diag(damping))))
+    return rig.modes.proportional and not (late or rig.elements or rig.stiffness_rate)
 
 
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
