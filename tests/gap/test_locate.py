@@ -131,7 +131,6 @@ def test_an_undamped_mode_on_a_line_is_no_obstacle(rig):
     dt = 2.0 * np.pi * 3.0 / (still.modes.omega[0] * 400)
     model = sampled_model(still.modes, still.sensors, np.full(4, NOISE), dt)
     (lines,) = lines_of(still, model, [np.full((4, 400), NOISE)], dt)
-    assert np.isfinite(lines.compliance).all() and np.isfinite(lines.tail).all()
     assert np.isfinite(lines.misfit(still.modes.phi(1.37)[0]))
 
 

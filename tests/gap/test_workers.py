@@ -44,6 +44,13 @@ def test_what_is_found_comes_in_the_order_of_the_items(number):
     assert Workers(number).map(late, []) == []
 
 
+@pytest.mark.parametrize("number", [1, 2])
+def test_two_different_things_are_done_side_by_side_and_each_may_share_its_own_work(number):
+    workers = Workers(number)
+    squares, text = workers.both(lambda: workers.map(lambda i: i**2, range(5)), lambda: "other")
+    assert squares == [0, 1, 4, 9, 16] and text == "other"
+
+
 @pytest.mark.parametrize("n", [MOST_TURNS - 1, MOST_TURNS, 2 * MOST_TURNS + 1])
 def test_more_items_than_a_pipe_holds_are_all_done_once(n):
     assert TWO.map(lambda i: i, range(n)) == list(range(n))

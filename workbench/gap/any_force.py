@@ -17,15 +17,14 @@ from functools import cached_property
 
 import numpy as np
 
+from workbench.gap.answers import Answers, answers_of, real_product
 from workbench.gap.missing_force import SampledModel
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import reading_of
 
 TOP = 0.9  # of half the sample rate: above, what is folded down is no longer small
 MOST_LINES = 8192  # of a record: of a longer one every so many, which costs precision alone
 WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
 CHANCE = 2.0  # deviations by which noise may pass for a force in them
-UNDAMPED = 1e-9j  # of the stiffness: what keeps a mode without damping finite on a line of its own
 COUNTING = 0.02  # weight below which a line tells nothing
 ROUNDS = 4  # of the spectrum of the force, each weighed by the one before
 
@@ -35,42 +34,41 @@ class Lines:
     """A record's residual at the lines of its spectrum, in units of the noise, and what it is made of.
 
     Attributes:
-        compliance: (n_lines, n_sensors, n_modes) of modal forces.
-        tail: (n_lines, n_sensors, 2 n_modes) of the state at the start less that at the end.
+        answers: of the rig, to forces and to states at the ends.
         left: (n_lines, n_sensors) the residual; its noise has unit variance.
+        weights: (n_lines,).
     """
 
-    compliance: np.ndarray
-    tail: np.ndarray
+    answers: Answers
     left: np.ndarray
+    weights: np.ndarray
 
     @cached_property
-    def _products(self) -> tuple[np.ndarray, np.ndarray, float]:
-        tail = self.tail.reshape(-1, self.tail.shape[2])
-        left = self.left.ravel()
-        return _real(tail, tail), _real(tail, left), float(2.0 * np.sum(np.abs(left) ** 2))
+    def _products(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.answers.products(self.left, self.weights)
 
     @property
     def freedom(self) -> int:
         """Values that stay noise once a force, of any law, and the ends are accounted for."""
         n_lines, n_sensors = self.left.shape
-        return max(2 * n_lines * (n_sensors - 1) - self.tail.shape[2], 0)
+        return max(2 * n_lines * (n_sensors - 1) - self._products[1].size, 0)
 
-    @property
+    @cached_property
     def power(self) -> float:
         """Sum of squares of the residual."""
-        return self._products[2]
+        return float(2.0 * self.weights @ np.sum(np.abs(self.left) ** 2, axis=1))
 
     def weighed(self, weights: np.ndarray) -> "Lines":
-        """The lines by weights (n_lines,), without those that tell nothing."""
+        """The lines by other weights (n_lines,), without those that tell nothing."""
         kept = weights > COUNTING
-        root = np.sqrt(weights[kept])[:, None]
-        return Lines(self.compliance[kept], self.tail[kept] * root[:, :, None], self.left[kept] * root)
+        return Lines(self.answers.on(kept), self.left[kept], weights[kept])
 
     def misfit(self, shape: np.ndarray) -> float:
         """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
         u, a, _ = self._along(shape)
-        end, along = self._end(u, a)
+        root = np.sqrt(self.weights)
+        a = a * root
+        end, along = self._end(u * root[:, None], a)
         return self.power - 2.0 * float(np.sum(np.abs(a) ** 2)) - float(along @ end)
 
     def telling(self, shape: np.ndarray) -> np.ndarray:
@@ -89,20 +87,16 @@ class Lines:
 
     def _end(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The ends by what a force leaves of the record, given the tail and the residual along it; and their pull."""
-        own, along, _ = self._products
-        along = along - _real(u, a)
-        return np.linalg.lstsq(own - _real(u, u), along, rcond=1e-12)[0], along
+        own, along = self._products
+        along = along - real_product(u, a)
+        return np.linalg.lstsq(own - real_product(u, u), along, rcond=1e-12)[0], along
 
     def _along(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tail and the residual along the reading of a force, and that reading's power."""
-        h = self.compliance @ shape
+        h = self.answers.to_force(shape)
         power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
         h = (h / np.sqrt(power)[:, None]).conj()
-        return (h[:, None, :] @ self.tail)[:, 0], np.sum(h * self.left, axis=1), power
-
-
-def _real(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
+        return self.answers.along(h), np.sum(h * self.left, axis=1), power
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
@@ -120,43 +114,15 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
         sample_time: s.
     """
     noise = np.sqrt(model.noise_variance)
-    made: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+    made: dict[int, tuple[np.ndarray, Answers]] = {}
     lines = []
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
             top = max(int(0.5 * TOP * n), 2)
             taken = np.arange(1, top, 1 + top // MOST_LINES)
-            omega = 2.0 * np.pi * taken / (n * sample_time)
-            tail = _tail(rig, model, omega * sample_time)
-            made[n] = taken, _compliance(rig, omega) / noise[:, None], tail / noise[:, None]
-        taken, compliance, tail = made[n]
+            made[n] = taken, answers_of(rig, model, 2.0 * np.pi * taken / (n * sample_time), n, sample_time)
+        taken, answers = made[n]
         left = np.fft.rfft(residual, axis=1)[:, taken].T / noise
-        lines.append(Lines(compliance, tail / np.sqrt(n), left / np.sqrt(n)))
+        lines.append(Lines(answers, left / np.sqrt(n), np.ones(taken.size)))
     return lines
-
-
-def _compliance(rig: Rig, omega: np.ndarray) -> np.ndarray:
-    """What the sensors read of modal forces: (n_lines, n_sensors, n_modes)."""
-    modes = rig.modes
-    dynamic = 1j * omega[:, None, None] * modes.damping
-    each = np.arange(modes.n_modes)
-    dynamic[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 - omega[:, None] ** 2
-    inverse = np.linalg.inv(dynamic)
-    rate = 1j * omega[:, None, None]
-    rows, orders = reading_of(rig)
-    return rate ** orders[:, None] * (rows @ inverse)
-
-
-def _tail(rig: Rig, model: SampledModel, turn: np.ndarray) -> np.ndarray:
-    """What the sensors read of a state that is there at the start and not at the end: (n_lines, n_sensors, 2 n_modes).
-
-    Velocities in units of the modes' own, so that no column is far larger than another.
-    """
-    z = (1.0 + abs(UNDAMPED)) * np.exp(1j * turn)[:, None, None]
-    size = model.transition.shape[0]
-    transposed = z * np.eye(size) - model.transition.T
-    outputs = np.broadcast_to(model.output.T, (turn.size, *model.output.T.shape))
-    tail = z * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2)
-    omega = rig.modes.omega
-    return tail * np.r_[np.ones(omega.size), np.maximum(omega, 0.1 * omega[-1])]

@@ -88,17 +88,21 @@ def _verdict(
     outcome = "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
     effects = found.best.effects if outcome in ("none", "explained") else ()
     faulty = [str(effect.target) for effect in found.best.effects if effect.kind.path == "sensor"]
+    ready, where = workers.both(
+        lambda: readiness(found.evidence, catalogue=catalogue),
+        lambda: locate(found.evidence, effects, faulty=faulty),
+    )
     return Verdict(
         case=name,
         outcome=outcome,
         effects=found.best.effects,
         alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in found.rivals),
-        where=locate(found.evidence, effects, faulty=faulty),
+        where=where,
         shrinkage=shrinkage,
         corrected=corrected,
         nominal=rig,
         attribution=found,
-        readiness=readiness(found.evidence, catalogue=catalogue),
+        readiness=ready,
         experiment=_next(rig, found, workers),
         notes=_notes(found, outcome),
     )

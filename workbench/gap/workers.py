@@ -76,6 +76,11 @@ class Workers:
                 helper.end()
         return [found[i] for i in range(len(items))]
 
+    def both(self, one: Callable[[], Item], other: Callable[[], Found]) -> tuple[Item, Found]:
+        """What two functions of nothing return; see `map`."""
+        found: list[Any] = self.map(lambda ask: ask(), (one, other))
+        return found[0], found[1]
+
 
 ALONE = Workers(1)
 

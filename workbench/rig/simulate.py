@@ -60,7 +60,7 @@ LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
     UserLaw: (USER, lambda e: e.parameters),
 }
-NOT_MEASURED, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
+NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +202,10 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
-    q, v, beside, _ = _stepped(rig, inputs, NOT_MEASURED, NO_GAIN, sample_time, substeps)
     modes = rig.modes
+    q, v, f = motion = tuple(np.zeros((modes.n_modes, inputs.shape[1])) for _ in range(3))
+    participation, at_samples = _step(rig, inputs, NOTHING, NO_GAIN, sample_time, substeps, motion, NOTHING)
+    beside = participation @ at_samples + f
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     # the forces beside hold what couples the modes; only each mode's own damping is left
     own = modes.omega[:, None] ** 2 * scale * q + np.diag(modes.damping)[:, None] * v
@@ -226,7 +228,9 @@ def follow(
         sample_time: s.
         substeps: of each sample interval.
     """
-    return _stepped(rig, inputs, outputs, gain, sample_time, substeps)[3]
+    errors = np.empty_like(outputs)
+    _step(rig, inputs, outputs, gain, sample_time, substeps, (NOTHING, NOTHING, NOTHING), errors)
+    return errors
 
 
 def reading_of(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
@@ -245,10 +249,21 @@ def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
         yield order, here, rig.modes.phi([rig.sensors[j].at for j in here], derivative)
 
 
-def _stepped(
-    rig: Rig, inputs: np.ndarray, outputs: np.ndarray, gain: np.ndarray, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Displacements and velocities of the modes, the forces on them, and where there are outputs their errors."""
+def _step(
+    rig: Rig,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    gain: np.ndarray,
+    sample_time: float,
+    substeps: int,
+    motion: tuple[np.ndarray, ...],
+    errors: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Fill displacements and velocities of the modes and the forces of what touches them, or the outputs' errors.
+
+    Returns:
+        Participations (n_modes, n_forces) of all other forces, and these at the sample instants (n_forces, n_samples).
+    """
     modes = rig.modes
     diagonal = np.diag(modes.damping).copy()
     coupling = modes.damping - np.diag(diagonal)
@@ -271,8 +286,7 @@ def _stepped(
     stretch = sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching))
     drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
     drag_shapes, drag_weights = _along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
-    q, v, f = (np.zeros((modes.n_modes, n_samples)) for _ in range(3))
-    known, reading, orders, errors = outputs, NOT_MEASURED, NO_ORDERS, np.empty_like(outputs)
+    known, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
@@ -296,13 +310,10 @@ def _stepped(
         orders,
         reading,
         gain,
-        q,
-        v,
-        f,
+        *motion,
         errors,
     )
-    acting = f if outputs.size else participation @ at_samples + f
-    return q, v, acting, errors
+    return participation, at_samples
 
 
 def _left_to_motion(rig: Rig, outputs: np.ndarray, reading, orders, participation, at_samples) -> np.ndarray:

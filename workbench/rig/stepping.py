@@ -272,16 +272,17 @@ def step_record(
     f_out,
     error_out,
 ):
-    """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest.
+    """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or error_out.
 
     forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
     stretching (n_modes, n_modes); drag_shapes (n_modes, n_points); shapes (n_elements, n_modes).
 
     Where something is measured, (n_sensors, n_samples), its error against reading (n_sensors, n_modes) of displacement,
-    velocity or acceleration, by orders (n_sensors,) 0, 1 or 2, fills error_out, and sets the motion right by gain
-    (2, n_modes, n_sensors).
+    velocity or acceleration, by orders (n_sensors,) 0, 1 or 2, fills error_out in place of the motion, which it sets
+    right by gain (2, n_modes, n_sensors).
     """
-    n_modes, n_samples, n_elements, n_inputs = omega.size, q_out.shape[1], kinds.size, forces.shape[0]
+    n_modes, n_elements, n_inputs = omega.size, kinds.size, forces.shape[0]
+    n_samples = measured.shape[1] if measured.size > 0 else q_out.shape[1]
     n = LANES * ((n_modes + LANES - 1) // LANES)
     omega, c, coupling = _widened(omega, n, 1.0), _widened(c, n, 0.0), _widened_square(coupling, n)
     stretching, drag_shapes = _widened_square(stretching, n), _widened_rows(drag_shapes, n)
@@ -318,11 +319,12 @@ def step_record(
                     for r in range(n):
                         aw[i, j] += shapes[i, r] * e[0, 3, r] * shapes[j, r]
                         av[i, j] += shapes[i, r] * e[1, 3, r] * shapes[j, r]
-        for r in range(n_modes):
-            q_out[r, k] = q[r]
-            v_out[r, k] = v[r]
-            f_out[r, k] = old[r]
-        if measured.size > 0:
+        if measured.size == 0:
+            for r in range(n_modes):
+                q_out[r, k] = q[r]
+                v_out[r, k] = v[r]
+                f_out[r, k] = old[r]
+        else:
             if accelerations:
                 stiffer = 1.0 + rate * k * dt
                 for r in range(n):
@@ -355,6 +357,11 @@ def step_record(
                 start, end = old[r] + drive[r], drive[r]
                 base_q[r] = e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
                 base_v[r] = e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
+            if n_elements == 0 and not distributed:
+                for r in range(n):
+                    q[r] = base_q[r]
+                    v[r] = base_v[r]
+                continue
             for i in range(n_elements):
                 guess = 2.0 * point[i] - earlier[i]
                 earlier[i], point[i] = point[i], guess

@@ -187,7 +187,7 @@ class _Member:
             raise ValueError(_unstable(tension)) from error
         vectors = vectors[:, ::-1]
         coefficients = np.zeros((segments.n_functions, n_modes))
-        coefficients[free] = vectors / np.sqrt(np.einsum("ir,ij,jr->r", vectors, mass, vectors, optimize=True))
+        coefficients[free] = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
         # Rayleigh's quotient, from the curvatures themselves: on a short segment the entries of K, EI/h³, cancel in a
         # soft mode, and 1/ν - σ keeps little of it; a sum of squares keeps all.
         eigenvalues = segments.form(stiffness, order, coefficients)

@@ -89,7 +89,7 @@ class Segments:
         nodal = self.continuity + 1
         inner = self.degree + 1 - 2 * nodal
         start = nodal * self.nodes.size + segment * inner
-        return np.r_[nodal * segment : nodal * (segment + 2), start : start + inner]
+        return np.concatenate([np.arange(nodal * segment, nodal * (segment + 2)), np.arange(start, start + inner)])
 
     def scales(self, segment: int) -> np.ndarray:
         """Factors (degree + 1,) that turn a local slope into a slope per metre."""

@@ -65,7 +65,7 @@ class Profile:
         """The values at positions x, in the shape of x."""
         x = np.asarray(x, float)
         values = np.asarray(self.function(np.atleast_1d(x)), float)
-        return np.broadcast_to(values, np.atleast_1d(x).shape).reshape(x.shape)
+        return values if values.shape == x.shape else np.broadcast_to(values, np.atleast_1d(x).shape).reshape(x.shape)
 
     def scaled(self, factor: float, start: float | None = None, stop: float | None = None) -> "Profile":
         """The same quantity times `factor`, everywhere or between `start` and `stop` (m)."""
