@@ -75,7 +75,7 @@ def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
     found = fitted(evidence)
     places = [f.effects[0].values["at"] for f in found if "at" in f.effects[0].values]
     if places:
-        found = sorted((*found, *fitted(replace(evidence, told=(places[0],)))), key=lambda f: f.cost)
+        found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
     return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RIVAL]
 
 

@@ -56,6 +56,7 @@ class Evidence:
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
         n_places: where a force is looked for.
         told: places of the force, m, where they are known from elsewhere.
+        sized: its rms, N, and correlation time, in samples, likewise.
         workers: processes that share the work.
     """
 
@@ -65,6 +66,7 @@ class Evidence:
     residuals: tuple[np.ndarray, ...]
     n_places: int = PLACES
     told: tuple[float, ...] = ()
+    sized: tuple[float, float] | None = None
     workers: Workers = ALONE
 
     @classmethod
@@ -87,6 +89,10 @@ class Evidence:
             data=self.data.of_outputs(tuple(sensor.name for sensor in sensors)),
             residuals=tuple(residual[kept] for residual in self.residuals),
         )
+
+    def of_force_at(self, *places: float) -> "Evidence":
+        """The same evidence of a force at places that are known, m."""
+        return replace(self, told=places, sized=self.size)
 
     @property
     def length(self) -> float:
@@ -113,6 +119,8 @@ class Evidence:
     @cached_property
     def size(self) -> tuple[float, float]:
         """Rms, N, and correlation time, in samples, of the missing force: the likeliest of a coarse grid."""
+        if self.sized is not None:
+            return self.sized
         coarse = self.places[::5] if self.places.size > 8 else self.places
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
         sizes = [(share * self.data.force_rms, memory) for memory in MEMORIES for share in LEVELS]

@@ -17,6 +17,7 @@ FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on th
 STEPPING = 1e-4  # of the gap's power: what coarser substeps may leave of it
 IDLE = 0.5  # of the noise power: what an effect may take away and still be none
 NO_NEARER = 0.9
+AT_FIRST, TOO_FAR = 4, 30.0  # iterations of a simpler form on the quick records, and times a set's cost: it is none
 TRIED = 2  # iterations at each other place, before the likeliest are chosen
 LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
 APART = 0.02  # of the length: nearer, a place is the same valley
@@ -130,7 +131,10 @@ def simplest(search: Search, candidate: Fit) -> Fit:
     improved = True
     while improved:
         improved = False
+        here = cost_of(search.rig, candidate.effects, search.quick)
         for effects in _simpler_sets(search, candidate):
+            if promise(fit(search.rig, effects, search.quick, iterations=AT_FIRST)) > TOO_FAR * here:
+                continue
             trial = fit(search.rig, effects, search.data.stepped(FINE), iterations=12, tolerance=1e-7)
             if search.explains(trial) and not _pays(search, candidate, trial):
                 candidate, improved = trial, True

@@ -3,10 +3,9 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit
 
 from workbench.gap.effects.structural import known_places
-from workbench.gap.missing_force import force_filter, sampled_model
+from workbench.gap.missing_force import driven, force_filter, sampled_model
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -69,8 +68,8 @@ class Follower:
         errors = self._followed(rig, record, substeps)
         model = sampled_model(rig.modes, rig.sensors, np.ones(len(rig.sensors)), record.sample_time)
         gain = self._gain_for(rig.modes.n_modes).reshape(-1, errors.shape[0])
-        a, h = np.ascontiguousarray(model.transition), np.ascontiguousarray(model.output)
-        return _carried_on(a, h, a @ gain, errors)
+        # every correction goes on to be a motion
+        return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]
 
     def _followed(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Errors one sample ahead, in the sensors' units."""
@@ -103,17 +102,6 @@ class Follower:
         known = min(n_modes, self.gain.shape[1])
         gain[:, :known] = self.gain[:, :known]
         return gain
-
-
-@njit(cache=True, nogil=True)
-def _carried_on(a: np.ndarray, h: np.ndarray, gain: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """The errors with what every correction goes on to be: y_k = h x_k + e_k, x_{k+1} = a x_k + gain e_k."""
-    x, out = np.zeros(a.shape[0]), np.empty_like(errors)
-    for k in range(errors.shape[1]):
-        e = np.ascontiguousarray(errors[:, k])
-        out[:, k] = h @ x + e
-        x = a @ x + gain @ e
-    return out
 
 
 def _unrounded(rig: Rig) -> Rig:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.linalg import cho_factor, cho_solve, expm
+from scipy.linalg import expm, solve_triangular
 
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.stepping import FAST
+from workbench.rig.stepping import FAST, LANES
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
@@ -168,39 +168,40 @@ def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_varianc
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _innovations(a, h, gain, residual, out):
-    n, m = a.shape[0], h.shape[0]
-    x, new, e = np.zeros(n), np.zeros(n), np.zeros(m)
-    for k in range(residual.shape[1]):
-        for j in range(m):
-            total = residual[j, k]
-            for i in range(n):
-                total -= h[j, i] * x[i]
-            out[j, k] = e[j] = total
-        for i in range(n):
+def _carry_on(a, x):
+    """Add a x_k to x_k+1, row after row of x (n_samples + 1, n_lanes); a (n_states, n_lanes)."""
+    for k in range(x.shape[0] - 1):
+        for i in range(a.shape[0]):
             total = 0.0
-            for s in range(n):
-                total += a[i, s] * x[s]
-            for j in range(m):
-                total += gain[i, j] * e[j]
-            new[i] = total
-        x, new = new, x
+            for s in range(a.shape[1]):
+                total += a[i, s] * x[k, s]
+            x[k + 1, i] += total
+
+
+def driven(a: np.ndarray, drive: np.ndarray) -> np.ndarray:
+    """States x_k+1 = a x_k + drive_k from rest: (n_states, n_samples + 1) of a drive (n_states, n_samples)."""
+    n, n_samples = drive.shape
+    n_lanes = LANES * -(-n // LANES)
+    wide, states = np.zeros((n, n_lanes)), np.zeros((n_samples + 1, n_lanes))
+    wide[:, :n], states[1:, :n] = a, drive.T
+    _carry_on(wide, states)
+    return states[:, :n].T
 
 
 def innovations(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     """One-step prediction errors (n_sensors, n_samples) of a residual, from rest."""
-    out = np.empty_like(residual)
-    _innovations(filter_.a, filter_.h, filter_.gain, np.ascontiguousarray(residual), out)
-    return out
+    closed = filter_.a - filter_.gain @ filter_.h
+    return residual - filter_.h @ driven(closed, filter_.gain @ residual)[:, :-1]
 
 
 def log_likelihoods(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,)."""
-    factor = cho_factor(filter_.innovation, lower=True)
     e = innovations(filter_, residual)
     if not np.abs(e).max() < RUNAWAY:
         return np.full(e.shape[1], -np.inf)
-    return -0.5 * np.sum(e * cho_solve(factor, e), axis=0) - np.log(np.diag(factor[0])).sum()
+    factor = np.linalg.cholesky(filter_.innovation)
+    white = solve_triangular(factor, e, lower=True, check_finite=False)
+    return -0.5 * np.einsum("jk,jk->k", white, white) - np.log(np.diag(factor)).sum()
 
 
 def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
@@ -210,7 +211,7 @@ def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
 
 def whiten(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     """Innovations of unit covariance (n_sensors, n_samples)."""
-    return np.linalg.solve(np.linalg.cholesky(filter_.innovation), innovations(filter_, residual))
+    return solve_triangular(np.linalg.cholesky(filter_.innovation), innovations(filter_, residual), lower=True)
 
 
 def smoothed_states(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
@@ -221,21 +222,6 @@ def smoothed_states(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     e = innovations(filter_, residual)
     weighted = filter_.h.T @ np.linalg.solve(filter_.innovation, e)
     closed = filter_.a - filter_.gain @ filter_.h
-    predicted = np.empty((filter_.a.shape[0], residual.shape[1]))
-    adjoint = np.empty_like(predicted)
-    _passes(filter_.a, filter_.gain, closed, e, weighted, predicted, adjoint)
+    predicted = driven(filter_.a, filter_.gain @ e)[:, :-1]
+    adjoint = driven(closed.T, weighted[:, ::-1])[:, :0:-1]
     return predicted + filter_.covariance @ adjoint
-
-
-@njit(cache=True, nogil=True)
-def _passes(a, gain, closed, e, weighted, predicted, adjoint):
-    n, n_samples = predicted.shape
-    x = np.zeros(n)
-    for k in range(n_samples):
-        predicted[:, k] = x
-        x = a @ x + gain @ np.ascontiguousarray(e[:, k])
-    transposed = np.ascontiguousarray(closed.T)
-    r = np.zeros(n)
-    for k in range(n_samples - 1, -1, -1):
-        r = transposed @ r + weighted[:, k]
-        adjoint[:, k] = r

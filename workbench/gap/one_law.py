@@ -38,7 +38,7 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
     if not effect.kind.nonlinear or "at" not in effect.values:
         return decision
     search.report("one force of another law", 0.9)
-    beyond, there = replace(search, catalogue=BEYOND), replace(evidence, told=(effect.values["at"],))
+    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.values["at"])
     as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
     fits = on_whole_records(beyond, [f for f in one_more(beyond, (), there) if f.cost < as_near], TRIED)
     sure = (f for f in fits if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))

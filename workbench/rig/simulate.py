@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,7 @@ LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
     UserLaw: (USER, lambda e: e.parameters),
 }
+QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
 
 
@@ -68,18 +69,30 @@ class Motion:
     """Modal motion of a rig at the sample instants.
 
     Attributes:
-        displacement, velocity, acceleration: (n_modes, n_samples) of the modal coordinates.
+        displacement, velocity: (n_modes, n_samples) of the modal coordinates.
+        forces: (n_modes, n_samples) on them beside those of stiffness and damping.
+        stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
+        damping: (n_modes, n_modes).
     """
 
     displacement: np.ndarray
     velocity: np.ndarray
-    acceleration: np.ndarray
+    forces: np.ndarray
+    stiffness: np.ndarray
+    damping: np.ndarray
+
+    @cached_property
+    def acceleration(self) -> np.ndarray:
+        """(n_modes, n_samples) of the modal coordinates."""
+        return self.forces - self.stiffness * self.displacement - self.damping @ self.velocity
 
     def after(self, lead: int) -> "Motion":
         """The motion without its first `lead` samples."""
         if lead == 0:
             return self
-        return Motion(self.displacement[:, lead:], self.velocity[:, lead:], self.acceleration[:, lead:])
+        stiffness = self.stiffness[:, lead:] if self.stiffness.shape[1] > 1 else self.stiffness
+        q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
+        return Motion(q, v, forces, stiffness, self.damping)
 
 
 def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, name: str = "simulated") -> Record:
@@ -131,9 +144,8 @@ def steps_exactly(rig: Rig) -> bool:
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
-    quantities = (motion.displacement, motion.velocity, motion.acceleration)
     for order, here, shapes in _shapes_at_sensors(rig):
-        outputs[here] = shapes @ quantities[order]
+        outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
     for j, sensor in enumerate(rig.sensors):
         outputs[j] = sensor_reading(sensor, outputs[j], sample_time)
     return outputs
@@ -198,18 +210,17 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
         response += sinusoid_response(system, shape, omega, phasor, time)
         acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
-    return Motion(q, v, acting - modes.omega[:, None] ** 2 * q - modes.damping @ v)
+    return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping)
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
     modes = rig.modes
     q, v, f = motion = tuple(np.zeros((modes.n_modes, inputs.shape[1])) for _ in range(3))
     participation, at_samples = _step(rig, inputs, NOTHING, NO_GAIN, sample_time, substeps, motion, NOTHING)
-    beside = participation @ at_samples + f
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
-    # the forces beside hold what couples the modes; only each mode's own damping is left
-    own = modes.omega[:, None] ** 2 * scale * q + np.diag(modes.damping)[:, None] * v
-    return Motion(q, v, beside - own)
+    stiffness = modes.omega[:, None] ** 2 * (scale if rig.stiffness_rate else 1.0)
+    # the forces on the modes hold what couples them; only each mode's own damping is left
+    return Motion(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)))
 
 
 def follow(
