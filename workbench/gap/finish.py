@@ -128,18 +128,16 @@ def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
 
 def simplest(search: Search, candidate: Fit) -> Fit:
     """The set with effects replaced by simpler or fewer ones, where the records cannot tell them apart."""
-    improved = True
-    while improved:
-        improved = False
-        here = cost_of(search.rig, candidate.effects, search.quick)
-        for effects in _simpler_sets(search, candidate):
-            if promise(fit(search.rig, effects, search.quick, iterations=AT_FIRST)) > TOO_FAR * here:
-                continue
-            trial = fit(search.rig, effects, search.data.stepped(FINE), iterations=12, tolerance=1e-7)
-            if search.explains(trial) and not _pays(search, candidate, trial):
-                candidate, improved = trial, True
-                break
-    return candidate
+    here = cost_of(search.rig, candidate.effects, search.quick)
+
+    def tried(effects: tuple[Effect, ...]) -> Fit | None:
+        if promise(fit(search.rig, effects, search.quick, iterations=AT_FIRST)) > TOO_FAR * here:
+            return None
+        trial = fit(search.rig, effects, search.data.stepped(FINE), iterations=12, tolerance=1e-7)
+        return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
+
+    simpler = next(filter(None, search.workers.map(tried, _simpler_sets(search, candidate))), None)
+    return candidate if simpler is None else simplest(search, simpler)
 
 
 def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]]:

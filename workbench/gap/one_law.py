@@ -21,7 +21,7 @@ def one_law(search: Search, evidence: Evidence) -> Fit | None:
     search.report("one force of another law", 0.35)
     beyond = replace(search, catalogue=BEYOND)
     hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < HOPEFUL]
-    fits = on_whole_records(beyond, hopeful, TRIED)
+    fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
     return next((f for f in fits if search.explains(f)), None)
 
 
@@ -40,7 +40,8 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
     search.report("one force of another law", 0.9)
     beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.values["at"])
     as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
-    fits = on_whole_records(beyond, [f for f in one_more(beyond, (), there) if f.cost < as_near], TRIED)
+    hopeful = [f for f in one_more(beyond, (), there) if f.cost < as_near]
+    fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
     sure = (f for f in fits if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)
     return decision if law is None else weighed_against(law, search, decision)

@@ -21,6 +21,7 @@ AT_HAND = 10.0  # times the noise: so near, whole records tell the way
 CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
 RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
 RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
+FURTHER = 100  # iterations like the last: a cost that they leave too high comes no lower in time
 
 
 def one_more(
@@ -78,12 +79,13 @@ def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     return distinct
 
 
-def on_whole_records(search: Search, ahead: Sequence[Fit], most: int) -> list[Fit]:
+def on_whole_records(search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf")) -> list[Fit]:
     """The best of fits ahead, fitted to whole records, best first.
 
     Args:
         ahead: best first.
         most: at most so many, and none that is far behind.
+        to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
     """
     close = [f for f in ahead[:most] if f.cost < CLOSE * ahead[0].cost]
     fits = [followed(search, f.effects, 5) for f in close[:1]]
@@ -92,6 +94,7 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int) -> list[Fi
     fits += search.workers.map(lambda f: followed(search, f.effects, 5), close[1:])
     fits.sort(key=promise)
     running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
+    running = [f for f in running if f.cost * (1.0 - f.falling) ** FURTHER < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 

@@ -61,8 +61,12 @@ class Search:
         left = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
         slack = SLACK + 5.0 * np.sqrt(2.0 / per_record) + INTEGRATION_SHARE * self.nominal.mean(axis=1)
-        overall = SLACK + INTEGRATION_SHARE * self.nominal.mean()
-        return bool((left < 1.0 + slack).all() and left.mean() < 1.0 + overall)
+        return bool((left < 1.0 + slack).all() and left.mean() < self.enough)
+
+    @property
+    def enough(self) -> float:
+        """The cost of a set that explains the records, at most."""
+        return float(1.0 + SLACK + INTEGRATION_SHARE * self.nominal.mean())
 
     def _doubled(self, effects: Sequence[Effect]) -> bool:
         point = [effect for effect in effects if effect.kind.nonlinear and "at" in effect.values]
