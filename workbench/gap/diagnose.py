@@ -88,6 +88,7 @@ def _verdict(
     outcome = "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
     effects = found.best.effects if outcome in ("none", "explained") else ()
     faulty = [str(effect.target) for effect in found.best.effects if effect.kind.path == "sensor"]
+    _ = found.evidence.at_peaks  # found once, before the work is shared
     where, ready = workers.both(
         lambda: locate(found.evidence, effects, faulty=faulty),
         lambda: readiness(found.evidence, catalogue=catalogue),

@@ -1,0 +1,70 @@
+"""A set brought to its end: as the simplest that the records cannot tell from it, and no further than is of use."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap import pursuit
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.gap.finish import finished, simplest
+from workbench.gap.fit import fit
+from workbench.gap.prediction import FitData
+from workbench.gap.pursuit import on_whole_records
+from workbench.gap.search import Search
+from workbench.gap.workers import Workers
+from workbench.rig.elements import BoucWen, CubicSpring
+
+BOUC_WEN, SPRING, NOISE = kind_named("bouc_wen"), kind_named("ground_spring"), 1e-5
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig()
+
+
+@pytest.fixture(scope="module")
+def search(rig, record_of):
+    """A search in a record of what the rig really is."""
+
+    def make(real, workers: int = 1, level: float = 1.0) -> Search:
+        rng = np.random.default_rng(0)
+        command = level * np.repeat(rng.normal(size=100), 10)[None]
+        data = FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
+        quick, nominal = data.stepped(2), data.by_channel(data.residual(rig))
+        return Search(rig, data, quick, quick, CATALOGUE, lambda text, share: None, Workers(workers), nominal)
+
+    return make
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_hysteretic_spring_that_never_yields_is_a_plain_one(rig, search, workers):
+    one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), workers, 0.02)
+    start = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 2.5, "yield_displacement": 3.0})
+    found = simplest(one, finished(one, fit(one.rig, (start,), one.data)))
+    assert one.explains(found) and found.labels == ("ground_spring",)
+    assert found.effects[0].values["at"] == pytest.approx(0.62, abs=0.01)
+
+
+def test_a_hysteretic_spring_that_yields_is_no_plain_one(rig, search):
+    one = search(replace(rig, elements=(BoucWen(0.62, 30.0, 0.02),)))
+    start = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 28.0, "yield_displacement": 0.025})
+    found = finished(one, fit(one.rig, (start,), one.data))
+    assert one.explains(found) and simplest(one, found) is found
+
+
+def test_a_fit_on_its_way_to_more_than_is_of_use_stays_where_it_is(rig, search, monkeypatch):
+    one, ended = search(replace(rig, elements=(CubicSpring(0.62, 300.0),))), []
+
+    def whole(search, effects, iterations):
+        ended.append(iterations)
+        return replace(fit(search.rig, effects, search.data, iterations=2), falling=0.003)
+
+    monkeypatch.setattr(pursuit, "whole", whole)
+    wrong = fit(one.rig, (Effect(SPRING, None, {"at": 0.6, "stiffness": 1.0}),), one.data, iterations=1)
+    on_whole_records(one, [wrong], 1)
+    assert ended == [5, 25]
+    ended.clear()
+    on_whole_records(one, [wrong], 1, to_cost=one.enough)
+    assert ended == [5]
