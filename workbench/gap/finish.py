@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.containment import fewer, simpler_forms
+from workbench.gap.effects.containment import fewer, with_one_simpler
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.pursuit import FINE
 from workbench.gap.search import Search, promise
-from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on they are tried
@@ -50,19 +49,13 @@ def simplified(search: Search, candidate: Fit) -> Fit:
     A hysteretic spring finds its way from where a plain one does not, and then never yields.
     """
     here = cost_of(search.rig, candidate.effects, search.quick)
-    for effects in _simpler_forms(search.rig, candidate.effects):
+    for effects in with_one_simpler(candidate.effects, search.rig):
         started = fit(search.rig, effects, search.quick, iterations=6)
         if promise(started) < here:
             trial = finished(search, fit(search.rig, started.effects, search.data, iterations=10))
             if trial.cost < candidate.cost:
                 return trial
     return candidate
-
-
-def _simpler_forms(rig: Rig, effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
-    for i, effect in enumerate(effects):
-        for simpler in simpler_forms(effect, rig):
-            yield (*effects[:i], simpler, *effects[i + 1 :])
 
 
 def relocated(search: Search, candidate: Fit) -> Fit:
@@ -113,7 +106,7 @@ def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list
     by_key = {candidate.key: candidate for candidate in fits}
 
     def needless(candidate: Fit) -> bool:
-        forms = (*fewer(candidate.effects), *_simpler_forms(search.rig, candidate.effects))
+        forms = (*fewer(candidate.effects), *with_one_simpler(candidate.effects, search.rig))
         others = (by_key.get(tuple(sorted(effect.label for effect in form))) for form in forms)
         simpler = (other for other in others if other is not None and other is not candidate)
         return any(not (_pays(search, candidate, f) and f.cost - candidate.cost > worth) for f in simpler)
@@ -146,7 +139,7 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
         if cost_of(search.rig, rest, search.data) < 1.0 + IDLE:
             yield rest
     yield from fewer(candidate.effects)
-    yield from _simpler_forms(search.rig, candidate.effects)
+    yield from with_one_simpler(candidate.effects, search.rig)
 
 
 def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 
+from workbench.gap.effects.containment import contained
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.following import LOOSE
 from workbench.gap.prediction import FitData
-from workbench.gap.search import Search, in_one_valley, promise
+from workbench.gap.search import WORTHWHILE, Search, in_one_valley, promise
 from workbench.gap.weighing import Weighed
 from workbench.rig.simulate import is_stepped
 
@@ -88,15 +89,25 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int, *, to_cost
         to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
     """
     close = [f for f in ahead[:most] if f.cost < CLOSE * ahead[0].cost]
-    fits = [followed(search, f.effects, 5) for f in close[:1]]
-    if fits and search.explains(fits[0]):
-        close = [f for f in close if f.cost < ahead[0].cost + RIVAL]
-    fits += search.workers.map(lambda f: followed(search, f.effects, 5), close[1:])
-    fits.sort(key=promise)
+    simpler = contained(close[0].effects, search.rig) if close else set()
+    first = [f for f in close if f is close[0] or f.key in simpler]
+    fits = search.workers.map(lambda f: followed(search, f.effects, 5), first)
+    rest = [f for f in close if f not in first]
+    if any(search.explains(f) for f in fits):
+        rest = [f for f in rest if f.cost < ahead[0].cost + RIVAL]
+    others = _none_that_contains(search, fits, rest)
+    fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, 5), others)), key=promise)
+    fits = _none_that_contains(search, fits, fits)
     running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
     running = [f for f in running if f.cost * (1.0 - f.falling) ** FURTHER < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
+
+
+def _none_that_contains(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+    """The others but those that come, at bounds of their numbers, to a fit that leaves nothing worth an effect."""
+    enough = {f.key for f in fits if f.cost < 1.0 + WORTHWHILE and search.explains(f)}
+    return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
 
 
 def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:

@@ -67,3 +67,20 @@ def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
             places = (one.values["at"], other.values["at"])
             for at in (*places, 0.5 * sum(places)):
                 yield (*rest, replace(one, values={**one.values, "at": at}))
+
+
+def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
+    """The set with one of its effects as what it turns into at a bound."""
+    for i, effect in enumerate(effects):
+        for simpler in simpler_forms(effect, rig):
+            yield (*effects[:i], simpler, *effects[i + 1 :])
+
+
+def contained(effects: Sequence[Effect], rig: Rig) -> set[tuple[str, ...]]:
+    """The labels, in order, of all sets that this one comes to at bounds of its parameters."""
+    found: set[tuple[str, ...]] = set()
+    for form in (*fewer(effects), *with_one_simpler(effects, rig)):
+        labels = tuple(sorted(effect.label for effect in form))
+        if labels not in found:
+            found |= {labels} | contained(form, rig)
+    return found
