@@ -7,6 +7,7 @@ import pytest
 
 from workbench.gap import pursuit
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.containment import contained
 from workbench.gap.effects.effect import Effect
 from workbench.gap.finish import finished, simplest
 from workbench.gap.fit import fit
@@ -68,3 +69,32 @@ def test_a_fit_on_its_way_to_more_than_is_of_use_stays_where_it_is(rig, search, 
     ended.clear()
     on_whole_records(one, [wrong], 1, to_cost=one.enough)
     assert ended == [5]
+
+
+def test_a_set_that_contains_one_that_leaves_only_noise_is_not_fitted_to_its_end(rig, search):
+    one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), level=0.02)
+    spring = Effect(SPRING, None, {"at": 0.6, "stiffness": 2.5})
+    hysteretic = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 2.5, "yield_displacement": 3.0})
+    ahead = [fit(one.rig, (effect,), one.data, iterations=1) for effect in (hysteretic, spring)]
+    # whichever comes first, the simpler one is fitted beside it
+    for both in (ahead, ahead[::-1]):
+        close = [replace(f, cost=1.0 + 0.01 * i) for i, f in enumerate(both)]
+        assert [f.labels for f in on_whole_records(one, close, 2)] == [("ground_spring",)]
+
+
+def test_a_set_that_contains_one_that_leaves_more_is_fitted(rig, search):
+    one = search(replace(rig, elements=(BoucWen(0.62, 30.0, 0.02),)))
+    spring = Effect(SPRING, None, {"at": 0.6, "stiffness": 28.0})
+    hysteretic = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 28.0, "yield_displacement": 0.025})
+    close = [replace(fit(one.rig, (effect,), one.data, iterations=1), cost=1.0) for effect in (spring, hysteretic)]
+    found = on_whole_records(one, close, 2)
+    assert found[0].labels == ("bouc_wen",) and one.explains(found[0])
+
+
+def test_what_a_set_comes_to_at_bounds_is_told_to_the_last(rig):
+    near_the_end = Effect(BOUC_WEN, None, {"at": 0.05, "stiffness": 1.0, "yield_displacement": 1.0})
+    gain = Effect(kind_named("sensor_gain"), "d1", {"gain": 0.9})
+    assert contained((near_the_end, gain), rig) == {
+        ("ground_spring", "sensor_gain[d1]"),
+        ("sensor_gain[d1]", "support_rotation[left]"),
+    }
