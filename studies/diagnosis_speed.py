@@ -18,7 +18,7 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 
 SEED = 70000
-FAMILIES = {"single": (1, 24, 10.0), "pair": (2, 12, 30.0)}  # effects that hide, cases, limit in s
+FAMILIES = {"single": (1, 18, 10.0), "pair": (2, 9, 30.0)}  # effects that hide, cases, limit in s
 WORKERS = 2
 MODES, SAMPLES = (16, 32, 64, 128), (4000, 8000, 16000, 32000)
 NOISE = 1e-4
