@@ -78,6 +78,14 @@ def test_innovations_are_what_was_not_foretold(kalman, residual):
     assert np.sum(white**2) == pytest.approx(np.sum(expected * np.linalg.solve(kalman.innovation, expected)))
 
 
+def test_what_runs_away_is_likely_nowhere_and_ends_nothing(kalman, residual):
+    astray = residual.copy()
+    astray[1, 7] = np.inf
+    with np.errstate(invalid="ignore"):
+        assert log_likelihood(kalman, [astray]) == -np.inf
+        assert not np.isfinite(whiten(kalman, astray)).all()
+
+
 def test_the_smoother_tells_the_mean_of_all_states_given_all_readings(kalman, joint, residual):
     mean = (joint[0] @ np.linalg.solve(joint[1], residual.T.ravel())).reshape(SAMPLES, -1).T
     found = smoothed_states(kalman, residual)

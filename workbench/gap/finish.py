@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.containment import fewer, with_one_simpler
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.containment import simpler_sets, with_one_simpler
+from workbench.gap.effects.effect import Effect, apply_all, key_of
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.pursuit import FINE
 from workbench.gap.search import Search, promise
@@ -106,8 +106,7 @@ def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list
     by_key = {candidate.key: candidate for candidate in fits}
 
     def needless(candidate: Fit) -> bool:
-        forms = (*fewer(candidate.effects), *with_one_simpler(candidate.effects, search.rig))
-        others = (by_key.get(tuple(sorted(effect.label for effect in form))) for form in forms)
+        others = (by_key.get(key_of(form)) for form in simpler_sets(candidate.effects, search.rig))
         simpler = (other for other in others if other is not None and other is not candidate)
         return any(not (_pays(search, candidate, f) and f.cost - candidate.cost > worth) for f in simpler)
 
@@ -138,8 +137,7 @@ def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]
         rest = tuple(other for other in candidate.effects if other is not effect)
         if cost_of(search.rig, rest, search.data) < 1.0 + IDLE:
             yield rest
-    yield from fewer(candidate.effects)
-    yield from with_one_simpler(candidate.effects, search.rig)
+    yield from simpler_sets(candidate.effects, search.rig)
 
 
 def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:

@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Parameter, apply_all
+from workbench.gap.effects.effect import Effect, Parameter, apply_all, key_of
 from workbench.gap.prediction import FitData
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
@@ -42,9 +42,9 @@ class Fit:
         return tuple(effect.label for effect in self.effects)
 
     @property
-    def key(self) -> tuple:
+    def key(self) -> tuple[str, ...]:
         """What tells this set from another, numbers apart."""
-        return tuple(sorted(self.labels))
+        return key_of(self.effects)
 
 
 def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:

@@ -199,9 +199,8 @@ def log_likelihoods(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     e = innovations(filter_, residual)
     if not np.abs(e).max() < RUNAWAY:
         return np.full(e.shape[1], -np.inf)
-    factor = np.linalg.cholesky(filter_.innovation)
-    white = solve_triangular(factor, e, lower=True, check_finite=False)
-    return -0.5 * np.einsum("jk,jk->k", white, white) - np.log(np.diag(factor)).sum()
+    white = _of_unit_covariance(filter_, e)
+    return -0.5 * (np.einsum("jk,jk->k", white, white) + np.linalg.slogdet(filter_.innovation)[1])
 
 
 def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
@@ -211,7 +210,12 @@ def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
 
 def whiten(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
     """Innovations of unit covariance (n_sensors, n_samples)."""
-    return solve_triangular(np.linalg.cholesky(filter_.innovation), innovations(filter_, residual), lower=True)
+    return _of_unit_covariance(filter_, innovations(filter_, residual))
+
+
+def _of_unit_covariance(filter_: ForceFilter, errors: np.ndarray) -> np.ndarray:
+    # errors of a motion that ran away are no numbers, and stay none
+    return solve_triangular(np.linalg.cholesky(filter_.innovation), errors, lower=True, check_finite=False)
 
 
 def smoothed_states(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:

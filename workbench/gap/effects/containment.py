@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.effects.effect import Effect, Kind, key_of
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.nonlinear import BOUC_WEN, CLEARANCE, COULOMB_FRICTION
 from workbench.gap.effects.structural import (
@@ -76,11 +76,16 @@ def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effe
             yield (*effects[:i], simpler, *effects[i + 1 :])
 
 
+def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
+    """The sets that this one comes to at a bound of one effect, or with two as one."""
+    yield from fewer(effects)
+    yield from with_one_simpler(effects, rig)
+
+
 def contained(effects: Sequence[Effect], rig: Rig) -> set[tuple[str, ...]]:
-    """The labels, in order, of all sets that this one comes to at bounds of its parameters."""
+    """The keys of all sets that this one comes to at bounds of its parameters."""
     found: set[tuple[str, ...]] = set()
-    for form in (*fewer(effects), *with_one_simpler(effects, rig)):
-        labels = tuple(sorted(effect.label for effect in form))
-        if labels not in found:
-            found |= {labels} | contained(form, rig)
+    for simpler in simpler_sets(effects, rig):
+        if key_of(simpler) not in found:
+            found |= {key_of(simpler)} | contained(simpler, rig)
     return found

@@ -110,6 +110,11 @@ class Effect:
         return self.kind.name if self.target is None else f"{self.kind.name}[{self.target}]"
 
 
+def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
+    """What tells a set of effects from another, numbers and order apart."""
+    return tuple(sorted(effect.label for effect in effects))
+
+
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
     """The rig with every effect in it, in order, those that come last at the end."""
     for effect in sorted(effects, key=lambda e: e.kind.last):
