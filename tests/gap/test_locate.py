@@ -36,8 +36,9 @@ def evidence(rig, records):
     return Evidence.of(rig, FitData(tuple(records), np.full(len(rig.sensors), NOISE)))
 
 
-def where(rig, records, **options):
-    return locate(evidence(rig, records), (), **options)
+def where(rig, records, faulty=()):
+    found = evidence(rig, records)
+    return locate(found, (), placed(found.without(faulty)))
 
 
 def placed_by(rig, records):

@@ -45,10 +45,29 @@ def test_what_is_found_comes_in_the_order_of_the_items(number):
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_two_different_things_are_done_side_by_side_and_each_may_share_its_own_work(number):
+def test_what_is_worked_out_aside_is_worked_out_once_beside_work_that_is_shared(number):
     workers = Workers(number)
-    squares, text = workers.both(lambda: workers.map(lambda i: i**2, range(5)), lambda: "other")
-    assert squares == [0, 1, 4, 9, 16] and text == "other"
+    with workers.aside(os.getpid) as one, workers.aside(lambda: workers.map(lambda i: i**2, range(5))) as other:
+        assert workers.map(lambda i: i + 1, range(5)) == [1, 2, 3, 4, 5]
+        assert other() == other() == [0, 1, 4, 9, 16]
+        assert (one() == os.getpid()) == (number == 1 or not FORKS)
+
+
+@forked
+def test_work_aside_gives_way_to_others_and_its_failure_is_raised_where_it_is_asked_for(helpers):
+    def fails():
+        raise ValueError(f"niceness {os.nice(0)}")
+
+    with TWO.aside(fails) as asked, pytest.raises(ValueError, match="niceness 19"):
+        asked()
+
+
+@forked
+def test_nobody_waits_for_work_aside_that_is_not_asked_for(helpers):
+    begun = time.perf_counter()
+    with pytest.raises(KeyboardInterrupt), TWO.aside(lambda: time.sleep(60)):
+        raise KeyboardInterrupt
+    assert time.perf_counter() - begun < 30
 
 
 @pytest.mark.parametrize("n", [MOST_TURNS - 1, MOST_TURNS, 2 * MOST_TURNS + 1])

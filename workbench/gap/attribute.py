@@ -73,39 +73,41 @@ class Attribution:
         return tuple(sorted((*self.tried, *fitted), key=lambda f: f.cost))
 
 
-def attribute(
-    rig: Rig,
-    records: Sequence[Record],
-    *,
-    catalogue: tuple[Kind, ...] = CATALOGUE,
-    report: Callable[[str, float], None] = lambda text, share: None,
-    workers: Workers = ALONE,
-    settle: float = 0.0,
-    free_nominal: bool = False,
-) -> Attribution:
-    """Find the effects that turn the residual of a rig on its fit records into noise.
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """Records laid beside a rig, before any effect is guessed.
 
-    Each kind is tried alone from many starts; if none alone leaves only noise, the best few are each joined by a
-    second. A set counts as an explanation only when every record is left at its noise floor; else the outcome is
-    "part" or "unknown".
+    Attributes:
+        seen: rounding and clipping, which show in the readings themselves.
+        nominal: evidence of the nominal rig.
+        evidence: of the rig with what is seen.
+    """
+
+    seen: tuple[Effect, ...]
+    nominal: Evidence
+    evidence: Evidence
+
+
+def opened(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers: Workers = ALONE) -> Opened:
+    """What a rig leaves of its fit records, where a force is missing and what it does there.
 
     Args:
         rig: nominal.
         records: to fit; validation records have no business here.
-        catalogue: kinds of effects to try.
-        report: told (what, share done) as the search proceeds.
-        workers: processes that share the work.
         settle: seconds at the start of each record that are simulated but not counted.
-        free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
-            a little off; otherwise they are freed where no set explains the records without.
+        workers: processes that share the work.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
-    plain = FitData(tuple(records), noise, lead=round(settle / records[0].sample_time))
-    seen, data = _plain_to_see(rig, plain)
-    return _search(rig, seen, data, catalogue, report, workers, free_nominal)
+    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, lead=round(settle / records[0].sample_time)))
+    evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
+    _ = evidence.at_peaks  # found once, before the work parts
+    if not seen:
+        return Opened(seen, evidence, evidence)
+    nominal = replace(Evidence.of(rig, data, workers=workers), told=evidence.peaks, sized=evidence.size)
+    return Opened(seen, nominal, evidence)
 
 
 def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
@@ -125,22 +127,40 @@ def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]
     return tuple(seen), replace(data, noise=noise)
 
 
-def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attribution:
-    base = apply_all(rig, seen)
-    nominal = data.by_channel(data.residual(rig))
-    start = Fit(seen, cost_of(base, (), data), data.by_channel(data.residual(base)), 0, "read off the records")
+def attribute(
+    found: Opened,
+    *,
+    catalogue: tuple[Kind, ...] = CATALOGUE,
+    report: Callable[[str, float], None] = lambda text, share: None,
+    free_nominal: bool = False,
+) -> Attribution:
+    """Find the effects that turn the residual of a rig on its fit records into noise.
+
+    Each kind is tried alone from many starts; if none alone leaves only noise, the best few are each joined by a
+    second. A set counts as an explanation only when every record is left at its noise floor; else the outcome is
+    "part" or "unknown".
+
+    Args:
+        found: before any effect is guessed.
+        catalogue: kinds of effects to try.
+        report: told (what, share done) as the search proceeds.
+        free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
+            a little off; otherwise they are freed where no set explains the records without.
+    """
+    seen, evidence = found.seen, found.evidence
+    rig, data, workers = evidence.rig, evidence.data, evidence.workers
+    nominal = data.by_channel(data.residual(found.nominal.rig))
+    start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0, "read off the records")
     telling = _telling(data, start)
     quick, first = data.only(telling).stepped(2), data.only(telling[:1]).stepped(2)
-    search = Search(base, data, quick, first, catalogue, report, workers, nominal)
-    report("looking for the missing force", 0.02)
-    evidence = Evidence.of(base, data, workers=workers)
-    found: Decision | None
+    search = Search(rig, data, quick, first, catalogue, report, workers, nominal)
+    decision: Decision | None
     ahead: list[Fit] = []
     if free_nominal and not search.explains(start):
-        found, singles = decide_with_figures_freed(search, start)
+        decision, singles = decide_with_figures_freed(search, start)
     else:
-        found, singles = (None, []) if search.explains(start) else decide_on_random(search, evidence)
-        if found is None:
+        decision, singles = (None, []) if search.explains(start) else decide_on_random(search, evidence)
+        if decision is None:
             report("one effect", 0.1)
             weighed = Weighed.of(search, (), evidence)
             ahead = one_more(search, (), evidence, weighed)
@@ -148,9 +168,9 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
             hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
             singles = on_whole_records(search, hopeful, FINALISTS)
             alone = decide(search, start, singles)
-            found = unless_another(search, alone, evidence) if alone else None
-            found = found or _with_a_second(search, start, ahead, weighed, evidence)
-    outcome, best, random, rivals = found
+            decision = unless_another(search, alone, evidence) if alone else None
+            decision = decision or _with_a_second(search, start, ahead, weighed, evidence)
+    outcome, best, random, rivals = decision
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
@@ -163,7 +183,7 @@ def _search(rig, seen, data, catalogue, report, workers, free_nominal) -> Attrib
         nominal_cost=float(nominal.mean()),
         tried=tuple(singles),
         ahead=tuple(ahead),
-        evidence=Evidence.of(rig, data, workers=workers) if seen else evidence,
+        evidence=found.nominal,
         search=search,
     )
 

@@ -4,13 +4,14 @@ from collections.abc import Callable, Sequence
 
 from threadpoolctl import threadpool_limits
 
-from workbench.gap.attribute import Attribution, attribute
+from workbench.gap.attribute import Attribution, attribute, opened
 from workbench.gap.check import check_modes, check_records, readiness
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Kind, apply_all
 from workbench.gap.experiment import Experiment, next_experiment
 from workbench.gap.locate import locate
+from workbench.gap.place import Placed, placed
 from workbench.gap.shrinkage import Shrinkage, measure
 from workbench.gap.verdict import Verdict
 from workbench.gap.workers import Workers
@@ -62,51 +63,42 @@ def diagnose(
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     # the threads of the search and those of the linear algebra would wait for one another
     with threadpool_limits(1, user_api="blas"):
-        found = attribute(
-            rig,
-            records,
-            catalogue=catalogue,
-            report=report,
-            workers=sharing,
-            settle=settle,
-            free_nominal=free_nominal,
-        )
-        return _verdict(rig, found, validation, catalogue, name, settle, sharing)
+        report("looking for the missing force", 0.02)
+        found = opened(rig, records, settle=settle, workers=sharing)
+        nominal = found.nominal
+        with (
+            sharing.aside(lambda: placed(nominal)) as place,
+            sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
+        ):
+            attribution = attribute(found, catalogue=catalogue, report=report, free_nominal=free_nominal)
+            corrected = apply_all(rig, attribution.best.effects)
+            shrinkage = measure(rig, corrected, validation, settle=settle)
+            outcome = _outcome(attribution, shrinkage)
+            effects = attribution.best.effects if outcome in ("none", "explained") else ()
+            return Verdict(
+                case=name,
+                outcome=outcome,
+                effects=attribution.best.effects,
+                alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in attribution.rivals),
+                where=locate(nominal, effects, _place(attribution) or place()),
+                shrinkage=shrinkage,
+                corrected=corrected,
+                nominal=rig,
+                attribution=attribution,
+                readiness=ready(),
+                experiment=_next(rig, attribution, sharing),
+                notes=_notes(attribution, outcome),
+            )
 
 
-def _verdict(
-    rig: Rig,
-    found: Attribution,
-    validation: Sequence[Record],
-    catalogue: tuple[Kind, ...],
-    name: str,
-    settle: float,
-    workers: Workers,
-) -> Verdict:
-    corrected = apply_all(rig, found.best.effects)
-    shrinkage = measure(rig, corrected, validation, settle=settle)
-    outcome = "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
-    effects = found.best.effects if outcome in ("none", "explained") else ()
+def _place(found: Attribution) -> Placed | None:
+    """Of a missing force without sensors at fault, which it would have to explain too; None where none is."""
     faulty = [str(effect.target) for effect in found.best.effects if effect.kind.path == "sensor"]
-    _ = found.evidence.at_peaks  # found once, before the work is shared
-    where, ready = workers.both(
-        lambda: locate(found.evidence, effects, faulty=faulty),
-        lambda: readiness(found.evidence, catalogue=catalogue),
-    )
-    return Verdict(
-        case=name,
-        outcome=outcome,
-        effects=found.best.effects,
-        alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in found.rivals),
-        where=where,
-        shrinkage=shrinkage,
-        corrected=corrected,
-        nominal=rig,
-        attribution=found,
-        readiness=ready,
-        experiment=_next(rig, found, workers),
-        notes=_notes(found, outcome),
-    )
+    return placed(found.evidence.without(faulty)) if faulty else None
+
+
+def _outcome(found: Attribution, shrinkage: Shrinkage | None) -> str:
+    return "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
 
 
 def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None) -> bool:

@@ -1,6 +1,6 @@
 """Where a simulation and a test disagree: by record, mode, band, time, sensor and level, and along which path."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +8,7 @@ import numpy as np
 from workbench.gap.coherence import linear_share
 from workbench.gap.effects.effect import Effect
 from workbench.gap.evidence import Evidence
-from workbench.gap.place import Placed, placed
+from workbench.gap.place import Placed
 from workbench.gap.prediction import FitData
 
 MODE_SHARE = 0.05
@@ -59,13 +59,13 @@ class Where:
         return self.place.at_std
 
 
-def locate(evidence: Evidence, effects: Sequence[Effect], *, faulty: Collection[str] = ()) -> Where:
+def locate(evidence: Evidence, effects: Sequence[Effect], place: Placed) -> Where:
     """Take the gap on the fit records apart.
 
     Args:
         evidence: of the nominal rig.
         effects: that explain the gap, where they are known: the path is theirs.
-        faulty: names of sensors at fault, left out where a force is placed: it would have to explain them too.
+        place: of a missing force; without sensors that are known to be at fault, which it would have to explain too.
     """
     data = evidence.data
     scaled = [
@@ -94,7 +94,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect], *, faulty: Collection[
         record_gaps=gaps,
         input_levels=levels,
         linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
-        place=placed(evidence.without(faulty)),
+        place=place,
     )
 
 

@@ -98,6 +98,7 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int, *, to_cost
     others = _none_that_contains(search, fits, rest)
     fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, 5), others)), key=promise)
     fits = _none_that_contains(search, fits, fits)
+    to_cost = min([to_cost, *(f.cost + RIVAL for f in fits if search.explains(f))])
     running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
     running = [f for f in running if f.cost * (1.0 - f.falling) ** FURTHER < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)

@@ -6,10 +6,11 @@ import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import cache
 from io import BytesIO
 from mmap import mmap
 from typing import Any, NoReturn, TypeVar
@@ -21,6 +22,7 @@ from workbench.gap.effects.effect import Kind
 
 MOST = 8  # processes: to fork one takes a hundredth of a second, every time
 FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not survive one, or there is none
+LEFT_OVER = 19  # niceness of what is worked out in the time that others leave
 TURN = 4  # bytes of a number in the pipe that turns are taken from
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
 
@@ -66,7 +68,7 @@ class Workers:
         turns = _turns(len(items))
         helpers: list[_Helper] = []
         try:
-            helpers += (_Helper(function, items, turns) for _ in range(number - 1))
+            helpers += (_Helper(lambda: _taken(function, items, turns)) for _ in range(number - 1))
             found = _taken(function, items, turns)
             for helper in helpers:
                 found.update(helper.found())
@@ -76,10 +78,21 @@ class Workers:
                 helper.end()
         return [found[i] for i in range(len(items))]
 
-    def both(self, one: Callable[[], Item], other: Callable[[], Found]) -> tuple[Item, Found]:
-        """What two functions of nothing return; see `map`."""
-        found: list[Any] = self.map(lambda ask: ask(), (one, other))
-        return found[0], found[1]
+    @contextmanager
+    def aside(self, function: Callable[[], Found]) -> Iterator[Callable[[], Found]]:
+        """Have `function()` worked out in the time that the others leave; what is given to the block, called, has it.
+
+        Where there is one process alone it is worked out when it is asked for. What nobody has asked for by the end of
+        the block is given up.
+        """
+        if _Helper.is_this_process or self.number < 2 or not FORKS:
+            yield cache(function)
+            return
+        helper = _Helper(function, patience=LEFT_OVER)
+        try:
+            yield cache(helper.found)
+        finally:
+            helper.end()
 
 
 ALONE = Workers(1)
@@ -115,22 +128,22 @@ def _taken(function: Callable, items: list, turns: int) -> dict[int, Any]:
 
 
 class _Helper:
-    """A forked process that takes its turns and sends back what it found; it has no helpers of its own."""
+    """A forked process that sends back what it found; it has no helpers of its own."""
 
     is_this_process = False
 
-    def __init__(self, function: Callable, items: list, turns: int):
+    def __init__(self, work: Callable[[], Any], patience: int = 0):
         self._source, sink = os.pipe()
         with warnings.catch_warnings():
             # no lock of another thread is ever asked for by a helper: it computes, writes to its pipe and ends
             warnings.filterwarnings("ignore", message=".*multi-threaded.*", category=DeprecationWarning)
             self._pid = os.fork()
         if self._pid == 0:
-            _help(function, items, turns, sink)
+            _help(work, sink, patience)
         os.close(sink)
 
-    def found(self) -> dict[int, Any]:
-        """What it found, by the index of the item; what it failed by is raised here."""
+    def found(self) -> Any:
+        """What it found; what it failed by is raised here."""
         with open(self._source, "rb", closefd=False) as sent:
             answer = sent.read()
         try:
@@ -150,12 +163,13 @@ class _Helper:
             os.waitpid(self._pid, 0)
 
 
-def _help(function: Callable, items: list, turns: int, sink: int) -> NoReturn:
+def _help(work: Callable[[], Any], sink: int, patience: int) -> NoReturn:
     """The life of a helper; it ends here, without what a process does at its end for those that it was forked from."""
     try:
         _Helper.is_this_process = True
+        os.nice(patience)
         try:
-            answer = _sent(_taken(function, items, turns))
+            answer = _sent(work())
         except Exception as error:
             error.add_note("".join(traceback.format_tb(error.__traceback__)))
             answer = _sent(error)

@@ -112,14 +112,18 @@ def held_response(
 
 
 def sinusoid_response(
-    system: ModalPoles, participation: np.ndarray, omega: float, phasor: complex, time: np.ndarray
+    system: ModalPoles, participation: np.ndarray, omega: float, phasor: complex, sample_time: float, n_samples: int
 ) -> np.ndarray:
     """Pole coordinates (n_poles, n_samples) under the modal force participation · Im(phasor e^{iωt}), from rest."""
-    poles, weights = system.poles[:, None], (system.weights @ participation)[:, None]
-    response = np.zeros((poles.size, time.size), complex)
-    for sign, amplitude in ((1.0, phasor / 2j), (-1.0, -np.conj(phasor) / 2j)):
-        response += amplitude * (np.exp(1j * sign * omega * time) - np.exp(poles * time)) / (1j * sign * omega - poles)
-    return weights * response
+    weights = system.weights @ participation
+    turning = np.exp(1j * omega * sample_time * np.arange(n_samples))
+    ahead = weights * (phasor / 2j) / (1j * omega - system.poles)
+    back = weights * (-np.conj(phasor) / 2j) / (-1j * omega - system.poles)
+    # beside what goes on with the force, each pole goes free from what makes the whole start at rest
+    response = np.empty((system.poles.size, n_samples), complex)
+    response[:, 0] = -(ahead + back)
+    _recursion(np.exp(system.poles * sample_time), np.zeros_like(response), response)
+    return response + np.outer(ahead, turning) + np.outer(back, turning.conj())
 
 
 def modal_motion(system: ModalPoles, response: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -207,7 +207,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
             continue
         shape = modes.phi(element.at)[0]
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
-        response += sinusoid_response(system, shape, omega, phasor, time)
+        response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
         acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
     return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping)
