@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 
 from workbench.gap.beside_random import NEAR
+from workbench.gap.effects.effect import apply_all
 from workbench.gap.finish import finished, ranked, relocated, simplest
 from workbench.gap.fit import Fit
 from workbench.gap.outcome import Decision
-from workbench.gap.search import Search
+from workbench.gap.search import FURTHER, RIVAL, Search, promise
+from workbench.rig.simulate import is_stepped
 
 FAR_BEHIND = 2.0  # finer steps bring no set this many times as costly as another to the noise floor before it
 
@@ -30,6 +32,9 @@ def decide(search: Search, start: Fit, singles: list[Fit]) -> Decision | None:
 
 
 def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
-    """The fits, best first; those that finer steps may bring to the noise floor are taken to their end."""
+    """The fits, best first; those that more or finer steps may bring to the noise floor are taken to their end."""
     hopeful = [f for f in fits if f.cost < FAR_BEHIND * fits[0].cost]
+    if fits and search.explains(fits[0]):
+        near = fits[0].cost + RIVAL
+        hopeful = [f for f in hopeful if promise(f, FURTHER) < near or is_stepped(apply_all(search.rig, f.effects))]
     return [*search.side_by_side(finished, hopeful), *fits[len(hopeful) :]]

@@ -108,7 +108,7 @@ def _unrounded(rig: Rig) -> Rig:
     """The rig itself where no sensor rounds."""
     if not any(sensor.step for sensor in rig.sensors):
         return rig
-    return replace(rig, sensors=tuple(replace(sensor, step=0.0) for sensor in rig.sensors))
+    return replace(rig, sensors=tuple(replace(s, step=0.0) if s.step else s for s in rig.sensors))
 
 
 def _at_once(rig: Rig) -> Rig:

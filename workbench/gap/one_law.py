@@ -7,8 +7,8 @@ from workbench.gap.evidence import Evidence
 from workbench.gap.finish import ranked
 from workbench.gap.fit import Fit, cost_of
 from workbench.gap.outcome import Decision
-from workbench.gap.pursuit import HOPEFUL, RIVAL, on_whole_records, one_more
-from workbench.gap.search import Search
+from workbench.gap.pursuit import HOPEFUL, on_whole_records, one_more
+from workbench.gap.search import RIVAL, Search
 
 TRIED = 2
 

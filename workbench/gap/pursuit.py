@@ -8,7 +8,7 @@ from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of, fit
 from workbench.gap.following import LOOSE
 from workbench.gap.prediction import FitData
-from workbench.gap.search import WORTHWHILE, Search, in_one_valley, promise
+from workbench.gap.search import FURTHER, RIVAL, WORTHWHILE, Search, in_one_valley, promise
 from workbench.gap.weighing import Weighed
 from workbench.rig.simulate import is_stepped
 
@@ -20,9 +20,7 @@ HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that e
 LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
 AT_HAND = 10.0  # times the noise: so near, whole records tell the way
 CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
-RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
 RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
-FURTHER = 100  # iterations like the last: a cost that they leave too high comes no lower in time
 
 
 def one_more(
@@ -100,7 +98,7 @@ def on_whole_records(search: Search, ahead: Sequence[Fit], most: int, *, to_cost
     fits = _none_that_contains(search, fits, fits)
     to_cost = min([to_cost, *(f.cost + RIVAL for f in fits if search.explains(f))])
     running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
-    running = [f for f in running if f.cost * (1.0 - f.falling) ** FURTHER < to_cost]
+    running = [f for f in running if promise(f, FURTHER) < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 

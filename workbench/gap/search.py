@@ -22,6 +22,8 @@ SURE = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
 WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect model
 ELSEWHERE = 0.1  # of the length: nearer, two places are in one valley of the cost at first
 SAME_PLACE = 0.02  # of the length: nearer, fits go on to the same end
+RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
+FURTHER = 100  # iterations like the last: a cost that they leave too high comes no lower in time
 COARSE = 2.0  # times the noise: below, rounding errors are all but white and of no signal
 
 
@@ -165,6 +167,6 @@ def in_one_valley(one: Fit, other: Fit, length: float) -> bool:
     return all(abs(here - there) < SAME_PLACE * length for (_, here), (_, there) in both)
 
 
-def promise(candidate: Fit) -> float:
-    """The cost that one more iteration like the last would come to."""
-    return candidate.cost * (1.0 - candidate.falling)
+def promise(candidate: Fit, iterations: int = 1) -> float:
+    """The cost that one more iteration like the last would come to, or so many more."""
+    return candidate.cost * (1.0 - candidate.falling) ** iterations

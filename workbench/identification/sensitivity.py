@@ -18,7 +18,7 @@ from scipy.linalg import eigh
 
 from workbench.identification.distributions import Basis
 from workbench.structure.member import Bar, Beam
-from workbench.structure.polynomials import Segments, tabulated_basis
+from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD, PointMass, PointSpring
 
@@ -218,7 +218,7 @@ class _Mesh:
         places = [*m.breaks, *k.breaks, *series.mass.breaks, *series.stiffness.breaks]
         nodes = _nodes([*places, *edges, *(part.at for part in nominal.attachments)], nominal.length)
         degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / nominal.length)) + 12 + EXTRA_DEGREES
-        segments = Segments(nodes, degree, order - 1)
+        segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
         x, weights, (values, slopes, strains) = _tables(segments, order)
         fixed_mass, fixed_stiffness, free = _fixed(nominal, segments, order)
         if isinstance(nominal, Beam) and nominal.tension:
@@ -238,18 +238,16 @@ def _nodes(places, length: float) -> np.ndarray:
 
 def _tables(segments: Segments, order: int):
     """Points, weights, and the functions with their first and highest derivatives there, (n_points, n_functions)."""
-    points, weights, reference = tabulated_basis(segments.degree, segments.continuity, segments.degree + 4)
-    n = points.size * segments.n_segments
-    h = np.diff(segments.nodes)
-    x = (segments.nodes[:-1, None] + 0.5 * h[:, None] * (points + 1.0)).ravel()
+    each = [[segments.tabulated(s, derivative) for s in range(segments.n_segments)] for derivative in (0, 1, order)]
+    x, weights = (np.concatenate([segment[i] for segment in each[0]]) for i in range(2))
     tables = []
-    for derivative in (0, 1, order):
-        table = np.zeros((n, segments.n_functions))
-        for s in range(segments.n_segments):
-            rows = slice(s * points.size, (s + 1) * points.size)
-            table[rows, segments.indices(s)] = reference[derivative] * segments.scales(s) * (2.0 / h[s]) ** derivative
+    for tabulated in each:
+        table, row = np.zeros((x.size, segments.n_functions)), 0
+        for s, (points, _, values) in enumerate(tabulated):
+            table[row : row + points.size, segments.indices(s)] = values
+            row += points.size
         tables.append(table)
-    return x, (0.5 * h[:, None] * weights).ravel(), tables
+    return x, weights, tables
 
 
 def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,13 +15,15 @@ from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring, as_end
 
-HIGHEST_DEGREE = 48
+HIGHEST_DEGREE = 60
+EVERY = 3  # degrees are multiples of it, so that few bases are made
 MOST_FUNCTIONS = 2400
 MOST_SEGMENTS = 600  # more would take minutes and gigabytes
 THINNEST = {0: 1e-9, 1: 1e-4}  # segment, of the length, by continuity: thinner, bending is lost in round-off
 NO_SLIVER = 1e-5  # of the length: a jump of a profile this near an end or another stands there
 TIP = 1e-9  # of the stiffness at midspan: an end that is no stiffer ends in a point
 CROWDING, COARSEST = 4.0, 0.25  # from segment to segment towards a tip, and the widest of them, of the length
+INSIDE = (np.arange(8) + 0.5) / 8  # where along a segment the length of waves is asked for
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
@@ -81,13 +84,19 @@ class _Member:
                 f"the profiles and attachments of the structure make {nodes.size - 1} segments; at most"
                 f" {MOST_SEGMENTS} are solved: give fewer points, or a smooth function"
             )
-        most = n_modes * np.diff(nodes).max() / self.length
-        degree = _carrying(most) + extra
-        pieces = int(np.ceil(degree / HIGHEST_DEGREE))
-        if pieces > 1:
-            nodes = np.unique(np.concatenate([np.linspace(a, b, pieces + 1) for a, b in zip(nodes, nodes[1:])]))
-            degree = _carrying(most / pieces) + extra // pieces
-        return Segments(nodes, min(degree, HIGHEST_DEGREE), continuity)
+        half_waves = n_modes * self._shares_of_waves(nodes, stiffness, continuity)
+        pieces = np.array([-(-_carrying(each) // HIGHEST_DEGREE) for each in half_waves])
+        degrees = [_carrying(each / n) + extra // n for each, n in zip(half_waves, pieces, strict=True)]
+        ends = (np.linspace(a, b, n + 1)[1:] for (a, b), n in zip(pairwise(nodes), pieces, strict=True))
+        return Segments(np.concatenate([nodes[:1], *ends]), tuple(np.repeat(degrees, pieces).tolist()), continuity)
+
+    def _shares_of_waves(self, nodes: np.ndarray, stiffness: Profile, continuity: int) -> np.ndarray:
+        """Share of a high mode's half waves in each segment: they are shorter where it is heavy or soft."""
+        points = nodes[:-1, None] + np.diff(nodes)[:, None] * INSIDE
+        softness = self.mass_per_length(points.ravel()) / stiffness(points.ravel())
+        density = softness.reshape(points.shape) ** (0.5 / (continuity + 1))
+        waves = np.diff(nodes) * density.mean(axis=1)
+        return waves / waves.sum()
 
     def _graded(self, at: float, stiffness: Profile) -> list[float]:
         """Nodes that crowd towards an attachment beside an end that is a tip: the motion there is all but singular."""
@@ -235,7 +244,8 @@ class _Member:
 
 def _carrying(half_waves: float) -> int:
     """The degree of a polynomial that carries so many half waves to ten digits: Bessel's J_k(z) < 1e-10 beyond it."""
-    return int(np.ceil(0.5 * np.pi * half_waves + 10.0 * half_waves ** (1.0 / 3.0))) + 3
+    degree = int(np.ceil(0.5 * np.pi * half_waves + 10.0 * half_waves ** (1.0 / 3.0))) + 3
+    return -(-degree // EVERY) * EVERY
 
 
 def _unstable(tension: float) -> str:

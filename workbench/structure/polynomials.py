@@ -7,7 +7,7 @@ accuracy would lose it to the condition number, which grows with the fourth powe
 """
 
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -25,20 +25,23 @@ def reference_basis(degree: int, continuity: int) -> np.ndarray:
     basis = np.zeros((degree + 1, degree + 1))
     if continuity == 0:
         basis[0, :2], basis[1, :2] = (0.5, -0.5), (0.5, 0.5)
-        first = 2
+        rows = np.arange(2, degree + 1)
     else:
         basis[0, :4] = legendre.poly2leg([0.5, -0.75, 0.0, 0.25])
         basis[1, :4] = legendre.poly2leg([0.25, -0.25, -0.25, 0.25])
         basis[2, :4] = legendre.poly2leg([0.5, 0.75, 0.0, -0.25])
         basis[3, :4] = legendre.poly2leg([-0.25, -0.25, 0.25, 0.25])
-        first = 4
-    for row in range(first, degree + 1):
-        order = row - (continuity + 1)
-        unit = np.zeros(order + 1)
-        unit[order] = np.sqrt(order + 0.5)
-        integral = legendre.legint(unit, m=continuity + 1, lbnd=-1)
-        basis[row, : integral.size] = integral
-    basis[np.abs(basis) < 1e-16] = 0.0
+        rows = np.arange(4, degree + 1)
+    n = rows - (continuity + 1)  # the row is the integral of the normalised polynomial of this order
+    integrals = np.zeros((rows.size, degree + 2 + continuity))
+    integrals[np.arange(rows.size), n] = np.sqrt(n + 0.5)
+    for _ in range(continuity + 1):
+        # from -1 on, P_n integrates to (P_n+1 - P_n-1) / (2 n + 1); no order below 1 comes up
+        share = integrals / (2.0 * np.arange(integrals.shape[1]) + 1.0)
+        integrals = np.zeros_like(integrals)
+        integrals[:, 1:] += share[:, :-1]
+        integrals[:, :-1] -= share[:, 1:]
+    basis[rows] = integrals[:, : degree + 1]
     return basis
 
 
@@ -66,12 +69,12 @@ class Segments:
 
     Attributes:
         nodes: (n_segments + 1,) ends of the segments, m.
-        degree: polynomial degree on every segment.
+        degrees: of the polynomials, one a segment.
         continuity: 0 (values; bar) or 1 (values and slopes; beam) shared across nodes.
     """
 
     nodes: np.ndarray
-    degree: int
+    degrees: tuple[int, ...]
     continuity: int
 
     @property
@@ -81,19 +84,23 @@ class Segments:
     @property
     def n_functions(self) -> int:
         """Number of global functions."""
+        return int(self._inner[-1])
+
+    @cached_property
+    def _inner(self) -> np.ndarray:
+        """Global index (n_segments + 1,) of the first function inside each segment, and the number of all."""
         nodal = self.continuity + 1
-        return nodal * self.nodes.size + self.n_segments * (self.degree + 1 - 2 * nodal)
+        return nodal * self.nodes.size + np.cumsum([0, *(degree + 1 - 2 * nodal for degree in self.degrees)])
 
     def indices(self, segment: int) -> np.ndarray:
         """Global indices (degree + 1,) of the functions of one segment, in the order of `reference_basis`."""
         nodal = self.continuity + 1
-        inner = self.degree + 1 - 2 * nodal
-        start = nodal * self.nodes.size + segment * inner
-        return np.concatenate([np.arange(nodal * segment, nodal * (segment + 2)), np.arange(start, start + inner)])
+        inner = np.arange(self._inner[segment], self._inner[segment + 1])
+        return np.concatenate([np.arange(nodal * segment, nodal * (segment + 2)), inner])
 
     def scales(self, segment: int) -> np.ndarray:
         """Factors (degree + 1,) that turn a local slope into a slope per metre."""
-        factors = np.ones(self.degree + 1)
+        factors = np.ones(self.degrees[segment] + 1)
         if self.continuity == 1:
             factors[[1, 3]] = 0.5 * (self.nodes[segment + 1] - self.nodes[segment])
         return factors
@@ -101,30 +108,35 @@ class Segments:
     def evaluation(self, x: ArrayLike, derivative: int = 0) -> np.ndarray:
         """The matrix (n_points, n_functions) that maps coefficients to values (or derivatives) at x, read-only."""
         x = np.atleast_1d(np.asarray(x, float))
-        return _evaluation(self.nodes.tobytes(), self.degree, self.continuity, x.tobytes(), derivative)
+        return _evaluation(self.nodes.tobytes(), self.degrees, self.continuity, x.tobytes(), derivative)
 
-    def assemble(self, weight, derivative: int, n_extra: int = 4) -> np.ndarray:
+    def tabulated(self, segment: int, derivative: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Gauss points of a segment (m), their weights, and a derivative of its functions there.
+
+        Returns:
+            (n_points,), (n_points,) and (n_points, degree + 1); the rule is exact for squares times a polynomial of
+            the seventh degree.
+        """
+        degree, h = self.degrees[segment], self.nodes[segment + 1] - self.nodes[segment]
+        points, weights, tables = tabulated_basis(degree, self.continuity, degree + 4)
+        table = tables[derivative] * self.scales(segment) * (2.0 / h) ** derivative
+        return self.nodes[segment] + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
+
+    def assemble(self, weight, derivative: int) -> np.ndarray:
         """Integral of weight(x) times the products of the functions' derivatives: (n_functions, n_functions)."""
-        points, weights, tables = tabulated_basis(self.degree, self.continuity, self.degree + n_extra)
         matrix = np.zeros((self.n_functions, self.n_functions))
         for s in range(self.n_segments):
-            h = self.nodes[s + 1] - self.nodes[s]
-            x = self.nodes[s] + 0.5 * h * (points + 1.0)
-            table = tables[derivative] * self.scales(s) * (2.0 / h) ** derivative
-            density = weights * 0.5 * h * weight(x)
+            x, weights, table = self.tabulated(s, derivative)
             indices = self.indices(s)
-            matrix[np.ix_(indices, indices)] += table.T @ (density[:, None] * table)
+            matrix[np.ix_(indices, indices)] += table.T @ ((weights * weight(x))[:, None] * table)
         return matrix
 
     def form(self, weight, derivative: int, coefficients: np.ndarray) -> np.ndarray:
         """Integral of weight(x) times the squared derivative of each column of coefficients: (n_columns,)."""
-        points, weights, tables = tabulated_basis(self.degree, self.continuity, self.degree + 4)
         total = np.zeros(coefficients.shape[1])
         for s in range(self.n_segments):
-            h = self.nodes[s + 1] - self.nodes[s]
-            x = self.nodes[s] + 0.5 * h * (points + 1.0)
-            table = tables[derivative] * self.scales(s) * (2.0 / h) ** derivative
-            total += (weights * 0.5 * h * weight(x)) @ (table @ coefficients[self.indices(s)]) ** 2
+            x, weights, table = self.tabulated(s, derivative)
+            total += (weights * weight(x)) @ (table @ coefficients[self.indices(s)]) ** 2
         return total
 
     def unresolved(self, coefficients: np.ndarray) -> float:
@@ -136,19 +148,18 @@ class Segments:
 
 
 @lru_cache(maxsize=512)
-def _evaluation(nodes: bytes, degree: int, continuity: int, places: bytes, derivative: int) -> np.ndarray:
+def _evaluation(nodes: bytes, degrees: tuple[int, ...], continuity: int, places: bytes, derivative: int) -> np.ndarray:
     """`Segments.evaluation`, remembered: sensors and actuators are asked for at the same places again and again."""
-    segments = Segments(np.frombuffer(nodes), degree, continuity)
+    segments = Segments(np.frombuffer(nodes), degrees, continuity)
     x = np.frombuffer(places)
     matrix = np.zeros((x.size, segments.n_functions))
     segment = np.clip(np.searchsorted(segments.nodes, x, side="right") - 1, 0, segments.n_segments - 1)
-    coefficients = _derived(degree, continuity, derivative)
-    orders = np.arange(coefficients.shape[0])
     for s in np.unique(segment):
         here = segment == s
         h = segments.nodes[s + 1] - segments.nodes[s]
         local = 2.0 * (x[here] - segments.nodes[s]) / h - 1.0
-        values = eval_legendre(orders, local[:, None]) @ coefficients
+        coefficients = _derived(degrees[s], continuity, derivative)
+        values = eval_legendre(np.arange(coefficients.shape[0]), local[:, None]) @ coefficients
         matrix[np.ix_(np.flatnonzero(here), segments.indices(s))] = (
             values * segments.scales(s) * (2.0 / h) ** derivative
         )
