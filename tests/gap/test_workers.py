@@ -4,6 +4,7 @@ import os
 import signal
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,6 +61,31 @@ def test_work_aside_gives_way_to_others_and_its_failure_is_raised_where_it_is_as
 
     with TWO.aside(fails) as asked, pytest.raises(ValueError, match="niceness 19"):
         asked()
+
+
+@forked
+def test_work_aside_is_shared_further_and_given_up_with_all_who_share_it(helpers):
+    source, sink = os.pipe()
+
+    def stays(i):
+        os.write(sink, os.getpid().to_bytes(4, "little"))
+        time.sleep(60)
+
+    with TWO.aside(lambda: TWO.map(stays, range(2))):
+        pids = {int.from_bytes(os.read(source, 4), "little") for _ in range(2)}
+    assert len(pids) == 2 and os.getpid() not in pids
+    deadline = time.perf_counter() + 10
+    while any(_runs(pid) for pid in pids) and time.perf_counter() < deadline:
+        time.sleep(0.01)
+    assert not any(_runs(pid) for pid in pids)
+
+
+def _runs(pid: int) -> bool:
+    """Whether a process is there, and not only as one that nobody asked how it ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 @forked

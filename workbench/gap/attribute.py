@@ -21,13 +21,14 @@ from workbench.gap.outcome import Decision
 from workbench.gap.pairs import Pairs
 from workbench.gap.prediction import FitData
 from workbench.gap.pursuit import HOPEFUL, on_whole_records, one_more
-from workbench.gap.search import Search, spread_over_kinds
+from workbench.gap.search import WORTHWHILE, Search, spread_over_kinds
 from workbench.gap.weighing import Weighed
 from workbench.gap.workers import ALONE, Workers
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
+BRIEFLY = 2  # iterations, where there may be no effect at all
 SHOWN = 7  # others that are, where they are to be shown beside them
 ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
 
@@ -166,7 +167,11 @@ def attribute(
             ahead = one_more(search, (), evidence, weighed)
             report("one effect, on whole records", 0.3)
             hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
-            singles = on_whole_records(search, hopeful, FINALISTS)
+            if search.explains(start):  # then only what leaves far less is of use, and none may
+                enough = start.cost - WORTHWHILE
+                singles = on_whole_records(search, hopeful, FINALISTS, to_cost=enough, at_first=BRIEFLY)
+            else:
+                singles = on_whole_records(search, hopeful, FINALISTS)
             alone = decide(search, start, singles)
             decision = unless_another(search, alone, evidence) if alone else None
             decision = decision or _with_a_second(search, start, ahead, weighed, evidence)

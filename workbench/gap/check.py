@@ -227,18 +227,21 @@ def _first_seen(kind: Kind, target, evidence: Evidence, data: FitData, base: np.
 
 
 def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
-    """Where a search would start, and from there each number by decades up and down.
+    """Where a search would start, and from the first and the last start each number by decades up and down.
 
     A search starts from the missing force, and where none is missing it starts from nothing.
     """
-    effect = None
-    for values in kind.starts(evidence, target):
-        effect = Effect(kind, target, dict(values))
-        yield effect
-    if effect is None:
-        return
+    starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+    if starts:
+        yield starts[0]
+        yield from _by_decades(starts[0], evidence.rig)
+        yield from starts[1:]
+        yield from _by_decades(starts[-1], evidence.rig)
+
+
+def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
     for factor in DECADES:
-        for parameter in effect.parameters(evidence.rig):
+        for parameter in effect.parameters(rig):
             if parameter.name != "at":
                 moved = float(np.clip(effect.values[parameter.name] * factor, parameter.low, parameter.high))
                 yield replace(effect, values={**effect.values, parameter.name: moved})

@@ -8,10 +8,10 @@ from workbench.gap.attribute import Attribution, attribute, opened
 from workbench.gap.check import check_modes, check_records, readiness
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Kind, apply_all
+from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.experiment import Experiment, next_experiment
 from workbench.gap.locate import locate
-from workbench.gap.place import Placed, placed
+from workbench.gap.place import placed
 from workbench.gap.shrinkage import Shrinkage, measure
 from workbench.gap.verdict import Verdict
 from workbench.gap.workers import Workers
@@ -67,7 +67,7 @@ def diagnose(
         found = opened(rig, records, settle=settle, workers=sharing)
         nominal = found.nominal
         with (
-            sharing.aside(lambda: placed(nominal)) as place,
+            sharing.aside(lambda: placed(nominal.without(_faulty(found.seen)))) as place,
             sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
         ):
             attribution = attribute(found, catalogue=catalogue, report=report, free_nominal=free_nominal)
@@ -75,12 +75,14 @@ def diagnose(
             shrinkage = measure(rig, corrected, validation, settle=settle)
             outcome = _outcome(attribution, shrinkage)
             effects = attribution.best.effects if outcome in ("none", "explained") else ()
+            faulty = _faulty(attribution.best.effects)
+            as_seen = faulty == _faulty(found.seen)
             return Verdict(
                 case=name,
                 outcome=outcome,
                 effects=attribution.best.effects,
                 alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in attribution.rivals),
-                where=locate(nominal, effects, _place(attribution) or place()),
+                where=locate(nominal, effects, place() if as_seen else placed(nominal.without(faulty))),
                 shrinkage=shrinkage,
                 corrected=corrected,
                 nominal=rig,
@@ -91,10 +93,9 @@ def diagnose(
             )
 
 
-def _place(found: Attribution) -> Placed | None:
-    """Of a missing force without sensors at fault, which it would have to explain too; None where none is."""
-    faulty = [str(effect.target) for effect in found.best.effects if effect.kind.path == "sensor"]
-    return placed(found.evidence.without(faulty)) if faulty else None
+def _faulty(effects: Sequence[Effect]) -> set[str]:
+    """Sensors at fault, which one force at a point would have to explain too."""
+    return {str(effect.target) for effect in effects if effect.kind.path == "sensor"}
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None) -> str:

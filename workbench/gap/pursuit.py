@@ -20,6 +20,7 @@ HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that e
 LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
 AT_HAND = 10.0  # times the noise: so near, whole records tell the way
 CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
+AT_FIRST = 5  # iterations on whole records, before it is seen which sets go on
 RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
 
 
@@ -78,23 +79,26 @@ def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     return distinct
 
 
-def on_whole_records(search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf")) -> list[Fit]:
+def on_whole_records(
+    search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf"), at_first: int = AT_FIRST
+) -> list[Fit]:
     """The best of fits ahead, fitted to whole records, best first.
 
     Args:
         ahead: best first.
         most: at most so many, and none that is far behind.
         to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
+        at_first: iterations before that is asked.
     """
     close = [f for f in ahead[:most] if f.cost < CLOSE * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
-    fits = search.workers.map(lambda f: followed(search, f.effects, 5), first)
+    fits = search.workers.map(lambda f: followed(search, f.effects, at_first), first)
     rest = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
         rest = [f for f in rest if f.cost < ahead[0].cost + RIVAL]
     others = _none_that_contains(search, fits, rest)
-    fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, 5), others)), key=promise)
+    fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, at_first), others)), key=promise)
     fits = _none_that_contains(search, fits, fits)
     to_cost = min([to_cost, *(f.cost + RIVAL for f in fits if search.explains(f))])
     running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]

@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from ctypes import CDLL
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -22,6 +23,7 @@ from workbench.gap.effects.effect import Kind
 
 MOST = 8  # processes: to fork one takes a hundredth of a second, every time
 FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not survive one, or there is none
+PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
 LEFT_OVER = 19  # niceness of what is worked out in the time that others leave
 TURN = 4  # bytes of a number in the pipe that turns are taken from
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
@@ -82,13 +84,13 @@ class Workers:
     def aside(self, function: Callable[[], Found]) -> Iterator[Callable[[], Found]]:
         """Have `function()` worked out in the time that the others leave; what is given to the block, called, has it.
 
-        Where there is one process alone it is worked out when it is asked for. What nobody has asked for by the end of
-        the block is given up.
+        Its work may be shared further. Where there is one process alone it is worked out when it is asked for. What
+        nobody has asked for by the end of the block is given up.
         """
         if _Helper.is_this_process or self.number < 2 or not FORKS:
             yield cache(function)
             return
-        helper = _Helper(function, patience=LEFT_OVER)
+        helper = _Helper(function, aside=True)
         try:
             yield cache(helper.found)
         finally:
@@ -128,18 +130,18 @@ def _taken(function: Callable, items: list, turns: int) -> dict[int, Any]:
 
 
 class _Helper:
-    """A forked process that sends back what it found; it has no helpers of its own."""
+    """A forked process that sends back what it found; it has no helpers of its own, unless it works aside."""
 
     is_this_process = False
 
-    def __init__(self, work: Callable[[], Any], patience: int = 0):
+    def __init__(self, work: Callable[[], Any], aside: bool = False):
         self._source, sink = os.pipe()
         with warnings.catch_warnings():
             # no lock of another thread is ever asked for by a helper: it computes, writes to its pipe and ends
             warnings.filterwarnings("ignore", message=".*multi-threaded.*", category=DeprecationWarning)
             self._pid = os.fork()
         if self._pid == 0:
-            _help(work, sink, patience)
+            _help(work, sink, aside)
         os.close(sink)
 
     def found(self) -> Any:
@@ -163,11 +165,12 @@ class _Helper:
             os.waitpid(self._pid, 0)
 
 
-def _help(work: Callable[[], Any], sink: int, patience: int) -> NoReturn:
+def _help(work: Callable[[], Any], sink: int, aside: bool) -> NoReturn:
     """The life of a helper; it ends here, without what a process does at its end for those that it was forked from."""
     try:
-        _Helper.is_this_process = True
-        os.nice(patience)
+        _Helper.is_this_process = not aside
+        os.nice(LEFT_OVER if aside else 0)
+        CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # it outlives nobody whom it works for
         try:
             answer = _sent(work())
         except Exception as error:
