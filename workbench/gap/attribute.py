@@ -28,6 +28,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
+ONE_SENSOR = 0.97  # of the gap
 BRIEFLY = 2  # iterations, where there may be no effect at all
 SHOWN = 7  # others that are, where they are to be shown beside them
 ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
@@ -155,26 +156,23 @@ def attribute(
     telling = _telling(data, start)
     quick, first = data.only(telling).stepped(2), data.only(telling[:1]).stepped(2)
     search = Search(rig, data, quick, first, catalogue, report, workers, nominal)
-    decision: Decision | None
+    decision: Decision | None = None
+    singles: list[Fit] = []
     ahead: list[Fit] = []
     if free_nominal and not search.explains(start):
         decision, singles = decide_with_figures_freed(search, start)
-    else:
-        decision, singles = (None, []) if search.explains(start) else decide_on_random(search, evidence)
-        if decision is None:
-            report("one effect", 0.1)
-            weighed = Weighed.of(search, (), evidence)
-            ahead = one_more(search, (), evidence, weighed)
-            report("one effect, on whole records", 0.3)
-            hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
-            if search.explains(start):  # then only what leaves far less is of use, and none may
-                enough = start.cost - WORTHWHILE
-                singles = on_whole_records(search, hopeful, FINALISTS, to_cost=enough, at_first=BRIEFLY)
-            else:
-                singles = on_whole_records(search, hopeful, FINALISTS)
-            alone = decide(search, start, singles)
-            decision = unless_another(search, alone, evidence) if alone else None
-            decision = decision or _with_a_second(search, start, ahead, weighed, evidence)
+    elif not search.explains(start) and not _of_one_sensor(start):
+        decision, singles = decide_on_random(search, evidence)
+    if decision is None:
+        report("one effect", 0.1)
+        weighed = Weighed.of(search, (), evidence)
+        ahead = one_more(search, (), evidence, weighed)
+        report("one effect, on whole records", 0.3)
+        singles = _alone(search, start, ahead)
+        alone = decide(search, start, singles)
+        decision = unless_another(search, alone, evidence) if alone else None
+        decision = decision or _beside_one_sensor(search, start, evidence)
+        decision = decision or _with_a_second(search, start, ahead, weighed, evidence)
     outcome, best, random, rivals = decision
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
@@ -191,6 +189,27 @@ def attribute(
         evidence=found.nominal,
         search=search,
     )
+
+
+def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
+    """Single effects on whole records, best first."""
+    hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
+    if not search.explains(start):
+        return on_whole_records(search, hopeful, FINALISTS)
+    # only what leaves far less is of use, and there may be none
+    enough = start.cost - WORTHWHILE
+    return on_whole_records(search, hopeful, FINALISTS, to_cost=enough, at_first=BRIEFLY)
+
+
+def _of_one_sensor(start: Fit) -> bool:
+    """Whether one sensor alone disagrees: its own fault is likelier than a random force, and far quicker to find."""
+    excess = np.maximum(start.cost_by_channel.mean(axis=0) - 1.0, 0.0)
+    return bool(excess.size > 1 and excess.max() > ONE_SENSOR * excess.sum())
+
+
+def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decision | None:
+    """A random disturbance that one sensor alone shows, where its own faults do not explain that."""
+    return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
 
 
 def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighed, evidence: Evidence) -> Decision:
