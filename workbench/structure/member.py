@@ -85,7 +85,7 @@ class _Member:
                 f" {MOST_SEGMENTS} are solved: give fewer points, or a smooth function"
             )
         half_waves = n_modes * self._shares_of_waves(nodes, stiffness, continuity)
-        pieces = np.array([-(-_carrying(each) // HIGHEST_DEGREE) for each in half_waves])
+        pieces = np.array([-(-(_carrying(each) + extra) // HIGHEST_DEGREE) for each in half_waves])
         degrees = [_carrying(each / n) + extra // n for each, n in zip(half_waves, pieces, strict=True)]
         ends = (np.linspace(a, b, n + 1)[1:] for (a, b), n in zip(pairwise(nodes), pieces, strict=True))
         return Segments(np.concatenate([nodes[:1], *ends]), tuple(np.repeat(degrees, pieces).tolist()), continuity)
