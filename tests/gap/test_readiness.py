@@ -43,6 +43,11 @@ def test_a_weak_start_hides_nothing_and_what_does_nothing_stays_hidden(rig, data
     assert readiness(Evidence.of(rig, data), catalogue=(weak, idle)).invisible == ("idle",)
 
 
+def test_a_force_that_noise_puts_by_a_support_hides_no_effect(rig, data):
+    found = readiness(Evidence.of(rig, data).of_force_at(1e-4 * rig.modes.length))
+    assert found.invisible and all("[F2]" in label for label in found.invisible)
+
+
 def test_two_effects_that_do_the_same_are_told_to_be_alike(rig, data):
     gain = kind_named("actuator_gain", CATALOGUE)
     twin = Kind(**{**vars(gain), "name": "another_gain"})

@@ -229,7 +229,8 @@ def _first_seen(kind: Kind, target, evidence: Evidence, data: FitData, base: np.
 def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
     """Where a search would start, and from the first and the last start each number by decades up and down.
 
-    A search starts from the missing force, and where none is missing it starts from nothing.
+    A search starts from the missing force, and where none is missing it starts from nothing, and anywhere: also by a
+    support, where nothing shows. So the last resort is where the structure moves most.
     """
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
     if starts:
@@ -237,6 +238,17 @@ def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
         yield from _by_decades(starts[0], evidence.rig)
         yield from starts[1:]
         yield from _by_decades(starts[-1], evidence.rig)
+        if "at" in starts[0].values:
+            liveliest = replace(starts[0], values={**starts[0].values, "at": _liveliest(evidence)})
+            yield liveliest
+            yield from _by_decades(liveliest, evidence.rig)
+
+
+def _liveliest(evidence: Evidence) -> float:
+    """The place that moves most, of those where a force is looked for, m."""
+    power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
+    shapes = evidence.rig.modes.phi(evidence.places)
+    return float(evidence.places[np.argmax(np.sum((shapes @ power) * shapes, axis=1))])
 
 
 def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
