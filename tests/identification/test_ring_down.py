@@ -112,6 +112,7 @@ def test_records_together_each_from_its_own_start():
     assert (told.refined.omega_std < ring_down(first).refined.omega_std).all()
 
 
+@pytest.mark.slow
 def test_swept_record_is_remarked():
     """A sweep lets mode after mode ring, and goes on."""
     time, pole = 0.02 * np.arange(1000), np.exp((-0.24 + 12.0j) * 0.02)
