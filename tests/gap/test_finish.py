@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap import pursuit
+from workbench.gap import decide, pursuit
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.containment import contained
 from workbench.gap.effects.effect import Effect
@@ -18,6 +18,7 @@ from workbench.gap.workers import Workers
 from workbench.rig.elements import BoucWen, CubicSpring
 
 BOUC_WEN, SPRING, NOISE = kind_named("bouc_wen"), kind_named("ground_spring"), 1e-5
+MODULUS = kind_named("modulus_error")
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +99,17 @@ def test_what_a_set_comes_to_at_bounds_is_told_to_the_last(rig):
         ("ground_spring", "sensor_gain[d1]"),
         ("sensor_gain[d1]", "support_rotation[left]"),
     }
+
+
+def test_what_is_not_taken_to_its_end_is_still_there_and_all_are_there_once(rig, search, monkeypatch):
+    one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), level=0.02)
+    ended = []
+    monkeypatch.setattr(decide, "finished", lambda search, candidate: ended.append(candidate) or candidate)
+    first = fit(rig, (Effect(SPRING, None, {"at": 0.62, "stiffness": 3.0}),), one.data)
+    assert one.explains(first)
+    linear = replace(first, effects=(Effect(MODULUS, None, {"factor": 1.01}),), cost=first.cost + 0.1, falling=0.0)
+    yields = Effect(BOUC_WEN, None, {"at": 0.62, "stiffness": 3.0, "yield_displacement": 3.0})
+    stepped = replace(linear, effects=(yields,), cost=first.cost + 0.2)
+    found = decide._ended(one, [first, linear, stepped])
+    assert ended == [first, stepped]
+    assert sorted(found, key=lambda f: f.cost) == [first, linear, stepped]

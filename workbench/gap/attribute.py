@@ -16,6 +16,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.evidence import Evidence
 from workbench.gap.fit import Fit, cost_of, fit
+from workbench.gap.locate import of_one_sensor
 from workbench.gap.one_law import one_law, unless_another, weighed_against
 from workbench.gap.outcome import Decision
 from workbench.gap.pairs import Pairs
@@ -28,7 +29,6 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
-ONE_SENSOR = 0.97  # of the gap
 BRIEFLY = 2  # iterations, where there may be no effect at all
 SHOWN = 7  # others that are, where they are to be shown beside them
 ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
@@ -203,9 +203,9 @@ def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
 
 
 def _of_one_sensor(start: Fit) -> bool:
-    """Whether one sensor alone disagrees: its own fault is likelier than a random force, and far quicker to find."""
+    """Whether one of several disagrees alone: its own fault is likelier than a random force, and quicker to find."""
     excess = np.maximum(start.cost_by_channel.mean(axis=0) - 1.0, 0.0)
-    return bool(excess.size > 1 and excess.max() > ONE_SENSOR * excess.sum())
+    return excess.size > 1 and of_one_sensor(excess)
 
 
 def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decision | None:

@@ -37,4 +37,4 @@ def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     if fits and search.explains(fits[0]):
         near = fits[0].cost + RIVAL
         hopeful = [f for f in hopeful if promise(f, FURTHER) < near or is_stepped(apply_all(search.rig, f.effects))]
-    return [*search.side_by_side(finished, hopeful), *fits[len(hopeful) :]]
+    return [*search.side_by_side(finished, hopeful), *(f for f in fits if f not in hopeful)]

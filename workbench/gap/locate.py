@@ -12,6 +12,7 @@ from workbench.gap.place import Placed
 from workbench.gap.prediction import FitData
 
 MODE_SHARE = 0.05
+ONE_SENSOR = 0.97  # of the gap
 OCTAVES = 8
 
 
@@ -123,7 +124,7 @@ def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> 
     power = np.maximum(excess, 0.0).sum(axis=0)
     if power.sum() <= 0 or evidence.data.by_channel(_joined(evidence)).mean() < 1.03:
         return "none"
-    if power.max() > 0.97 * power.sum():
+    if of_one_sensor(power):
         return "sensor"
     direct = {a.name for a in evidence.rig.actuators if a.direct}
     for record, row in zip(evidence.data.counted, excess, strict=True):
@@ -132,6 +133,11 @@ def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> 
             floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).mean()
             return "structure" if row.mean() > 0.1 * floor else "actuator"
     return "structure"
+
+
+def of_one_sensor(excess: np.ndarray) -> bool:
+    """Whether one sensor alone disagrees, by the power above the noise in each (n_outputs,)."""
+    return bool(excess.max() > ONE_SENSOR * excess.sum())
 
 
 def _joined(evidence: Evidence) -> np.ndarray:

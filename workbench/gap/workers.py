@@ -84,7 +84,7 @@ class Workers:
     def aside(self, function: Callable[[], Found]) -> Iterator[Callable[[], Found]]:
         """Have `function()` worked out in the time that the others leave; what is given to the block, called, has it.
 
-        Its work may be shared further. Where there is one process alone it is worked out when it is asked for. What
+        Its work may be shared further. Where no process is forked it is worked out when it is asked for. What
         nobody has asked for by the end of the block is given up.
         """
         if _Helper.is_this_process or self.number < 2 or not FORKS:
