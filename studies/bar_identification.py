@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from workbench.draw.identification import distribution_errors, eigenfunction, eigenvalue_errors
-from workbench.identification.distributions import Basis, mass_and_stiffness
-from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.ibrahim import two_delays
-from workbench.identification.order import identify
-from workbench.identification.synthesis import free_decay, struck
+from workbench.identification.free_decay.ibrahim import two_delays
+from workbench.identification.free_decay.order import identify
+from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.updating.distributions import Basis, mass_and_stiffness
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.member import Bar
 from workbench.structure.modes import SampledModes

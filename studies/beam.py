@@ -6,19 +6,19 @@ the ends and the mass of the beam, never its modes. The law designed on what was
 
 import numpy as np
 
-from workbench.design.closed_loop import close_loop, impulse_state, respond
-from workbench.design.coupled import coupled_lqr
-from workbench.design.imsc import imsc
-from workbench.design.law import Law
-from workbench.design.modal_filter import displacement_filter
-from workbench.design.placement import place, placement_task
-from workbench.design.spillover import effort, finite_spillover, quadratic_cost
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.estimation.modal_filter import displacement_filter
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import Law
+from workbench.design.placement.placement import place, placement_task
+from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
 from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works
 from workbench.draw.motion import response_motion
-from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.ibrahim import stacked_delays
-from workbench.identification.refinement import refine
-from workbench.identification.synthesis import free_decay, struck
+from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.free_decay.refinement import refine
+from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.signal.synthesis import free_decay, struck
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space

@@ -3,10 +3,10 @@
 import numpy as np
 from scipy.integrate import quad
 
-from workbench.design.closed_loop import close_loop, impulse_state, respond
-from workbench.design.imsc import imsc
-from workbench.design.modal_filter import hermite_filter
-from workbench.design.spillover import energy_gained, finite_spillover, spillover
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.estimation.modal_filter import hermite_filter
+from workbench.design.laws.imsc import imsc
+from workbench.design.spillover.spillover import energy_gained, finite_spillover, spillover
 from workbench.draw.design import plot_displacements, plot_work
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from joblib import Parallel, delayed
 
-from workbench.gap.case import read_case
+from workbench.cases.case import read_case
 from workbench.gap.diagnose import diagnose
 
 NEEDS_DATA = "a folder of case folders"

@@ -7,8 +7,7 @@ import numpy as np
 
 from workbench.draw.trials import plot_times
 from workbench.gap.diagnose import diagnose
-from workbench.gap.prediction import FitData
-from workbench.gap.trials import KINDS, draw_kinds, make_trial
+from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
 from workbench.rig.rig import Rig
@@ -16,6 +15,7 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
+from workbench.trials.make import KINDS, draw_kinds, make_trial
 
 SEED = 70000
 FAMILIES = {"single": (1, 18, 10.0), "pair": (2, 9, 30.0)}  # effects that hide, cases, limit in s

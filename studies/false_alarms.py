@@ -5,7 +5,7 @@ from pathlib import Path
 from joblib import Parallel, delayed
 
 from workbench.gap.diagnose import diagnose
-from workbench.gap.trials import make_trial
+from workbench.trials.make import make_trial
 
 CASES, SEED = 100, 40000
 

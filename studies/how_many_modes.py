@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from workbench.design.closed_loop import close_loop, impulse_state
-from workbench.design.how_many import how_many_modes
-from workbench.design.imsc import imsc
-from workbench.design.placement import nodes_of_mode
-from workbench.design.spillover import finite_spillover
+from workbench.design.estimation.closed_loop import close_loop, impulse_state
+from workbench.design.laws.imsc import imsc
+from workbench.design.placement.how_many import how_many_modes
+from workbench.design.placement.placement import nodes_of_mode
+from workbench.design.spillover.spillover import finite_spillover
 from workbench.draw.design import plot_how_many
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam

@@ -12,11 +12,11 @@ import numpy as np
 from scipy.special import ndtri
 
 from workbench.draw.accuracy import plot_bands
-from workbench.identification.bands import eigenfunction_bands
-from workbench.identification.eigenfunctions import KnownEnds
-from workbench.identification.ibrahim import stacked_delays
-from workbench.identification.refinement import Refined, bound, refine
-from workbench.identification.synthesis import free_decay, struck
+from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.free_decay.refinement import Refined, bound, refine
+from workbench.identification.shapes.bands import eigenfunction_bands
+from workbench.identification.shapes.eigenfunctions import KnownEnds
+from workbench.identification.signal.synthesis import free_decay, struck
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
 

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from workbench.draw.identification import order_found
-from workbench.identification.order import identify
-from workbench.identification.refinement import bound
-from workbench.identification.synthesis import free_decay
+from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.refinement import bound
+from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.modes import SampledModes
 
 # The method was worked out on seeds below 1000.

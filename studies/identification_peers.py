@@ -29,10 +29,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from workbench.draw.accuracy import peers_errors
-from workbench.identification.ibrahim import two_delays
-from workbench.identification.order import identify
-from workbench.identification.refinement import bound, project
-from workbench.identification.synthesis import free_decay
+from workbench.identification.free_decay.ibrahim import two_delays
+from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.refinement import bound, project
+from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Record
 from workbench.records.resample import decimate
 from workbench.records.transfer_file import read_transfer

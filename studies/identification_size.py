@@ -17,9 +17,9 @@ from scipy.fft import rfft
 from scipy.optimize import linear_sum_assignment
 
 from workbench.draw.accuracy import size_and_errors
-from workbench.identification.order import identify
-from workbench.identification.refinement import bound
-from workbench.identification.synthesis import free_decay
+from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.refinement import bound
+from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
 

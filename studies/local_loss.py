@@ -13,9 +13,9 @@ from scipy.sparse.linalg import eigsh
 from skfem.helpers import dd, ddot, dot, grad
 
 from workbench.draw.distributions import places_found, stiffness_found
-from workbench.identification.local_loss import LossFound, find_loss
-from workbench.identification.order import identify
-from workbench.identification.synthesis import free_decay
+from workbench.identification.free_decay.order import identify
+from workbench.identification.signal.synthesis import free_decay
+from workbench.identification.updating.local_loss import LossFound, find_loss
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 

@@ -11,9 +11,9 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from workbench import study as many
-from workbench.design.closed_loop import impulse_state
-from workbench.design.imsc import imsc
-from workbench.design.spillover import effort, spillover
+from workbench.design.estimation.closed_loop import impulse_state
+from workbench.design.laws.imsc import imsc
+from workbench.design.spillover.spillover import effort, spillover
 from workbench.draw.many import plot_cases
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam

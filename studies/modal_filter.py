@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from workbench.design.modal_filter import displacement_filter, hermite_filter
+from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
 from workbench.draw.design import plot_filter_errors
 from workbench.structure.member import Beam
 

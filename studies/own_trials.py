@@ -6,9 +6,9 @@ from time import process_time
 import numpy as np
 
 from workbench.draw.trials import plot_confusion
-from workbench.gap.holding import hold_trials
-from workbench.gap.scoring import tally
-from workbench.gap.trials import draw_kinds
+from workbench.trials.hold import hold_trials
+from workbench.trials.make import draw_kinds
+from workbench.trials.scoring import tally
 
 CASES, SEED = 200, 845211
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from workbench.design.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
-from workbench.design.sensor_placement import place_sensors
+from workbench.design.placement.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.design.placement.sensor_placement import place_sensors
 from workbench.draw.design import plot_effort_front
 from workbench.structure.member import Beam
 

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from workbench.design.certificate import certify
-from workbench.design.closed_loop import impulse_state
-from workbench.design.coupled import coupled_lqr
-from workbench.design.coupled_placement import place_coupled
-from workbench.design.coupled_scan import scan_coupled
-from workbench.design.placement import Limits, law_at, nodes_of_mode, place, placement_task
-from workbench.design.spillover import quadratic_cost
+from workbench.design.estimation.closed_loop import impulse_state
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.placement.certificate import certify
+from workbench.design.placement.coupled_placement import place_coupled
+from workbench.design.placement.coupled_scan import scan_coupled
+from workbench.design.placement.placement import Limits, law_at, nodes_of_mode, place, placement_task
+from workbench.design.spillover.spillover import quadratic_cost
 from workbench.draw.design import plot_placement_fronts
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam

@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 from scipy.optimize import least_squares
 
-from workbench.design.placement import nodes_of_mode, place, placement_task
+from workbench.design.placement.placement import nodes_of_mode, place, placement_task
 from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.identification.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.refinement import amplitudes
-from workbench.identification.stabilisation import real_modes, stabilise
-from workbench.identification.telling import tell_apart
+from workbench.identification.free_decay.refinement import amplitudes
+from workbench.identification.free_decay.stabilisation import real_modes, stabilise
+from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
+from workbench.identification.shapes.mode_pairing import tell_apart
 from workbench.records.resample import decimate
 from workbench.records.transfer_file import read_transfer
 from workbench.rig.rig import Rig

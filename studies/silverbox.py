@@ -6,8 +6,8 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
+from workbench.cases.case import KnownPlaces
 from workbench.draw.gap import plot_missing_force, plot_rivals
-from workbench.gap.case import KnownPlaces
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from workbench.design.closed_loop import close_loop
-from workbench.design.controller import close_with, filtered
-from workbench.design.coupled import coupled_lqr
-from workbench.design.explain import explain, stability_margin
-from workbench.design.law import Law
-from workbench.design.modal_filter import displacement_filter
-from workbench.design.observers import kalman, luenberger
-from workbench.design.remedies import remedies, sensors_that_suffice
+from workbench.design.estimation.closed_loop import close_loop
+from workbench.design.estimation.controller import close_with, filtered
+from workbench.design.estimation.modal_filter import displacement_filter
+from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.laws.law import Law
+from workbench.design.spillover.explain import explain, stability_margin
+from workbench.design.spillover.remedies import remedies, sensors_that_suffice
 from workbench.draw.design import plot_cure, plot_spillover_paths
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor

@@ -12,13 +12,21 @@ FLOORS = {
     "rig": 2,
     "identification": 3,
     "design": 3,
+    "cases": 3,
     "gap": 4,
-    "draw": 5,
-    "study": 6,
-    "cli": 7,
+    "trials": 5,
+    "draw": 6,
+    "study": 7,
+    "cli": 8,
+}
+# Rooms inside a room, ground floor first; the room's own files stand above them all.
+INSIDE = {
+    "identification": ("signal", "free_decay", "input_output", "output_only", "shapes", "updating"),
+    "design": ("laws", "estimation", "spillover", "placement"),
+    "gap": ("effects", "prediction", "localisation", "search", "report"),
 }
 ENGINES = {
-    "casadi": {"design/placement.py"},
+    "casadi": {"design/placement/placement.py"},
     "matplotlib": {"draw/"},
     "pyuff": {"records/uff_file.py"},
     "h5py": {"records/hdf5_file.py"},
@@ -60,6 +68,31 @@ def test_a_room_imports_only_from_floors_below():
             if FLOORS[parts[1]] >= FLOORS[room(name)]:
                 wrong.append(f"{name} imports {target}")
     assert not wrong, wrong
+
+
+def inner_floor(parts: tuple[str, ...]) -> int:
+    """Of a module inside its room."""
+    rooms = INSIDE[parts[0]]
+    return rooms.index(parts[1]) if parts[1] in rooms else len(rooms)
+
+
+def test_imports_run_one_way_inside_a_room():
+    wrong = []
+    for name, tree in modules():
+        parts = tuple(name.removesuffix(".py").split("/"))
+        if parts[0] not in INSIDE or len(parts) < 2:
+            continue
+        for target in imports(tree):
+            there = tuple(target.split(".")[1:])
+            if len(there) > 1 and there[0] == parts[0] and inner_floor(there) > inner_floor(parts):
+                wrong.append(f"{name} imports {target}")
+    assert not wrong, wrong
+
+
+def test_every_room_inside_a_room_is_named():
+    for room_name, named in INSIDE.items():
+        folders = {path.parent.name for path in (ROOT / room_name).glob("*/__init__.py")}
+        assert folders == set(named), room_name
 
 
 def test_no_file_imports_a_rooms_init():

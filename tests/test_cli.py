@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 from workbench.cli import app
-from workbench.identification.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, struck
 from workbench.records.files import write_record
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ModalDamping

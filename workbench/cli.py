@@ -211,7 +211,7 @@ def identify(
     Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """
     from workbench.records.files import read_measured
-    from workbench.study.modes_told import HEADINGS, told_of
+    from workbench.study.identification_report import HEADINGS, told_of
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -257,9 +257,9 @@ def design(
 
     Example: workbench design case.toml --control 3 --weight 20 --damping 0.2 --errors 0.05
     """
-    from workbench.design.closed_loop import impulse_state
-    from workbench.design.comparison import compare, laws_of, through_sensors
-    from workbench.design.robustness import survival_of, wrong_by
+    from workbench.design.estimation.closed_loop import impulse_state
+    from workbench.design.spillover.comparison import compare, laws_of, through_sensors
+    from workbench.design.spillover.robustness import survival_of, wrong_by
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -367,9 +367,9 @@ def place(
     """
     import numpy as np
 
-    from workbench.design.certificate import certify
-    from workbench.design.placement import nodes_of_mode, placement_task, scan
-    from workbench.design.placement import place as least_work
+    from workbench.design.placement.certificate import certify
+    from workbench.design.placement.placement import nodes_of_mode, placement_task, scan
+    from workbench.design.placement.placement import place as least_work
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -438,7 +438,7 @@ def diagnose(
 
     Example: workbench diagnose cases/arm --json verdict.json
     """
-    from workbench.gap.case import read_case
+    from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
     from workbench.gap.effects.structural import known_places
     from workbench.study.verdict_page import verdict_page
@@ -496,10 +496,10 @@ def trial(
 
     Example: workbench trial cases/arm --cases 40
     """
+    from workbench.cases.case import read_case
     from workbench.draw.trials import plot_confusion
-    from workbench.gap.case import read_case
-    from workbench.gap.holding import hold_trials
     from workbench.study.whole_file import check_target
+    from workbench.trials.hold import hold_trials
 
     check_target(json_path)
     if cases < 1:
@@ -599,7 +599,7 @@ def _stretch(text: str) -> tuple[float, float]:
 
 
 def _structure_rig(path: Path):
-    from workbench.gap.case import read_rig
+    from workbench.cases.case import read_rig
 
     found = read_rig(path)
     if found.structure is None:

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from workbench.design.closed_loop import close_loop, impulse_state, respond
-from workbench.design.coupled import coupled_lqr
-from workbench.design.imsc import imsc
-from workbench.design.law import DesignError
-from workbench.design.modal_filter import hermite_filter
-from workbench.design.sensor_placement import filter_error, place_sensors
-from workbench.design.spillover import distributed_cost, effort, finite_spillover, modal_cost, spillover
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.estimation.modal_filter import hermite_filter
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError
+from workbench.design.placement.sensor_placement import filter_error, place_sensors
+from workbench.design.spillover.spillover import distributed_cost, effort, finite_spillover, modal_cost, spillover
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 

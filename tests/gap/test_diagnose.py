@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.gap.check import RecordsError
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect, Kind, Parameter
 from workbench.gap.effects.nonlinear import with_element
 from workbench.gap.effects.structural import place_parameter
-from workbench.gap.fit import fit
-from workbench.gap.prediction import FitData
-from workbench.gap.trials import make_trial
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.report.readiness import RecordsError
+from workbench.gap.search.fit import fit
 from workbench.rig.elements import UserLaw
 from workbench.rig.rig import Rig
+from workbench.trials.make import make_trial
 
 
 def verdict_on(case, **options):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from workbench.cases.case import read_case
 from workbench.draw.gap import plot_missing_force, plot_where
-from workbench.gap.case import read_case
 from workbench.gap.diagnose import diagnose
 
 MASS, DAMPING, STIFFNESS, CUBIC = 2.0, 1.6, 800.0, 4e5

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from workbench.cases.case import Case, CaseError, read_case
+from workbench.cases.writing import write_case
 from workbench.cli import app
-from workbench.gap.case import Case, CaseError, read_case
-from workbench.gap.writing import write_case
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor

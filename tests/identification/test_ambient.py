@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter
 
 from workbench.identification.ambient import ambient_decays, identify_ambient
-from workbench.identification.whittle import Spectrum, Swing, posed, started
+from workbench.identification.output_only.whittle import Spectrum, Swing, posed, started
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import mac
 

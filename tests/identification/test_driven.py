@@ -6,7 +6,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from workbench.identification.driven import identify_driven
-from workbench.identification.synthesis import free_decay
+from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

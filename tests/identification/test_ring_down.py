@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.identification.ring_down import _check_undriven, ring_down
-from workbench.identification.synthesis import free_decay
+from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from workbench.identification.order import identify
-from workbench.identification.synthesis import free_decay
+from workbench.identification.free_decay.order import identify
+from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, mac
 

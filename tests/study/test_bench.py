@@ -8,7 +8,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from workbench.design.law import DesignError
+from workbench.design.laws.law import DesignError
 from workbench.study.bench import bench_server
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import describe, run_study
@@ -51,8 +51,8 @@ def test_it_begins_with_the_design_of_section_5_8():
 
 
 def test_effort_is_that_of_the_lyapunov_equation():
-    from workbench.design.closed_loop import impulse_state
-    from workbench.design.spillover import effort
+    from workbench.design.estimation.closed_loop import impulse_state
+    from workbench.design.spillover.spillover import effort
 
     tried = try_out(RIG, replace(start(RIG), final_time=120.0))
     exact = effort(RIG.modes, tried.law, impulse_state(RIG.modes, 6.3))

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.identification.bands import Bands
+from workbench.identification.shapes.bands import Bands
 from workbench.structure.modes import Modes
 
 

@@ -6,12 +6,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from workbench.design.closed_loop import Response
-from workbench.design.explain import Explanation
-from workbench.design.how_many import HowMany
-from workbench.design.on_off import OnOffLaw, Switched
-from workbench.design.placement import Placement
-from workbench.design.spillover import Spillover
+from workbench.design.estimation.closed_loop import Response
+from workbench.design.placement.how_many import HowMany
+from workbench.design.placement.placement import Placement
+from workbench.design.spillover.explain import Explanation
+from workbench.design.spillover.on_off import OnOffLaw, Switched
+from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
 
 SHOWN_SHARE = 1e-5

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.identification.local_loss import LossFound
+from workbench.identification.updating.local_loss import LossFound
 
 
 def stiffness_found(cases: Mapping[str, tuple[LossFound, Callable[[np.ndarray], np.ndarray], np.ndarray]]) -> Figure:

@@ -9,8 +9,8 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.effects.structural import known_places, place_name
-from workbench.gap.evidence import Evidence
-from workbench.gap.verdict import Verdict
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate

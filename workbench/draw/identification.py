@@ -7,8 +7,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.identification.stabilisation import Stabilisation
-from workbench.identification.telling import Told
+from workbench.identification.free_decay.stabilisation import Stabilisation
+from workbench.identification.shapes.mode_pairing import Told
 from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}

@@ -5,20 +5,20 @@ from functools import singledispatch
 import numpy as np
 from matplotlib.figure import Figure
 
-from workbench.design.closed_loop import Response
-from workbench.design.explain import Explanation
-from workbench.design.how_many import HowMany
-from workbench.design.modal_filter import ModalFilter
-from workbench.design.placement import Placement
-from workbench.design.spillover import Spillover
+from workbench.design.estimation.closed_loop import Response
+from workbench.design.estimation.modal_filter import ModalFilter
+from workbench.design.placement.how_many import HowMany
+from workbench.design.placement.placement import Placement
+from workbench.design.spillover.explain import Explanation
+from workbench.design.spillover.spillover import Spillover
 from workbench.draw.accuracy import plot_bands
 from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.gap.verdict import Verdict
-from workbench.identification.bands import Bands
-from workbench.identification.refinement import Refined
+from workbench.gap.report.verdict import Verdict
+from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.shapes.bands import Bands
 from workbench.records.record import Record
 from workbench.structure.modes import Modes, SampledModes
 

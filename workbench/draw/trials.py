@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.gap.scoring import Tally
+from workbench.trials.scoring import Tally
 
 _FAMILY = {
     "single": "one effect:",

@@ -4,17 +4,17 @@ from collections.abc import Callable, Sequence
 
 from threadpoolctl import threadpool_limits
 
-from workbench.gap.attribute import Attribution, attribute, opened
-from workbench.gap.check import check_modes, check_records, readiness
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
-from workbench.gap.experiment import Experiment, next_experiment
-from workbench.gap.locate import locate
-from workbench.gap.place import placed
-from workbench.gap.shrinkage import Shrinkage, measure
-from workbench.gap.verdict import Verdict
-from workbench.gap.workers import Workers
+from workbench.gap.localisation.force_localisation import placed
+from workbench.gap.localisation.where import locate
+from workbench.gap.prediction.workers import Workers
+from workbench.gap.report.experiment import Experiment, next_experiment
+from workbench.gap.report.readiness import check_modes, check_records, readiness
+from workbench.gap.report.shrinkage import Shrinkage, measure
+from workbench.gap.report.verdict import Verdict
+from workbench.gap.search.attribute import Attribution, attribute, opened
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 

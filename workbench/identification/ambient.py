@@ -16,13 +16,13 @@ import numpy as np
 from scipy.special import ndtri
 from scipy.stats import chi2
 
-from workbench.identification.ibrahim import normalised_shapes, stacked_delays
-from workbench.identification.identified import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE
-from workbench.identification.projection import project
-from workbench.identification.stabilisation import real_modes, stabilise
-from workbench.identification.standard_errors import StandardErrors
-from workbench.identification.synthesis import time_derivatives
-from workbench.identification.whittle import Spectrum, Swing, bands, fit_band, fit_bands, started
+from workbench.identification.free_decay.ibrahim import normalised_shapes, stacked_delays
+from workbench.identification.free_decay.identified import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE
+from workbench.identification.free_decay.stabilisation import real_modes, stabilise
+from workbench.identification.output_only.whittle import Spectrum, Swing, bands, fit_band, fit_bands, started
+from workbench.identification.signal.projection import project
+from workbench.identification.signal.standard_errors import StandardErrors
+from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen, mac
 

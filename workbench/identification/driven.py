@@ -11,15 +11,15 @@ from dataclasses import dataclass, field
 import control
 import numpy as np
 
-from workbench.identification.fit_errors import errors, fixed_std, pole_covariance
-from workbench.identification.ibrahim import check_alike, normalised_shapes
-from workbench.identification.identified import FALSE_ALARM
-from workbench.identification.known_inputs import KnownInputs
-from workbench.identification.modal_count import Told, tell
-from workbench.identification.modal_fit import Fit, projected, settled
-from workbench.identification.noise_course import alike
-from workbench.identification.standard_errors import StandardErrors
-from workbench.identification.synthesis import time_derivatives
+from workbench.identification.free_decay.ibrahim import check_alike, normalised_shapes
+from workbench.identification.free_decay.identified import FALSE_ALARM
+from workbench.identification.input_output.fit_errors import errors, fixed_std, pole_covariance
+from workbench.identification.input_output.known_inputs import KnownInputs
+from workbench.identification.input_output.modal_fit import Fit, projected, settled
+from workbench.identification.input_output.model_order import Told, tell
+from workbench.identification.input_output.noise_spectrum import alike
+from workbench.identification.signal.standard_errors import StandardErrors
+from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 

@@ -6,19 +6,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from workbench.identification.ailments import ailments, check_fit
-from workbench.identification.amplitude import AmplitudeDependence, amplitude_dependence
-from workbench.identification.coloured import in_its_noise
-from workbench.identification.decay import decay_start
-from workbench.identification.drift import HIGHEST_DEGREE, without_drift
-from workbench.identification.ibrahim import check_alike, stacked_delays
-from workbench.identification.identified import Identified, unshaped
-from workbench.identification.order import identify
-from workbench.identification.projection import project
-from workbench.identification.proportional import ProportionalFit, proportional_fit
-from workbench.identification.refinement import Refined, refine
-from workbench.identification.remarks import SURE, remarks
-from workbench.identification.stabilisation import real_modes, stabilise
+from workbench.identification.free_decay.amplitude import AmplitudeDependence, amplitude_dependence
+from workbench.identification.free_decay.coloured_noise import in_its_noise
+from workbench.identification.free_decay.drift import HIGHEST_DEGREE, without_drift
+from workbench.identification.free_decay.ibrahim import check_alike, stacked_delays
+from workbench.identification.free_decay.identified import Identified, unshaped
+from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.proportional import ProportionalFit, proportional_fit
+from workbench.identification.free_decay.refinement import Refined, refine
+from workbench.identification.free_decay.remarks import SURE, remarks
+from workbench.identification.free_decay.stabilisation import real_modes, stabilise
+from workbench.identification.signal.data_quality import ailments, check_fit
+from workbench.identification.signal.decay import decay_start
+from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
 

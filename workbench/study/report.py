@@ -7,11 +7,11 @@ from typing import NoReturn
 
 import numpy as np
 
+from workbench.cases.case import read_case
 from workbench.draw.beam import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.motion import mode_motion
 from workbench.draw.tables import plot_deviations, plot_poles
-from workbench.gap.case import read_case
 from workbench.structure.modes import SampledModes
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study

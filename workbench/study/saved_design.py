@@ -19,7 +19,7 @@ import numpy as np
 from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_work
 from workbench.draw.motion import response_motion
-from workbench.gap.case import read_rig
+from workbench.cases.case import read_rig
 from workbench.study.trying import Design, try_out
 
 DESIGN = {design}

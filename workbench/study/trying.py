@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import simpson
 
-from workbench.design.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
-from workbench.design.coupled import coupled_lqr
-from workbench.design.imsc import imsc
-from workbench.design.law import DesignError, Law
-from workbench.design.modal_filter import displacement_filter
-from workbench.design.spillover import Spillover, finite_spillover
-from workbench.gap.case import read_rig
+from workbench.cases.case import read_rig
+from workbench.design.estimation.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
+from workbench.design.estimation.modal_filter import displacement_filter
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.study.cases import StudyError

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
+from workbench.cases.case import Case
 from workbench.draw.gap import plot_missing_force, plot_responses, plot_rivals, plot_where
 from workbench.draw.motion import mode_motion
-from workbench.gap.case import Case
-from workbench.gap.verdict import Verdict
+from workbench.gap.report.verdict import Verdict
 from workbench.study.page import Story, block, write_page
 
 MOVING = "How the nominal model swings, and the corrected one where it differs; circles are sensors, triangles inputs."

@@ -1,0 +1,225 @@
+"""Case folders: read, written, refused."""
+
+import os
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workbench.cases.case import Case, CaseError, read_case
+from workbench.cases.writing import write_case
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.supports import PointMass
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+SHARED = Path(os.environ.get("WORKBENCH_SHARED", CHECKOUT.parent / "shared")) / "gap-trials"
+
+
+@pytest.fixture
+def case() -> Case:
+    beam = Beam(
+        length=2.0,
+        mass_per_length=([0.0, 0.5, 2.0], [1.5, 1.0, 1.0]),
+        bending_stiffness=3.0,
+        left="clamped",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    actuators = (Actuator("F1", 0.7), Actuator("tap", 1.1, direct=True))
+    sensors = (Sensor("d1", 0.5, noise_std=1e-4), Sensor("a1", 1.2, "acceleration", noise_std=1e-2))
+    rig = Rig(beam.modes(5, tolerance=1e-9), actuators, sensors, structure=beam)
+    inputs = np.random.default_rng(1).standard_normal((2, 200))
+    record = simulate(rig, inputs, sample_time=0.02, name="one")
+    return Case("a beam", rig, (record,), (replace(record, name="kept"),))
+
+
+@pytest.fixture
+def folder(case, tmp_path) -> Path:
+    write_case(case, tmp_path / "case")
+    return tmp_path / "case"
+
+
+def test_what_is_written_is_read_back(case, folder):
+    read = read_case(folder)
+    np.testing.assert_allclose(read.rig.modes.omega, case.rig.modes.omega, rtol=1e-9)
+    np.testing.assert_allclose(read.rig.modes.damping, case.rig.modes.damping, rtol=1e-9, atol=1e-12)
+    assert [(a.name, a.at, a.direct) for a in read.rig.actuators] == [("F1", 0.7, False), ("tap", 1.1, True)]
+    assert [(s.name, s.at, s.quantity, s.noise_std) for s in read.rig.sensors] == [
+        ("d1", 0.5, "displacement", 1e-4),
+        ("a1", 1.2, "acceleration", 1e-2),
+    ]
+    assert [r.name for r in read.fit] == ["one"] and [r.name for r in read.validation] == ["kept"]
+    np.testing.assert_array_equal(read.fit[0].outputs, case.fit[0].outputs)
+    np.testing.assert_array_equal(read.fit[0].inputs, case.fit[0].inputs)
+    assert read.fit[0].sample_time == 0.02
+
+
+def test_what_the_format_cannot_say_is_refused(case, tmp_path):
+    smooth = replace(case.rig.structure, mass_per_length=lambda x: 1.0 + x**2)
+    loaded = replace(case.rig.structure, attachments=(PointMass(1.0, 0.1),))
+    for structure, word in ((smooth, "linear between"), (loaded, "attachments"), (None, "without its structure")):
+        with pytest.raises(ValueError, match=word):
+            write_case(replace(case, rig=replace(case.rig, structure=structure)), tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('kind = "beam"', 'kind = "plate"', "beam, rod or modal; got 'plate'"),
+        ("length = 2.0", "length = -2.0", "length"),
+        ('left = "clamped"', 'left = "glued"', "glued"),
+        ("modes = 5", "modes = 5.5", "whole number"),
+        ("at = 0.7", "at = 7.0", "outside the structure"),
+        ('quantity = "acceleration"', 'quantity = "volts"', "quantity is one of"),
+        ("noise_std = 0.0001", "noise_std = 0.0", "noise_std must be positive"),
+        ('name = "a1"', 'name = "d1"', "names must differ"),
+        ('name = "a1"', 'name = "a2"', "channel 'a2' of case.toml is missing"),
+        ("sample_time = 0.02", "sample_time = 0.03", "must rise by sample_time"),
+        ('use = "fit"', 'use = "test"', "fit or validate"),
+        ('use = "fit"', 'use = "validate"', 'no record has use = "fit"'),
+        ("records/one.npz", "../elsewhere.npz", "outside the case folder"),
+        ("records/one.npz", "records/two.npz", "there is no file"),
+        ("[structure]", "[structure", "TOML"),
+    ],
+)
+def test_a_faulty_case_toml_is_refused_by_name(folder, old, new, words):
+    path = folder / "case.toml"
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(CaseError, match=words):
+        read_case(folder)
+
+
+def _spoiled(folder: Path, **changes) -> None:
+    file = folder / "records/one.npz"
+    arrays = dict(np.load(file))
+    for name, change in changes.items():
+        arrays[name] = change(arrays.get(name))
+        if arrays[name] is None:
+            del arrays[name]
+    np.savez(file, **arrays)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"d1": lambda y: None}, "channel 'd1' of case.toml is missing"),
+        ({"extra": lambda y: np.zeros(200)}, "channel 'extra' is not named"),
+        ({"t": lambda t: None}, "array t"),
+        ({"d1": lambda y: np.where(np.arange(200) == 17, np.nan, y)}, "'d1', sample 17 is nan"),
+        ({"F1": lambda y: y[:-1]}, r"shape \(199,\)"),
+        ({"d1": lambda y: y.astype(complex)}, "real numbers"),
+        ({"d1": lambda y: np.full(200, 3.0)}, "flat"),
+        ({"t": lambda t: t[::-1]}, "must rise"),
+    ],
+)
+def test_a_faulty_record_is_refused_by_channel(folder, changes, words):
+    _spoiled(folder, **changes)
+    with pytest.raises(CaseError, match=words):
+        read_case(folder)
+
+
+def test_a_record_shorter_than_a_period_is_refused(case, tmp_path):
+    short = case.fit[0].between(stop=0.4)
+    assert 0.4 < 2.0 * np.pi / case.rig.modes.omega[0]
+    write_case(replace(case, fit=(short,)), tmp_path / "short")
+    with pytest.raises(CaseError, match="less than a period"):
+        read_case(tmp_path / "short")
+
+
+def test_what_is_not_a_case_folder_is_refused(tmp_path, folder):
+    with pytest.raises(CaseError, match="not a folder"):
+        read_case(tmp_path / "nowhere")
+    with pytest.raises(CaseError, match=r"holds no case\.toml"):
+        read_case(tmp_path)
+    (folder / "records/one.npz").write_bytes(b"not an archive")
+    with pytest.raises(CaseError, match="NPZ"):
+        read_case(folder)
+
+
+MODAL = """
+[structure]
+kind = "modal"
+{structure}
+[[input]]
+name = "F"
+kind = "actuator"
+shape = {at_input}
+[[output]]
+name = "y"
+quantity = "displacement"
+shape = {at_output}
+noise_std = 1e-3
+[[record]]
+name = "r"
+file = "r.npz"
+sample_time = 0.1
+use = "fit"
+"""
+
+
+def _modal_case(folder: Path, **parts: str) -> Path:
+    (folder / "case.toml").write_text(MODAL.format(**parts), encoding="utf-8")
+    rng = np.random.default_rng(0)
+    np.savez(folder / "r.npz", t=0.1 * np.arange(300), F=rng.standard_normal(300), y=rng.standard_normal(300))
+    return folder
+
+
+def test_plain_modal_data_answer_as_the_modal_sum_says(tmp_path):
+    rig = read_case(
+        _modal_case(
+            tmp_path,
+            structure="natural_frequencies_hz = [0.5, 1.5]\ndamping_ratios = [0.02, 0.03]",
+            at_input="[1.0, -2.0]",
+            at_output="[0.5, 0.25]",
+        )
+    ).rig
+    impulse = np.zeros((1, 400))
+    impulse[0, 0] = 1.0
+    y = simulate(rig, impulse, sample_time=1e-3).outputs[0]
+    t = 1e-3 * np.arange(400) - 0.5e-3
+    omega, zeta = 2.0 * np.pi * np.array([0.5, 1.5]), np.array([0.02, 0.03])
+    damped = omega * np.sqrt(1.0 - zeta**2)
+    waves = np.exp(-np.outer(t, zeta * omega)) * np.sin(np.outer(t, damped)) / damped
+    np.testing.assert_allclose(y[1:], (1e-3 * waves @ [0.5, -0.5])[1:], atol=1e-9)
+
+
+def test_a_single_degree_of_freedom_yields_by_force_over_stiffness(tmp_path):
+    structure = "mass = 2.0\ndamping = 4.0\nstiffness = 8.0"
+    rig = read_case(_modal_case(tmp_path, structure=structure, at_input="[1.0]", at_output="[1.0]")).rig
+    y = simulate(rig, np.full((1, 400), 3.0), sample_time=0.1).outputs[0]
+    assert y[-1] == pytest.approx(3.0 / 8.0, rel=1e-9)
+    assert rig.modes.omega[0] == pytest.approx(2.0) and rig.modes.zeta[0] == pytest.approx(4.0 / (2 * 2.0 * 2.0))
+
+
+def test_modal_shapes_of_the_wrong_length_are_refused(tmp_path):
+    with pytest.raises(CaseError, match="list of 2 numbers"):
+        read_case(
+            _modal_case(
+                tmp_path,
+                structure="natural_frequencies_hz = [0.5, 1.5]\ndamping_ratios = [0.02, 0.03]",
+                at_input="[1.0]",
+                at_output="[0.5, 0.25]",
+            )
+        )
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason=f"the shared gap trials are not at {SHARED}")
+def test_all_shared_cases_load():
+    folders = sorted(SHARED.glob("*/case-*"))
+    assert len(folders) >= 14
+    for folder in folders:
+        case = read_case(folder)
+        table = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
+        assert len(case.fit) + len(case.validation) == len(table["record"])
+        assert case.rig.modes.n_modes == table["structure"]["modes"]
+        assert all(isinstance(r, Record) and isinstance(r.output_channels[0], Channel) for r in case.fit)

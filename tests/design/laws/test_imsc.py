@@ -1,0 +1,120 @@
+"""Closed-form laws against python-control, and the refusals of a design that cannot be."""
+
+import control
+import numpy as np
+import pytest
+
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
+from workbench.design.laws.law import DesignError
+from workbench.rig.actuators import Actuator
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+
+def modes(n=9, **options):
+    return Beam(
+        length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged", **options
+    ).modes(n)
+
+
+def actuators(*places):
+    return [Actuator(f"F{i + 1}", x) for i, x in enumerate(places)]
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_riccati_closed_form_over_five_decades(damping):
+    for omega in np.geomspace(1e-2, 1e3, 11):
+        for weight in np.geomspace(1e-3, 1e2, 11):
+            p = riccati_matrices(np.array([omega]), weight, damping)[0]
+            a, b = np.array([[0, 1], [-(omega**2), -damping]]), np.array([[0.0], [1.0]])
+            q = np.diag([omega**2, 1.0])
+            terms = (a.T @ p, p @ a, -p @ b @ b.T @ p / weight, q)
+            size = np.max([np.abs(t) for t in terms], axis=0)
+            assert (np.abs(sum(terms))[size > 0] <= 1e-12 * size[size > 0]).all()
+
+
+def test_gains_equal_lqr_mode_by_mode():
+    for omega in np.geomspace(1e-2, 1e2, 9):
+        for weight in np.geomspace(1e-2, 1e2, 5):
+            a, q = np.array([[0, 1], [-(omega**2), -0.1]]), np.diag([omega**2, 1.0])
+            peer = control.lqr(a, [[0.0], [1.0]], q, [[weight]])[0][0]
+            mine = np.ravel(riccati_gains(omega, weight, 0.1))
+            np.testing.assert_allclose(mine, peer, rtol=1e-8, atol=1e-8 * np.abs(peer).max())
+
+
+def test_poles_are_where_they_were_asked():
+    wanted = np.array([-0.3 + 0.9j, -0.5 + 1.5j])
+    law = imsc_poles(modes(2), 2, actuators(3.0, 6.0), poles=wanted)
+    poles = close_loop(modes(2), law).poles
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(np.r_[wanted, wanted.conj()]), atol=1e-9)
+
+
+def test_imsc_is_coupled_lqr_where_b_is_orthogonal():
+    places = actuators(2.0, 4.0, 6.0, 8.0)
+    np.testing.assert_allclose(
+        imsc(modes(), 4, places, weight=20.0).gain, coupled_lqr(modes(), 4, places, weight=10.0).gain, atol=1e-8
+    )
+
+
+def test_damped_modes_are_designed_with_their_damping():
+    damped = modes(4, damping=ModalDamping(0.05))
+    law = imsc(damped, 4, actuators(2.0, 4.0, 6.0, 8.0), weight=20.0)
+    b = damped.phi([2.0, 4.0, 6.0, 8.0]).T
+    a = np.block([[np.zeros((4, 4)), np.eye(4)], [-np.diag(damped.omega**2), -damped.damping]])
+    peer = control.lqr(
+        a, np.vstack([np.zeros((4, 4)), np.eye(4)]), np.diag([*damped.omega**2, 1, 1, 1, 1]), 20 * np.eye(4)
+    )[0]
+    np.testing.assert_allclose(b @ law.gain, peer, atol=1e-8)
+
+
+def test_response_against_python_control():
+    law = imsc(modes(), 4, actuators(1.5, 3.5, 6.5, 8.5), weight=20.0)
+    loop, state, time = close_loop(modes(), law), impulse_state(modes(), 6.3), np.linspace(0, 40, 81)
+    system = control.ss(loop.matrix, np.zeros((18, 1)), np.eye(18), np.zeros((18, 1)))
+    peer = control.initial_response(system, time, state).outputs
+    assert np.abs(respond(loop, state, time).modal - peer).max() < 1e-9
+
+
+def test_response_at_uneven_times_is_the_same_response():
+    law = imsc(modes(), 4, actuators(2.0, 4.0, 6.0, 8.0), weight=20.0)
+    loop, state = close_loop(modes(), law), impulse_state(modes(), 6.3)
+    even, uneven = respond(loop, state, [0.0, 1.0, 2.0, 3.0]), respond(loop, state, [0.0, 0.7, 2.0, 3.0])
+    np.testing.assert_allclose(even.modal[:, 2:], uneven.modal[:, 2:], atol=1e-12)
+    many = np.linspace(2.0, 40.0, 317)
+    many, some = respond(loop, state, many), respond(loop, state, many[[0, 3, 90, 316]])
+    np.testing.assert_allclose(many.modal[:, [0, 3, 90, 316]], some.modal, atol=1e-12)
+    assert not many.modal.flags.writeable and state.flags.writeable
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        (lambda: imsc(modes(), 2, actuators(2.0, 2.0), weight=1.0), "F1 and F2 both stand at x = 2"),
+        (lambda: imsc(modes(), 1, actuators(0.0), weight=1.0), "stands on the support"),
+        (lambda: imsc(modes(), 3, actuators(2.0, 4.0), weight=1.0), "3 controlled modes need as many actuators"),
+        (lambda: imsc(modes(), 2, actuators(5.0, 1.0), weight=-1.0), "weight R must be positive"),
+        (lambda: imsc_poles(modes(), 1, actuators(2.0), poles=[0.1 + 1j]), "not stable"),
+        (lambda: pole_gains([1.0, 2.0], [-1.0]), "one pole a mode"),
+        (lambda: imsc(modes(), [1], actuators(5.0), weight=1.0), "no actuator moves mode 2"),
+        (lambda: imsc(modes(), [11], actuators(5.0), weight=1.0), "not distinct modes"),
+        (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=[1.0, -1.0]), "positive definite"),
+    ],
+)
+def test_designs_that_cannot_be_are_refused(act, words):
+    with pytest.raises(ValueError, match=words):
+        act()
+
+
+def test_errors_of_design_have_one_type():
+    with pytest.raises(DesignError):
+        imsc(modes(), 3, actuators(2.0), weight=1.0)
+
+
+@pytest.mark.parametrize("gain", [1e-12, 1.0])
+def test_a_mode_nobody_moves_is_told_whatever_the_units(gain):
+    weak = [Actuator("F1", 5.0, gain=gain), Actuator("F2", 3.0, gain=gain)]
+    assert imsc(modes(), 2, weak, weight=1.0).gain.shape == (2, 4)
+    with pytest.raises(DesignError, match="no actuator moves mode 2"):
+        imsc(modes(), [1], weak[:1], weight=1.0)

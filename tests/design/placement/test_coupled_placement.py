@@ -1,0 +1,61 @@
+"""Places for coupled LQR: figures against the law itself, and an optimum that no grid beats."""
+
+import numpy as np
+import pytest
+
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.laws.law import DesignError
+from workbench.design.placement.coupled_placement import place_coupled
+from workbench.design.placement.coupled_scan import scan_coupled
+from workbench.design.placement.coupled_spillover import coupled_batch, coupled_figures
+from workbench.design.placement.limits import Limits
+from workbench.design.spillover.spillover import effort, spillover
+from workbench.rig.actuators import Actuator
+from workbench.structure.member import Beam
+
+
+@pytest.fixture(scope="module")
+def modes():
+    return Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+
+
+def test_figures_are_those_of_the_law(modes):
+    places = [1.3, 2.6, 5.2]
+    law = coupled_lqr(modes, 4, [Actuator(f"F{i}", x) for i, x in enumerate(places)], weight=10.0)
+    state = impulse_state(modes, 6.3)
+    state[13:] = 0.0
+    found = coupled_figures(modes, 4, places, impulse_at=6.3, weight=10.0)
+    np.testing.assert_allclose(found.by_mode, spillover(modes, law, state).residual_work, rtol=1e-7)
+    assert found.effort == pytest.approx(effort(modes, law, state), rel=1e-8)
+    forces = respond(close_loop(modes, law), state, np.linspace(0.0, 40.0, 8001)).forces
+    assert found.peak_force == pytest.approx(np.abs(forces).max(), rel=1e-2)
+
+
+def test_many_at_once_are_each_by_itself(modes):
+    places = np.sort(np.random.default_rng(0).uniform(0.2, 9.8, (8, 3)), axis=1)
+    work, spent = coupled_batch(modes, 4, places, impulse_at=6.3, weight=10.0)
+    each = [coupled_figures(modes, 4, x, impulse_at=6.3, weight=10.0) for x in places]
+    np.testing.assert_allclose(work, [found.residual_work for found in each], rtol=1e-9)
+    np.testing.assert_allclose(spent, [found.effort for found in each], rtol=1e-9)
+    assert coupled_batch(modes, 2, np.array([[5.0]]), impulse_at=6.3, weight=10.0)[0] == np.inf
+
+
+def test_no_grid_beats_the_optimum(modes):
+    limits = Limits(spacing=0.5, effort=0.5, forbidden=((2.0, 2.4),))
+    best = place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=limits, starts=4)
+    assert best.effort <= 0.5 and np.diff(best.positions)[0] >= 0.5
+    coarse, fine = (scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=limits, n_places=k) for k in (25, 75))
+    assert coarse.tried < fine.tried
+    assert coarse.lower_bound <= fine.lower_bound <= best.residual_work <= fine.best.residual_work
+    assert not ((fine.best.positions > 2.0) & (fine.best.positions < 2.4)).any()
+
+
+def test_refusals(modes):
+    with pytest.raises(DesignError, match="no residual mode"):
+        place_coupled(modes, 9, 2, impulse_at=6.3, weight=10.0, limits=Limits())
+    with pytest.raises(DesignError, match="keeps the limits"):
+        place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6))
+    with pytest.raises(DesignError, match="on the grid"):
+        scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6), n_places=9)
+    assert coupled_figures(modes, 2, [5.0], impulse_at=6.3, weight=10.0).residual_work == np.inf

@@ -1,0 +1,270 @@
+"""Placement: exact derivatives, limits kept, global by a scan; and the trap that limits are for."""
+
+import numpy as np
+import pytest
+
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.laws.law import DesignError
+from workbench.design.placement.certificate import _Bounds, certify
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.peak import largest
+from workbench.design.placement.placement import law_at, nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.design.placement.task import batch_figures, batch_work
+from workbench.design.spillover.spillover import effort, finite_spillover, spillover
+from workbench.structure.member import Beam
+
+
+@pytest.fixture(scope="module")
+def task():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+    return placement_task(modes, 4, impulse_at=6.3, weight=20.0)
+
+
+def even(task):
+    return task.placed([2.0, 4.0, 6.0, 8.0], "")
+
+
+def test_the_task_agrees_with_the_law(task):
+    places = (1.5, 3.5, 6.5, 8.5)
+    law = law_at(task, places, weight=20.0)
+    state = impulse_state(task.modes, 6.3)
+    state[13:] = 0.0
+    at = task.placed(places, "")
+    total, by_mode, spent = at.residual_work, at.by_mode, at.effort
+    np.testing.assert_allclose(by_mode, spillover(task.modes, law, state).residual_work, rtol=1e-9)
+    assert total == pytest.approx(by_mode.sum()) and spent == pytest.approx(effort(task.modes, law, state), rel=1e-9)
+
+
+def test_casadi_agrees_in_value_and_derivative(task):
+    import casadi as ca
+
+    function = symbolic_work(task)
+    x = np.array([1.7, 3.6, 6.4, 8.2])
+    at = task.placed(x, "")
+    total, spent = at.residual_work, at.effort
+    assert float(function(x)[0]) == pytest.approx(total, rel=1e-9)
+    assert float(function(x)[1]) == pytest.approx(spent, rel=1e-9)
+    z = ca.MX.sym("z", 4)
+    exact = ca.Function("g", [z], [ca.gradient(function(z)[0], z)])(x).full().ravel()
+
+    def work(at):
+        return task.placed(at, "").residual_work
+
+    for i in range(4):
+        step = np.eye(4)[i] * 1e-4
+        slope = (work(x + step) - work(x - step)) / 2e-4
+        assert exact[i] == pytest.approx(slope, rel=1e-5)
+
+
+def test_nodes_of_mode_five(task):
+    np.testing.assert_allclose(nodes_of_mode(task.modes, 4), [2, 4, 6, 8], atol=1e-9)
+
+
+def test_the_optimum_keeps_its_limits_and_beats_a_full_grid(task):
+    limit = 1.5 * even(task).effort
+    best = place(task, effort_limit=limit, spacing=0.5, starts=4)
+    assert best.effort <= limit * (1 + 1e-6) and (np.diff(best.positions) >= 0.5 - 1e-6).all()
+    on_grid, tried = scan(task, effort_limit=limit, spacing=0.5, n_places=30)
+    assert tried > 10000 and best.residual_work <= on_grid.residual_work
+    assert best.residual_work < 0.5 * even(task).residual_work
+
+
+def test_without_a_limit_the_outer_actuators_run_onto_the_supports(task):
+    free = place(task, effort_limit=1e9, spacing=0.1, starts=4)
+    assert free.positions[0] < 0.1 and free.positions[-1] > 9.9
+    assert free.residual_work == pytest.approx(5.3e-4, rel=0.1)
+    assert free.effort > 10 * even(task).effort
+
+
+def test_limits_that_conflict_are_named(task):
+    with pytest.raises(DesignError, match="the structure has 10"):
+        place(task, effort_limit=1.0, spacing=4.0)
+    with pytest.raises(DesignError, match="effort limit"):
+        place(task, effort_limit=1e-3, spacing=0.5, starts=1)
+    with pytest.raises(DesignError, match="no residual mode"):
+        placement_task(task.modes, 9, impulse_at=6.3, weight=20.0)
+
+
+def test_a_heavy_structure_is_placed_like_a_light_one(task):
+    """The test of a singular B once was not relative, so every placement on a heavy structure was thrown out."""
+    heavy = Beam(length=10.0, mass_per_length=1e8, bending_stiffness=1e8, left="hinged", right="hinged").modes(9)
+    twin = placement_task(heavy, 4, impulse_at=6.3, weight=20.0, impulse=1e8)
+    limits = [1.5 * even(t).effort for t in (task, twin)]
+    light, same = (scan(t, effort_limit=e, spacing=0.5, n_places=16)[0] for t, e in zip((task, twin), limits))
+    np.testing.assert_allclose(same.positions, light.positions, atol=1e-12)
+    assert same.residual_work == pytest.approx(1e8 * light.residual_work, rel=1e-6)
+
+
+def law_and_state(task, places, at=6.3):
+    state = impulse_state(task.modes, at)
+    state[task.modes.n_modes + task.n_controlled :] = 0.0
+    return law_at(task, places, weight=20.0), state
+
+
+def test_finite_time_and_peak_force_are_those_of_the_motion(task):
+    places = (1.5, 3.5, 6.5, 8.5)
+    short = placement_task(task.modes, 4, impulse_at=6.3, weight=20.0, final_time=25.0)
+    law, state = law_and_state(task, places)
+    loop = close_loop(task.modes, law)
+    found = short.placed(places, "")
+    np.testing.assert_allclose(found.by_mode, finite_spillover(loop, state, 25.0).residual_work, rtol=1e-8)
+    forces = respond(loop, state, np.linspace(0.0, 25.0, 20001)).forces
+    assert np.abs(forces).max() <= found.peak_force <= np.abs(forces).max() * (1 + 1e-5)
+    assert found.effort == pytest.approx(np.trapezoid((forces**2).sum(axis=0), dx=25.0 / 20000), rel=1e-5)
+
+
+def test_a_peak_between_samples_is_met():
+    """1 - cos beats slowly: 2 at t = π/δ; and e^{-t} - e^{-2t}, which is largest, 1/4, at log 2."""
+    beating = np.array([10j, -10j, 10.001j, -10.001j])
+    assert largest(beating, np.array([[0.5, 0.5, -0.5, -0.5]]), 4000.0) == pytest.approx(2.0, rel=1e-6)
+    assert largest(np.array([-1.0, -2.0]), np.array([[1.0, -1.0]]), np.inf) == pytest.approx(0.25, rel=2e-6)
+    assert largest(np.array([-1.0, -2.0]), np.zeros((2, 2)), np.inf) == 0.0
+
+
+def test_a_distribution_of_blows_is_the_mean_over_them(task):
+    blows, chances = [2.2, 6.3, 9.1], [0.5, 0.3, 0.2]
+    many = placement_task(task.modes, 4, impulse_at=blows, weight=20.0, chances=chances).placed([2.1, 4, 6, 8.3], "")
+    each = [placement_task(task.modes, 4, impulse_at=x, weight=20.0).placed([2.1, 4, 6, 8.3], "") for x in blows]
+    np.testing.assert_allclose(many.by_mode, np.average([e.by_mode for e in each], axis=0, weights=chances), rtol=1e-10)
+    assert many.effort == pytest.approx(np.average([e.effort for e in each], weights=chances), rel=1e-10)
+    assert many.peak_force == pytest.approx(max(e.peak_force for e in each), rel=2e-6)
+
+
+def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses():
+    """Covariance of the driven loop, mode 3 residual and lightly damped: ½ S_ff / c, against a Lyapunov equation."""
+    from scipy.linalg import solve_continuous_lyapunov
+
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(3)
+    task = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
+    law = law_at(task, [2.5, 6.0], weight=20.0)
+    a = np.array(close_loop(modes, law).matrix)
+    c = 1e-5
+    a[5, 5] -= c
+    push = np.r_[np.zeros(3), modes.phi(6.3)[0, :2], 0.0]
+    covariance = solve_continuous_lyapunov(a, -np.outer(push, push))
+    # at rest, power in = power lost: W_3 = c E q3'²
+    assert c * covariance[5, 5] == pytest.approx(task.placed([2.5, 6.0], "").by_mode[0], rel=1e-3)
+
+
+def test_the_tail_bound_holds_and_is_not_idle(task):
+    many = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(60)
+    places = [1.5, 3.5, 6.5, 8.5]
+    all_ = placement_task(many, 4, impulse_at=6.3, weight=20.0).placed(places, "")
+    left_out = all_.by_mode[16:].sum()
+    bound = placement_task(many.select(range(20)), 4, impulse_at=6.3, weight=20.0).tail_bound(places, growth=2.0)
+    assert left_out < bound < 100 * left_out
+
+
+def test_limits_on_peak_force_condition_and_stretches_are_kept(task):
+    limits = {"effort_limit": 0.4, "peak_limit": 0.34, "condition_limit": 6.0, "forbidden": [(2.5, 3.4), (7.0, 9.0)]}
+    best = place(task, spacing=0.5, starts=6, **limits)
+    assert best.peak_force <= 0.34 * (1 + 1e-5) and best.condition <= 6.0 * (1 + 1e-5)
+    assert not any(((low < best.positions) & (best.positions < high)).any() for low, high in limits["forbidden"])
+    on_grid, _ = scan(task, spacing=0.5, n_places=28, **limits)
+    assert best.residual_work <= on_grid.residual_work
+
+
+def test_candidates_are_searched_whole(task):
+    candidates = np.array([1.0, 2.2, 3.1, 4.4, 5.9, 7.3, 8.6])
+    best, tried = scan(task, candidates=candidates)
+    assert tried == 35 and set(best.positions) <= set(candidates)
+    with pytest.raises(DesignError, match="4 actuators at 300 places make"):
+        scan(task, candidates=np.linspace(0.1, 9.9, 300))
+    with pytest.raises(DesignError, match="leave 3"):
+        scan(task, candidates=[1.0, 2.0, 3.0])
+
+
+def test_which_limits_conflict_is_said(task):
+    with pytest.raises(DesignError, match="condition limit 3"):
+        place(task, condition_limit=3.9, starts=1)
+    with pytest.raises(DesignError, match="peak force limit 0"):
+        scan(task, peak_limit=0.01, n_places=20)
+    with pytest.raises(DesignError, match="leave no place"):
+        place(task, forbidden=[(-1.0, 11.0)])
+    with pytest.raises(DesignError, match="effort must be positive"):
+        place(task, effort_limit=-1.0)
+
+
+def test_fast_figures_are_the_careful_ones(task):
+    shapes = task.shapes(np.sort(np.random.default_rng(0).uniform(0.3, 9.7, (50, 4)), axis=1))
+    careful = batch_figures(task, shapes)
+    work, spent = batch_work(task, shapes)
+    np.testing.assert_allclose(work, careful.work, rtol=1e-9)
+    np.testing.assert_allclose(spent, careful.effort, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [{"effort": 0.2352}, {"peak_force": 0.31}, {"condition": 5.5}, {"effort": 0.3, "peak_force": 0.4, "condition": 7}],
+)
+def test_bounds_hold_on_every_cell(task, limits):
+    """No placement in a cell does better than the cell's bound, nor keeps a limit that the cell cannot."""
+    rng = np.random.default_rng(1)
+    limits = Limits(**limits)
+    bounds = _Bounds(task, limits)
+    informative = refused = 0
+    for half in (0.2, 0.05, 0.01):
+        centres = np.sort(rng.uniform(0.5, 9.5, (200, 4)), axis=1)
+        centres[:100] = [0.8655, 2.883, 6.2842, 9.2303] + rng.uniform(-0.3, 0.3, (100, 4))
+        lower, possible, _ = bounds(centres, half)
+        informative, refused = informative + (lower > 0).sum(), refused + (~possible).sum()
+        inside = (centres[:, None] + rng.uniform(-half, half, (200, 40, 4))).reshape(-1, 4)
+        figures = batch_figures(task, task.shapes(inside))
+        broken = limits.broken(inside, figures)
+        kept = np.all([excess <= 0 for excess in broken.values()], axis=0).reshape(200, 40)
+        assert (np.sqrt(figures.work.reshape(200, 40)) >= lower[:, None] - 1e-12)[kept].all()
+        assert not kept[~possible].any()
+    assert informative > 150 and refused > 50
+
+
+def test_the_certificate_proves_an_optimum_and_finds_out_a_pretender():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+    two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
+    nodes = two.placed(nodes_of_mode(modes, 2), "nodes")
+    limits = {"effort_limit": 1.5 * nodes.effort, "spacing": 0.5}
+    proven = certify(two, place(two, starts=6, **limits), gap=0.01, **limits)
+    assert proven.complete and proven.gap == pytest.approx(0.01)
+    found_out = certify(two, nodes, gap=0.01, **limits)
+    assert found_out.better is not None
+    assert two.placed(found_out.better, "").residual_work < nodes.residual_work
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"peak_limit": 0.35, "spacing": 0.5},
+        {"condition_limit": 2.5, "spacing": 0.5},
+        {"effort_limit": 0.2, "forbidden": [(4.9, 5.6), (7.0, 8.0)]},
+        {"peak_limit": 0.5, "candidates": np.linspace(0.5, 9.5, 31)},
+    ],
+)
+def test_every_limit_is_part_of_the_proof(limits):
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+    two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
+    best = scan(two, **limits)[0] if "candidates" in limits else place(two, starts=8, **limits)
+    proof = certify(two, best, gap=0.01, **limits)
+    assert proof.better is None and proof.complete and proof.gap <= 0.01 + 1e-12
+    # a grid by itself: no better
+    fine = np.stack(np.meshgrid(*[limits.get("candidates", np.linspace(0.05, 9.95, 199))] * 2, indexing="ij"), -1)
+    fine = fine.reshape(-1, 2)[fine.reshape(-1, 2)[:, 0] < fine.reshape(-1, 2)[:, 1]]
+    keep = Limits(
+        limits.get("effort_limit", np.inf),
+        limits.get("peak_limit", np.inf),
+        limits.get("condition_limit", np.inf),
+        limits.get("spacing", 0.0),
+        forbidden=tuple(limits.get("forbidden", ())),
+    )
+    figures = batch_figures(two, two.shapes(fine))
+    kept = np.all([excess <= 0 for excess in keep.broken(fine, figures).values()], axis=0)
+    for low, high in keep.forbidden:
+        kept &= ~((fine > low) & (fine < high)).any(axis=1)
+    # the best of the candidates is evaluated here among others: the last digit may differ
+    assert kept.any() and figures.work[kept].min() >= proof.lower_bound * (1.0 - 1e-12)
+    # and a worse one that keeps the limits is found out
+    worse = two.placed(fine[kept][np.argsort(figures.work[kept])[kept.sum() // 2]], "")
+    assert certify(two, worse, gap=0.01, **limits).better is not None
+
+
+def test_a_proof_needs_a_limit(task):
+    with pytest.raises(DesignError, match="singular"):
+        certify(task, even(task))

@@ -1,0 +1,188 @@
+"""Observers and filters in one loop: separation, peers, spillover explained to the path, remedies that hold."""
+
+import control
+import numpy as np
+import pytest
+
+from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
+from workbench.design.estimation.controller import close_with, filtered
+from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
+from workbench.design.estimation.observers import kalman, luenberger
+from workbench.design.laws.coupled import controlled_plant, coupled_lqr
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.spillover.explain import explain, stability_margin
+from workbench.design.spillover.remedies import remedies, sensors_that_suffice
+from workbench.design.spillover.spillover import finite_spillover
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+ACTUATORS = (Actuator("F1", 10 / 6),)
+
+
+def beam(n=9, zeta=0.002):
+    damping = ModalDamping(zeta)
+    return Beam(
+        length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged", damping=damping
+    ).modes(n)
+
+
+def observed(modes, at, share=1.0, actuators=ACTUATORS):
+    law = coupled_lqr(modes, 3, actuators, weight=1.0)
+    law = Law(share * law.gain, law.controlled, law.actuators, law.name)
+    sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(np.atleast_1d(at))]
+    return luenberger(modes, law, sensors, poles=(-0.3 + 1j) * modes.omega[:3])
+
+
+def through_filter(modes, actuators, places, share=1.0):
+    law = coupled_lqr(modes, 3, actuators, weight=1.0)
+    law = Law(share * law.gain, law.controlled, law.actuators, law.name)
+    return filtered(law, displacement_filter(modes.select(range(3)), places, 1.0))
+
+
+def nearest(poles, wanted):
+    return max(np.abs(poles - p).min() / abs(p) for p in wanted)
+
+
+def test_without_residual_modes_law_and_observer_keep_their_poles():
+    modes = beam(3)
+    controller = observed(modes, 10 / 1.2)
+    a, b = controlled_plant(modes, range(3), ACTUATORS)
+    wanted = np.r_[np.linalg.eigvals(a - b @ controller.law.gain), (-0.3 + 1j) * modes.omega]
+    assert nearest(close_with(modes, controller).poles, wanted) < 1e-9
+
+
+def test_kalman_gain_is_that_of_the_dual_regulator():
+    modes = beam(3)
+    law = coupled_lqr(modes, 3, ACTUATORS, weight=1.0)
+    sensors = [Sensor("y", 3.1), Sensor("v", 4.4, "velocity")]
+    gain = kalman(modes, law, sensors, disturbance=0.5, noise=[1e-2, 1e-3]).reads
+    a, _ = controlled_plant(modes, range(3), ACTUATORS)
+    shapes = modes.phi([3.1, 4.4])
+    c = np.block([[shapes[:1], np.zeros((1, 3))], [np.zeros((1, 3)), shapes[1:]]])
+    peer = control.lqr(a.T, c.T, np.diag([0, 0, 0, 0.5, 0.5, 0.5]), np.diag([1e-2, 1e-3]))[0].T
+    np.testing.assert_allclose(gain, peer, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [hermite_filter, displacement_filter])
+def test_a_filter_closes_the_same_loop_either_way(kind):
+    modes = beam()
+    law = coupled_lqr(modes, 3, ACTUATORS, weight=1.0)
+    filter_ = kind(modes.select(range(3)), np.linspace(0.0, 10.0, 6), 1.0)
+    one, other = close_loop(modes, law, filter_), close_with(modes, filtered(law, filter_))
+    np.testing.assert_allclose(one.matrix, other.matrix, atol=1e-13)
+    np.testing.assert_allclose(one.feedback, other.feedback, atol=1e-13)
+
+
+def test_an_observer_in_the_loop_against_python_control():
+    modes, state, time = beam(), impulse_state(beam(), 6.3), np.linspace(0.0, 30.0, 61)
+    controller = observed(modes, 3.1)
+    n, m = 9, 3
+    plant = control.ss(
+        np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]]),
+        np.r_[np.zeros((n, 1)), modes.phi(10 / 6).T],
+        np.c_[modes.phi(3.1), np.zeros((1, n))],
+        0,
+    )
+    a, b = controlled_plant(modes, range(m), ACTUATORS)
+    c = np.c_[modes.phi(3.1)[:, :m], np.zeros((1, m))]
+    observer = control.ss(a - b @ controller.law.gain - controller.reads @ c, controller.reads, -controller.law.gain, 0)
+    loop = control.feedback(plant, observer, sign=1)
+    peer = control.initial_response(loop, time, np.r_[state, np.zeros(2 * m)]).states[: 2 * n]
+    mine = respond(close_with(modes, controller), state, time)
+    np.testing.assert_allclose(mine.modal, peer, atol=1e-9)
+    # the work counts the same motion
+    loss = np.diag(modes.damping)
+    fine = respond(close_with(modes, controller), state, np.linspace(0.0, 30.0, 6001))
+    gained = fine.energy[:, -1] - fine.energy[:, 0]
+    work = finite_spillover(close_with(modes, controller), state, 30.0).by_mode
+    np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
+
+
+def test_a_residual_mode_is_named_that_stays_stable_and_unsettles_a_controlled_one():
+    modes = beam(5, 0.01)
+    controller = observed(modes, 3.3)
+    told = explain(modes, controller)
+    assert told.margin < 0 and told.reduced_margin > 0 and told.moved[0].closed_pole.real < 0
+    assert told.culprit.mode == 3 and stability_margin(close_with(modes.select([0, 1, 2, 4]), controller)) > 0
+    assert stability_margin(close_with(modes.select([0, 1, 2, 3]), controller)) < 0
+
+
+def test_balas_one_sensor_settles_here_and_unsettles_there():
+    modes = beam()
+    good, bad = explain(modes, observed(modes, 10 / 6)), explain(modes, observed(modes, 50 / 6))
+    assert good.margin > 0 and good.culprit is None
+    assert bad.margin < 0 and bad.culprit.mode == 3
+    assert bad.reduced_margin == pytest.approx(
+        stability_margin(close_with(modes.select(range(3)), observed(modes, 50 / 6)))
+    )
+    # without either spillover the same mode would stay
+    assert stability_margin(close_with(modes.select(range(3)), observed(modes, 50 / 6))) > 0
+
+
+@pytest.mark.parametrize(
+    "controller", [lambda m: observed(m, [3.1, 7.7]), lambda m: through_filter(m, ACTUATORS, [2.0, 5.5])]
+)
+def test_paths_add_up_to_the_movement_of_the_pole(controller):
+    modes = beam()
+    explained = explain(modes, controller(modes))
+    assert len(explained.moved) == 6
+    for moved in explained.moved:
+        assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-9 * abs(moved.pole))
+        assert np.abs(explained.poles - moved.closed_pole).min() == 0.0
+
+
+def test_first_order_is_the_derivative():
+    """With the gain lowered the movement tends to its first order, quadratically."""
+    modes = beam()
+    errors = []
+    for share in (1e-2, 1e-3):
+        controller = through_filter(modes, ACTUATORS, [2.0, 5.5], share)
+        moved = {m.mode: m for m in explain(modes, controller).moved}[4]
+        errors.append(abs(moved.shift - moved.first_order) / abs(moved.shift))
+    assert errors[1] < 0.15 * errors[0] < 0.01
+
+
+def test_every_remedy_settles_the_loop_and_less_does_not():
+    modes = beam()
+
+    def redesign(actuators, sensors, share):
+        return observed(modes, sensors, share, actuators)
+
+    found = {r.kind: r for r in remedies(modes, redesign, ACTUATORS, [50 / 6])}
+    assert set(found) == {"gain", "actuator", "sensor", "sensors added"}
+    assert all(explain(modes, r.controller).margin == pytest.approx(r.margin) and r.margin > 0 for r in found.values())
+    share = 1 - found["gain"].size
+    assert explain(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
+    assert found["sensors added"].size == 1
+
+
+def test_the_filter_cures_it_with_sensors_enough():
+    modes = beam()
+
+    def redesign(actuators, sensors, share):
+        return through_filter(modes, actuators, sensors, share)
+
+    count, margins = sensors_that_suffice(modes, redesign, ACTUATORS)
+    assert margins[0] < 0 and count is not None and (margins[count - 1 :] > 0).all() and margins[count - 2] <= 0
+
+
+@pytest.mark.parametrize(
+    ("act", "words"),
+    [
+        (lambda m: observed(m, 5.0), "no sensor sees mode 2"),
+        (lambda m: observed(m, []), "needs a sensor"),
+        (
+            lambda m: kalman(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], disturbance=1, noise=0),
+            "noise",
+        ),
+        (
+            lambda m: luenberger(m, coupled_lqr(m, 3, ACTUATORS, weight=1.0), [Sensor("y", 3.0)], poles=[1 + 1j] * 3),
+            "mode 1 of the observer is not stable",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(act, words):
+    with pytest.raises(DesignError, match=words):
+        act(beam())

@@ -1,0 +1,168 @@
+"""Where a gap lies, on gaps put in by hand: a tone on a late stretch of one sensor, a force that nobody modelled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_lines import lines_of
+from workbench.gap.localisation.force_localisation import placed
+from workbench.gap.localisation.where import locate
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import sampled_model
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import AirDrag, Clearance, CoulombFriction, CubicSpring, LinearDamper, PeriodicForce
+from workbench.structure.damping import ModalDamping
+
+DT, SAMPLES, NOISE = 0.01, 2000, 1e-5
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig()
+
+
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real, name, level, seed):
+        rng = np.random.default_rng(seed)
+        return record_of(real, np.repeat(level * rng.normal(size=SAMPLES // 10), 10)[None], rng, name=name)
+
+    return make
+
+
+def evidence(rig, records):
+    return Evidence.of(rig, FitData(tuple(records), np.full(len(rig.sensors), NOISE)))
+
+
+def where(rig, records, faulty=()):
+    found = evidence(rig, records)
+    return locate(found, (), placed(found.without(faulty)))
+
+
+def placed_by(rig, records):
+    return placed(evidence(rig, records))
+
+
+def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):
+    quiet, loud = measured(rig, "quiet", 0.1, 0), measured(rig, "loud", 1.0, 1)
+    tone = 0.05 * loud.outputs[2].std() * np.sin(2 * np.pi * 20.0 * loud.time) * (loud.time > 7 / 8 * loud.time[-1])
+    loud = replace(loud, outputs=loud.outputs + np.array([[0.0], [0.0], [1.0], [0.0]]) * tone)
+    found = where(rig, (quiet, loud))
+    assert found.sensor_shares[2] > 0.99 and found.path == "sensor"
+    inside = (found.band_edges_hz[:-1] <= 20.0) & (found.band_edges_hz[1:] > 20.0)
+    assert inside.sum() == 1 and found.band_shares[inside][0] > 0.95
+    assert found.band_shares.sum() == pytest.approx(1.0) and found.mode_shares.sum() == pytest.approx(1.0)
+    assert found.time_shares[1].argmax() == 7 and found.time_shares[1, 7] > 0.9
+    assert found.linear_share < 0.2
+    assert found.record_gaps[1] > 10 * NOISE / loud.outputs.std()
+
+
+def test_a_force_that_nobody_modelled_is_placed_before_any_effect_is_guessed(rig, measured):
+    frequency = 1.1 * rig.modes.frequencies_hz[1]
+    real = replace(rig, elements=(PeriodicForce(1.37, frequency, 0.05, 0.3),))
+    found = where(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
+    assert found.at_std < 0.005 * rig.modes.length
+    assert 2 in found.modes and found.place.holds and found.place.share > 0.999
+    assert found.path == "structure" and found.linear_share < 0.1
+
+
+def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
+    faulty = rig.sensors[1]
+    sensors = tuple(replace(s, gain=-1.0) if s is faulty else s for s in rig.sensors)
+    real = replace(rig, elements=(PeriodicForce(1.37, 1.1 * rig.modes.frequencies_hz[1], 0.05, 0.3),), sensors=sensors)
+    records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]
+    misled, found = where(rig, records), where(rig, records, faulty=[faulty.name])
+    assert abs(misled.at - 1.37) > 0.02 * rig.modes.length
+    assert abs(found.at - 1.37) < min(0.005 * rig.modes.length, 4.0 * found.at_std)
+    assert found.place.holds and not misled.place.holds and found.sensor_shares[1] == misled.sensor_shares[1]
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        CoulombFriction(1.37, 0.02, 0.005),
+        CubicSpring(1.37, 300.0),
+        Clearance(1.37, 1.0, 0.01),
+        LinearDamper(1.37, 0.02),
+    ],
+    ids=lambda law: type(law).__name__,
+)
+def test_the_deviation_of_a_place_is_true(rig, measured, law):
+    real = replace(rig, elements=(law,))
+    places = [placed_by(rig, [measured(real, str(s), 0.3, s) for s in (seed, seed + 100)]) for seed in range(10)]
+    z = np.array([(place.at - 1.37) / place.at_std for place in places])
+    assert all(place.holds for place in places)
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 2.0 and np.abs(z).max() < 4.0
+
+
+@pytest.mark.parametrize("elsewhere", [CubicSpring(0.5, 300.0), AirDrag(1.0)], ids=lambda law: type(law).__name__)
+def test_a_gap_that_is_not_of_one_force_is_not_placed(rig, measured, elsewhere):
+    real = replace(rig, elements=(CubicSpring(1.37, 300.0), elsewhere))
+    place = placed_by(rig, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert not place.holds
+
+
+def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch):
+    real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
+    records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]
+    every = placed_by(rig, records)
+    monkeypatch.setattr("workbench.gap.localisation.force_lines.MOST_LINES", 300)
+    fewer = placed_by(rig, records)
+    assert fewer.holds and every.at_std < fewer.at_std < 8.0 * every.at_std
+    assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std
+
+
+def test_no_gap_tells_no_place(rig, measured):
+    place = placed_by(rig, [measured(rig, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert place.holds is None and place.share == 0.0
+
+
+def test_short_records_of_one_force_are_of_one_force(rig, measured):
+    real = replace(rig, elements=(CubicSpring(1.37, 3000.0),))
+    records = [measured(real, str(s), 1.0, s) for s in range(10)]
+    short = [record.between(0.0, 4.0) for record in records]
+    assert all(placed_by(rig, pair).holds for pair in zip(short[::2], short[1::2], strict=True))
+
+
+def test_an_undamped_mode_on_a_line_is_no_obstacle(rig):
+    still = replace(rig, modes=replace(rig.structure, damping=ModalDamping(0.0)).modes(6))
+    dt = 2.0 * np.pi * 3.0 / (still.modes.omega[0] * 400)
+    model = sampled_model(still.modes, still.sensors, np.full(4, NOISE), dt)
+    (lines,) = lines_of(still, model, [np.full((4, 400), NOISE)], dt)
+    assert np.isfinite(lines.misfit(still.modes.phi(1.37)[0]))
+
+
+def test_a_sensor_that_lags_misleads_no_place(rig, measured):
+    sensors = (replace(rig.sensors[0], time_constant=0.01), *rig.sensors[1:])
+    known, real = replace(rig, sensors=sensors), replace(rig, sensors=sensors, elements=(CubicSpring(1.37, 3000.0),))
+    place = placed_by(known, [measured(real, str(seed), 0.3, seed) for seed in (2, 3)])
+    assert place.holds and abs(place.at - 1.37) < 4.0 * place.at_std
+
+
+def test_one_sensor_tells_no_place(rig, measured):
+    real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
+    records = [measured(real, str(seed), 0.3, seed).only(("d2",)) for seed in (2, 3)]
+    place = placed_by(replace(rig, sensors=rig.sensors[1:2]), records)
+    assert place.holds is None and place.at_std > 0.2 * rig.modes.length
+
+
+def test_no_gap_has_no_path(rig, measured):
+    found = where(rig, [measured(rig, "a", 0.3, 4)])
+    assert found.path == "none"
+
+
+@pytest.mark.parametrize(
+    "changed, low, high",
+    [
+        ({"actuators": (Actuator("F", 0.45, gain=1.2),)}, 0.95, 1.0),
+        ({"actuators": (Actuator("F", 0.52),)}, 0.95, 1.0),
+        ({"elements": (CoulombFriction(0.9, 0.05, 0.005),)}, 0.0, 0.6),
+    ],
+)
+def test_a_linear_gap_is_told_from_one_that_depends_on_level(rig, changed, low, high, measured):
+    real = replace(rig, **changed)
+    found = where(rig, [measured(real, f"{level}", level, seed) for seed, level in enumerate((0.1, 0.3, 1.0))])
+    assert low <= found.linear_share <= high

@@ -1,0 +1,44 @@
+"""A random disturbance follows nothing that the rig does; a force that pulls harder the nearer it is does."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from workbench.gap.prediction.random_force import _power, followed
+
+N = 2000
+
+
+@pytest.fixture(scope="module")
+def record():
+    """Inputs, and a lightly damped motion (displacement, velocity) that they cause."""
+    inputs = np.random.default_rng(0).normal(size=(2, N))
+    pole = 0.998 * np.exp(0.2j)
+    w = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], inputs.sum(axis=0))
+    return inputs, np.array([w, np.gradient(w)]) / w.std()
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])
+def test_what_follows_nothing(record, memory):
+    force = lfilter([1.0], [1.0, -memory], np.random.default_rng(1).normal(size=N))
+    assert followed(force, *record) < 0.1
+
+
+@pytest.mark.parametrize("law", [lambda w, v: 1.0 / (6.0 - w) ** 2, lambda w, v: -v * np.abs(v), lambda w, v: w**3])
+def test_what_follows_the_motion(record, law):
+    inputs, motion = record
+    force = law(*np.clip(motion, -4.0, 4.0))
+    noise = 0.5 * force.std() * np.random.default_rng(2).normal(size=N)
+    assert followed(force + noise, inputs, motion) > 0.5
+
+
+def test_what_follows_the_inputs_without_delay(record):
+    inputs, motion = record
+    assert followed(inputs[0] + 0.1 * motion[0], inputs, np.zeros_like(motion)) > 0.5
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3])
+@pytest.mark.parametrize("memory", [0.0, 0.6, 0.95])
+def test_power_of_a_colour(stages, memory):
+    impulse = lfilter([1.0], np.poly([memory] * stages), np.eye(1, N)[0])
+    assert _power(memory, stages) == pytest.approx((impulse**2).sum(), rel=1e-9)

@@ -1,0 +1,100 @@
+"""Filter and smoother of a missing force, beside Gaussian distributions of all samples at once."""
+
+import numpy as np
+import pytest
+from scipy.linalg import solve_discrete_are
+from scipy.stats import multivariate_normal
+
+from workbench.gap.prediction.unmodelled_force import (
+    driven,
+    force_filter,
+    innovations,
+    log_likelihood,
+    sampled_model,
+    smoothed_states,
+    whiten,
+)
+
+DT, SAMPLES = 0.01, 40
+NOISE = np.array([1e-4, 3e-4, 2e-4, 1e-4])
+
+
+@pytest.fixture(scope="module")
+def kalman(hinged_rig):
+    rig = hinged_rig(n_modes=3)
+    model = sampled_model(rig.modes, rig.sensors, NOISE, DT)
+    return force_filter(model, rig.modes.phi(0.9).T, np.array([0.04]), 0.7)
+
+
+@pytest.fixture(scope="module")
+def joint(kalman):
+    """Covariances of all states, and of all states with all readings, of a process that has gone on for ever."""
+    size, m = kalman.a.shape[0], kalman.h.shape[0]
+    powers = [np.eye(size)]
+    for _ in range(SAMPLES):
+        powers.append(kalman.a @ powers[-1])
+    q = np.zeros((size, size))
+    q[-1, -1] = 0.04
+    own = [kalman.covariance]
+    for _ in range(SAMPLES - 1):
+        own.append(kalman.a @ own[-1] @ kalman.a.T + q)
+    states = np.zeros((SAMPLES, size, SAMPLES, size))
+    for i in range(SAMPLES):
+        for j in range(i + 1):
+            states[i, :, j] = powers[i - j] @ own[j]
+            states[j, :, i] = states[i, :, j].T
+    with_readings = np.einsum("iajb,mb->iajm", states, kalman.h)
+    readings = np.einsum("lb,ibjm->iljm", kalman.h, with_readings).reshape(SAMPLES * m, SAMPLES * m)
+    return with_readings.reshape(SAMPLES * size, SAMPLES * m), readings + np.kron(np.eye(SAMPLES), np.diag(NOISE**2))
+
+
+@pytest.fixture(scope="module")
+def residual(joint):
+    rng = np.random.default_rng(0)
+    return rng.multivariate_normal(np.zeros(len(joint[1])), joint[1]).reshape(SAMPLES, -1).T
+
+
+def test_the_covariance_is_that_of_the_riccati_equation(kalman):
+    q = np.zeros_like(kalman.a)
+    q[-1, -1] = 0.04
+    expected = solve_discrete_are(kalman.a.T, kalman.h.T, q, np.diag(NOISE**2))
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((kalman.covariance - expected) / size).max() < 1e-6
+
+
+def test_the_likelihood_is_that_of_all_samples_at_once(kalman, joint, residual):
+    density = multivariate_normal(cov=joint[1], allow_singular=True).logpdf(residual.T.ravel())
+    constants = -0.5 * residual.size * np.log(2.0 * np.pi)
+    assert log_likelihood(kalman, [residual, residual]) == pytest.approx(2.0 * (density - constants), rel=1e-6)
+
+
+def test_innovations_are_what_was_not_foretold(kalman, residual):
+    state, expected = np.zeros(len(kalman.a)), np.empty_like(residual)
+    for k in range(SAMPLES):
+        expected[:, k] = residual[:, k] - kalman.h @ state
+        state = kalman.a @ state + kalman.gain @ expected[:, k]
+    assert np.allclose(innovations(kalman, residual), expected, rtol=0.0, atol=1e-10 * np.abs(residual).max())
+    white = whiten(kalman, residual)
+    assert np.sum(white**2) == pytest.approx(np.sum(expected * np.linalg.solve(kalman.innovation, expected)))
+
+
+def test_what_runs_away_is_likely_nowhere_and_ends_nothing(kalman, residual):
+    astray = residual.copy()
+    astray[1, 7] = np.inf
+    with np.errstate(invalid="ignore"):
+        assert log_likelihood(kalman, [astray]) == -np.inf
+        assert not np.isfinite(whiten(kalman, astray)).all()
+
+
+def test_the_smoother_tells_the_mean_of_all_states_given_all_readings(kalman, joint, residual):
+    mean = (joint[0] @ np.linalg.solve(joint[1], residual.T.ravel())).reshape(SAMPLES, -1).T
+    found = smoothed_states(kalman, residual)
+    assert (np.abs(found - mean).max(axis=1) < 1e-5 * np.abs(mean).max(axis=1)).all()
+
+
+def test_states_are_driven_from_rest():
+    rng = np.random.default_rng(1)
+    a, drive = 0.3 * rng.normal(size=(5, 5)), rng.normal(size=(5, 30))
+    x = driven(a, drive)
+    assert x.shape == (5, 31) and not x[:, 0].any()
+    assert np.allclose(x[:, 1:], a @ x[:, :-1] + drive, rtol=1e-12, atol=1e-12)

@@ -1,0 +1,87 @@
+"""What records could tell before a fit: an actuator at rest hides its faults; nothing else on this rig is hidden."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Kind
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.report.readiness import RecordsError, check_modes, check_records, readiness
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import PeriodicForce
+
+NOISE = 1e-5
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(actuators=(Actuator("F1", 0.45), Actuator("F2", 1.35)))
+
+
+@pytest.fixture(scope="module")
+def data(rig, record_of):
+    rng = np.random.default_rng(5)
+    commands = np.vstack([np.repeat(0.3 * rng.normal(size=100), 10), np.zeros(1000)])
+    return FitData((record_of(rig, commands, rng),), np.full(4, NOISE))
+
+
+def test_only_the_actuator_at_rest_hides_its_faults(rig, data):
+    found = readiness(Evidence.of(rig, data))
+    assert found.invisible
+    assert all(label.startswith("actuator_") and "[F2]" in label for label in found.invisible)
+    assert "actuator_gain[F2]" in found.invisible and found.strengths["actuator_gain[F2]"] == 0.0
+    assert found.strengths["actuator_gain[F1]"] > 5.0 and found.strengths["point_mass"] > 5.0
+
+
+def test_a_weak_start_hides_nothing_and_what_does_nothing_stays_hidden(rig, data):
+    modulus = vars(kind_named("modulus_error", CATALOGUE))
+    weak = Kind(**{**modulus, "starts": lambda *_: [{"factor": 1.0 + 1e-12}, {"factor": 1.1}]})
+    idle = Kind(**{**modulus, "name": "idle", "apply": lambda rig, *_: rig})
+    assert readiness(Evidence.of(rig, data), catalogue=(weak, idle)).invisible == ("idle",)
+
+
+def test_a_force_that_noise_puts_by_a_support_hides_no_effect(rig, data):
+    found = readiness(Evidence.of(rig, data).of_force_at(1e-4 * rig.modes.length))
+    assert found.invisible and all("[F2]" in label for label in found.invisible)
+
+
+def test_two_effects_that_do_the_same_are_told_to_be_alike(rig, data):
+    gain = kind_named("actuator_gain", CATALOGUE)
+    twin = Kind(**{**vars(gain), "name": "another_gain"})
+    found = readiness(Evidence.of(rig, data), catalogue=(gain, twin, kind_named("modulus_error", CATALOGUE)))
+    assert found.alike == (("actuator_gain[F1]", "another_gain[F1]", pytest.approx(1.0)),)
+
+
+@pytest.mark.parametrize("kept", [(0, 1), (0, 1, 2, 3)])
+def test_the_channel_in_other_units_is_named(rig, data, kept):
+    names = [rig.sensors[j].name for j in kept]
+    few = replace(rig, sensors=tuple(rig.sensors[j] for j in kept))
+    (record,) = data.of_outputs(names).records
+    check_records(few, [record])
+    factors = np.ones((len(kept), 1))
+    factors[1] = 1e-3
+    with pytest.raises(RecordsError, match=rf"output '{names[1]}' reads about 0.001 times"):
+        check_records(few, [replace(record, outputs=factors * record.outputs)])
+    with pytest.raises(RecordsError, match="the outputs read about 1000 times"):
+        check_records(few, [replace(record, outputs=1e3 * record.outputs)])
+
+
+def test_a_strong_force_that_nobody_modelled_is_no_wrong_unit(rig, record_of):
+    rng = np.random.default_rng(6)
+    commands = 0.003 * np.vstack([np.repeat(rng.normal(size=100), 10), np.zeros(1000)])
+    check_records(rig, [record_of(replace(rig, elements=(PeriodicForce(1.37, 0.47, 1.0, 0.0),)), commands, rng)])
+
+
+def test_modes_changed_behind_the_back_of_their_structure_are_refused(rig):
+    check_modes(rig)
+    modes = rig.modes
+    sharper = replace(modes, omega=modes.omega * np.array([1.0, 1.01, *[1.0] * (modes.n_modes - 2)]))
+    with pytest.raises(ValueError, match=r"mode 2 .* structure=None"):
+        check_modes(replace(rig, modes=sharper))
+    with pytest.raises(ValueError, match=r"mode 1 .* damped"):
+        check_modes(replace(rig, modes=replace(modes, damping=1.5 * modes.damping)))
+    check_modes(replace(rig, modes=sharper, structure=None))
+    check_modes(replace(rig, modes=modes.select(slice(3))))

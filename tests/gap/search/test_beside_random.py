@@ -1,0 +1,83 @@
+"""A random disturbance is told from forces that the rig makes itself, and hides no effect beside it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.search.beside_random import looks_random
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
+from workbench.rig.simulate import simulate
+
+LEVELS = (0.1, 0.4, 1.6)
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(actuators=(Actuator("F", 0.45), Actuator("wind", 1.3)))
+
+
+@pytest.fixture(scope="module")
+def records(rig, record_of):
+    """Records at three levels, with a random force at the second place that the rig is not told of."""
+
+    def make(real, rms: float):
+        rng, made = np.random.default_rng(5), []
+        for level in LEVELS:
+            command = level * np.repeat(rng.normal(size=150), 10)
+            wind = lfilter([1.0], [1.0, -0.8], rng.normal(size=command.size))
+            record = record_of(real, np.array([command, rms * wind / wind.std()]), rng, name=str(level), substeps=8)
+            known = replace(record, inputs=record.inputs[:1], input_channels=record.input_channels[:1])
+            made.append(known)
+        return made
+
+    return make
+
+
+def evidence(rig, records):
+    return Evidence.of(rig, FitData(tuple(records), np.array([s.noise_std for s in rig.sensors])))
+
+
+def test_only_what_keeps_its_level_looks_random(rig, records):
+    told = replace(rig, actuators=rig.actuators[:1])
+    assert looks_random(evidence(told, records(rig, 0.05)))
+    gripped = replace(rig, elements=(CoulombFriction(1.3, 0.05, 1e-3),))
+    assert not looks_random(evidence(told, records(gripped, 0.0)))
+    stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.05})
+    assert not looks_random(evidence(told, records(stiffer, 0.0)))
+
+
+@pytest.mark.parametrize("law", [OneSidedStop(0.9, 80.0, 0.002), AirDrag(10.0), CoulombFriction(0.9, 0.05, 0.02)])
+def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig, records, law):
+    told, real = (replace(r, elements=(law,)) for r in (replace(rig, actuators=rig.actuators[:1]), rig))
+    noise = np.array([s.noise_std for s in rig.sensors])
+    (weak, *_), (plain, *_) = records(real, 0.05), records(rig, 0.05)
+    quiet = simulate(replace(rig, actuators=rig.actuators[:1]), plain.inputs, sample_time=0.01).outputs
+    truth = plain.outputs - quiet  # the same wind on the structure without the law
+    follower = Follower.of(told, noise, 0.1, 0.01, at=1.3, rms=0.05)
+    left = follower.left(told, weak, 8)
+    whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
+    error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]
+    assert error[0] < 0.02 < 0.1 < error[1]
+
+
+@pytest.mark.slow
+def test_a_weak_effect_beside_it_is_found(rig, records):
+    told = replace(rig, actuators=rig.actuators[:1])
+    alone = diagnose(told, records(rig, 0.05))
+    assert [effect.label for effect in alone.effects] == ["random_disturbance"]
+    (wind,) = alone.effects
+    assert wind.values["at"] == pytest.approx(1.3, abs=0.01)
+    assert wind.values["rms"] == pytest.approx(0.05, rel=0.05)
+    stiffer = kind_named("modulus_error").apply(rig, None, {"factor": 1.002})
+    both = diagnose(told, records(stiffer, 0.05))
+    assert sorted(effect.label for effect in both.effects) == ["modulus_error", "random_disturbance"]
+    factor = next(e.values["factor"] for e in both.effects if "factor" in e.values)
+    assert factor == pytest.approx(1.002, abs=5e-4)

@@ -1,0 +1,115 @@
+"""A set brought to its end: as the simplest that the records cannot tell from it, and no further than is of use."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.limiting_cases import contained
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import Workers
+from workbench.gap.search import decide, pursuit
+from workbench.gap.search.finish import finished, simplest
+from workbench.gap.search.fit import fit
+from workbench.gap.search.pursuit import on_whole_records
+from workbench.gap.search.search import Search
+from workbench.rig.elements import BoucWen, CubicSpring
+
+BOUC_WEN, SPRING, NOISE = kind_named("bouc_wen"), kind_named("ground_spring"), 1e-5
+MODULUS = kind_named("modulus_error")
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig()
+
+
+@pytest.fixture(scope="module")
+def search(rig, record_of):
+    """A search in a record of what the rig really is."""
+
+    def make(real, workers: int = 1, level: float = 1.0) -> Search:
+        rng = np.random.default_rng(0)
+        command = level * np.repeat(rng.normal(size=100), 10)[None]
+        data = FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
+        quick, nominal = data.stepped(2), data.by_channel(data.residual(rig))
+        return Search(rig, data, quick, quick, CATALOGUE, lambda text, share: None, Workers(workers), nominal)
+
+    return make
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_hysteretic_spring_that_never_yields_is_a_plain_one(rig, search, workers):
+    one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), workers, 0.02)
+    start = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 2.5, "yield_displacement": 3.0})
+    found = simplest(one, finished(one, fit(one.rig, (start,), one.data)))
+    assert one.explains(found) and found.labels == ("ground_spring",)
+    assert found.effects[0].values["at"] == pytest.approx(0.62, abs=0.01)
+
+
+def test_a_hysteretic_spring_that_yields_is_no_plain_one(rig, search):
+    one = search(replace(rig, elements=(BoucWen(0.62, 30.0, 0.02),)))
+    start = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 28.0, "yield_displacement": 0.025})
+    found = finished(one, fit(one.rig, (start,), one.data))
+    assert one.explains(found) and simplest(one, found) is found
+
+
+def test_a_fit_on_its_way_to_more_than_is_of_use_stays_where_it_is(rig, search, monkeypatch):
+    one, ended = search(replace(rig, elements=(CubicSpring(0.62, 300.0),))), []
+
+    def whole(search, effects, iterations):
+        ended.append(iterations)
+        return replace(fit(search.rig, effects, search.data, iterations=2), falling=0.003)
+
+    monkeypatch.setattr(pursuit, "whole", whole)
+    wrong = fit(one.rig, (Effect(SPRING, None, {"at": 0.6, "stiffness": 1.0}),), one.data, iterations=1)
+    on_whole_records(one, [wrong], 1)
+    assert ended == [5, 25]
+    ended.clear()
+    on_whole_records(one, [wrong], 1, to_cost=one.enough)
+    assert ended == [5]
+
+
+def test_a_set_that_contains_one_that_leaves_only_noise_is_not_fitted_to_its_end(rig, search):
+    one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), level=0.02)
+    spring = Effect(SPRING, None, {"at": 0.6, "stiffness": 2.5})
+    hysteretic = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 2.5, "yield_displacement": 3.0})
+    ahead = [fit(one.rig, (effect,), one.data, iterations=1) for effect in (hysteretic, spring)]
+    # whichever comes first, the simpler one is fitted beside it
+    for both in (ahead, ahead[::-1]):
+        close = [replace(f, cost=1.0 + 0.01 * i) for i, f in enumerate(both)]
+        assert [f.labels for f in on_whole_records(one, close, 2)] == [("ground_spring",)]
+
+
+def test_a_set_that_contains_one_that_leaves_more_is_fitted(rig, search):
+    one = search(replace(rig, elements=(BoucWen(0.62, 30.0, 0.02),)))
+    spring = Effect(SPRING, None, {"at": 0.6, "stiffness": 28.0})
+    hysteretic = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 28.0, "yield_displacement": 0.025})
+    close = [replace(fit(one.rig, (effect,), one.data, iterations=1), cost=1.0) for effect in (spring, hysteretic)]
+    found = on_whole_records(one, close, 2)
+    assert found[0].labels == ("bouc_wen",) and one.explains(found[0])
+
+
+def test_what_a_set_comes_to_at_bounds_is_told_to_the_last(rig):
+    near_the_end = Effect(BOUC_WEN, None, {"at": 0.05, "stiffness": 1.0, "yield_displacement": 1.0})
+    gain = Effect(kind_named("sensor_gain"), "d1", {"gain": 0.9})
+    assert contained((near_the_end, gain), rig) == {
+        ("ground_spring", "sensor_gain[d1]"),
+        ("sensor_gain[d1]", "support_rotation[left]"),
+    }
+
+
+def test_what_is_not_taken_to_its_end_is_still_there_and_all_are_there_once(rig, search, monkeypatch):
+    one = search(SPRING.apply(rig, None, {"at": 0.62, "stiffness": 3.0}), level=0.02)
+    ended = []
+    monkeypatch.setattr(decide, "finished", lambda search, candidate: ended.append(candidate) or candidate)
+    first = fit(rig, (Effect(SPRING, None, {"at": 0.62, "stiffness": 3.0}),), one.data)
+    assert one.explains(first)
+    linear = replace(first, effects=(Effect(MODULUS, None, {"factor": 1.01}),), cost=first.cost + 0.1, falling=0.0)
+    yields = Effect(BOUC_WEN, None, {"at": 0.62, "stiffness": 3.0, "yield_displacement": 3.0})
+    stepped = replace(linear, effects=(yields,), cost=first.cost + 0.2)
+    found = decide._ended(one, [first, linear, stepped])
+    assert ended == [first, stepped]
+    assert sorted(found, key=lambda f: f.cost) == [first, linear, stepped]

@@ -1,0 +1,141 @@
+"""Fits of what a place and a strength make up for between them, on a beam with known truth."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import _fails_unseen
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.limiting_cases import fewer, simpler_forms
+from workbench.gap.prediction.innovations import LOOSE
+from workbench.gap.prediction.random_force import tonal
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import force_filter, sampled_model, whiten
+from workbench.gap.report.shrinkage import Shrinkage
+from workbench.gap.search.fit import cost_of, fit, slopes
+from workbench.rig.elements import CubicSpring, PeriodicForce
+
+NOISE, DT = 1e-5, 0.01
+CUBIC, SPRING, LOSS = (kind_named(n) for n in ("cubic_spring", "ground_spring", "local_stiffness_loss"))
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig()
+
+
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real, level=1.0):
+        rng = np.random.default_rng(3)
+        command = level * np.repeat(rng.normal(size=100), 10)[None]
+        return FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
+
+    return make
+
+
+def test_an_effect_without_numbers_is_fitted_as_it_is(rig, measured):
+    data, more = measured(rig), kind_named("truncated_modes")
+    effects = (Effect(more, more.targets(rig)[0], {}),)
+    assert slopes(rig, effects, data).shape == (data.n_values, 0)
+    found = fit(rig, effects, data)
+    assert found.n_parameters == 0 and found.cost == cost_of(rig, effects, data)
+
+
+def test_a_fit_follows_the_valley_along_which_a_place_makes_up_for_a_strength(rig, measured):
+    real = replace(rig, elements=(CubicSpring(0.2, 400.0),))
+    data = measured(real)
+    nominal = cost_of(rig, (), data)
+    # where the beam moves half as much a spring must be sixteen times as hard
+    found = fit(rig, (Effect(CUBIC, None, {"at": 0.1, "stiffness": 16 * 400.0}),), data, iterations=20)
+    values, spread = found.effects[0].values, found.effects[0].deviations
+    assert nominal > 100 and found.cost < 1.02
+    assert values["at"] == pytest.approx(0.2, abs=4 * spread["at"] + 1e-3)
+    assert values["stiffness"] == pytest.approx(400.0, rel=0.05)
+
+
+def test_predictions_ahead_err_by_the_innovations_of_the_filter_where_all_is_linear(rig, record_of):
+    rng = np.random.default_rng(5)
+    real = replace(rig, elements=(PeriodicForce(1.37, 3.0, 0.05, 0.3),))
+    record = record_of(real, np.repeat(rng.normal(size=30), 10)[None], rng)
+    data = FitData((record,), np.full(4, NOISE))
+    places = (np.arange(50) + 0.5) / 25
+    forces = LOOSE * data.force_rms * np.sqrt(np.mean(rig.modes.phi(places) ** 2, axis=0))
+    kalman = force_filter(sampled_model(rig.modes, rig.sensors, data.noise, DT), np.eye(6), forces**2, 0.0)
+    expected = whiten(kalman, data.residual(rig).reshape(4, -1) * NOISE)
+    np.testing.assert_allclose(data.following(rig).residual(rig).reshape(4, -1), expected, atol=1e-6)
+    assert np.std(expected) > 2.0  # so that more than noise was compared
+
+
+def test_predictions_ahead_lead_to_a_spring_beside_which_motions_run_apart(rig, measured):
+    data = measured(replace(rig, elements=(CubicSpring(0.62, 4e4),)), level=0.5)
+    away = (Effect(CUBIC, None, {"at": 0.56, "stiffness": 2.8e4}),)
+    lost = fit(rig, away, data, iterations=30)
+    ahead = fit(rig, away, data.following(rig), iterations=15)
+    found = fit(rig, ahead.effects, data.stepped(8), iterations=15)
+    assert lost.cost > 1e4 and found.cost < 1.02
+    assert found.effects[0].values["at"] == pytest.approx(0.62, abs=1e-4)
+    assert found.effects[0].values["stiffness"] == pytest.approx(4e4, rel=1e-3)
+
+
+def test_a_number_comes_back_from_its_bound(rig, measured):
+    data = measured(LOSS.apply(rig, None, {"at": 1.2, "width": 0.33, "loss": 0.05}))
+    # a fit from the narrow side overshoots to the widest loss there may be
+    found = fit(rig, (Effect(LOSS, None, {"at": 1.3, "width": 0.4, "loss": 0.03}),), data, iterations=20)
+    values, spread = found.effects[0].values, found.effects[0].deviations
+    assert found.cost < 1.02
+    assert values["at"] == pytest.approx(1.2, abs=4 * spread["at"] + 1e-4)
+    assert values["width"] == pytest.approx(0.33, abs=4 * spread["width"])
+
+
+def test_a_local_loss_stays_on_the_structure(rig):
+    softened = LOSS.apply(rig, None, {"at": 0.11, "width": 0.2, "loss": 0.1})
+    assert softened.modes.omega[0] < rig.modes.omega[0]
+    with pytest.raises(ValueError, match="beyond the structure"):
+        LOSS.apply(rig, None, {"at": 0.09, "width": 0.2, "loss": 0.1})
+
+
+def test_a_spring_beside_a_hinge_is_a_hinge_that_resists_turning(rig):
+    (left,) = simpler_forms(Effect(SPRING, None, {"at": 0.05, "stiffness": 400.0}), rig)
+    (right,) = simpler_forms(Effect(SPRING, None, {"at": 1.95, "stiffness": 400.0}), rig)
+    assert (left.target, right.target) == ("left", "right")
+    assert left.values["rotational_stiffness"] == pytest.approx(400.0 * 0.05**2)
+    spring = SPRING.apply(rig, None, {"at": 0.01, "stiffness": 1e4}).modes.omega
+    turning = left.kind.apply(rig, "left", {"rotational_stiffness": 1.0}).modes.omega
+    assert spring[:3] == pytest.approx(turning[:3], rel=2e-3) and turning[0] > 1.01 * rig.modes.omega[0]
+    assert simpler_forms(Effect(SPRING, None, {"at": 1.0, "stiffness": 400.0}), rig) == ()
+
+
+def test_two_effects_of_one_kind_may_be_one():
+    first, second = (Effect(CUBIC, None, {"at": at, "stiffness": 1.0}) for at in (0.5, 0.9))
+    other = Effect(SPRING, None, {"at": 1.2, "stiffness": 2.0})
+    sets = list(fewer((first, other, second)))
+    assert [s[0] for s in sets] == [other] * 3
+    assert sorted(s[1].values["at"] for s in sets) == pytest.approx([0.5, 0.7, 0.9])
+    assert not list(fewer((first, other)))
+
+
+def test_a_tone_is_no_random_force():
+    time = DT * np.arange(2000)
+    noise = np.random.default_rng(0).normal(size=2000)
+    slow = np.convolve(noise, np.exp(-np.arange(400) / 80.0), "same")
+    assert tonal(np.sin(2 * np.pi * 0.33 * time + 1.0) + 0.1 * noise, DT) > 0.95
+    assert tonal(noise, DT) < 0.1 and tonal(slow, DT) < 0.6
+
+
+class Found:
+    def __init__(self, *kinds):
+        self.best = type("Fit", (), {"effects": tuple(Effect(kind_named(k), None, {}) for k in kinds)})
+
+
+def test_a_set_must_hold_on_records_it_has_not_seen():
+    def unseen(after, overall):
+        return Shrinkage({"v": 0.5}, {"v": after}, {"v": 0.01}, {"v": overall}, overall, (overall, overall))
+
+    assert _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77))
+    assert not _fails_unseen(Found("cubic_spring"), unseen(0.02, 0.97))
+    assert not _fails_unseen(Found("cubic_spring"), unseen(0.0102, 0.8)), "what is left is noise"
+    assert not _fails_unseen(Found("random_disturbance"), unseen(0.3, 0.1)), "no prediction can hold it"
+    assert not _fails_unseen(Found("cubic_spring"), None)

@@ -1,0 +1,94 @@
+"""One sensor and a beat: two linear modes, or one whose frequency and damping go with its amplitude."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from workbench.identification.free_decay.backbone import left_by_backbone
+from workbench.identification.free_decay.order import identify
+from workbench.records.record import Channel, Record
+
+DT = 0.02
+TIME = DT * np.arange(1600)
+
+
+def noisy(y, level, seed):
+    y = y + level * y.std() * np.random.default_rng(seed).standard_normal(y.size)
+    return Record(DT, y[None], (Channel("y", "displacement"),))
+
+
+def bent(omega=20.0, sigma=0.15, rise=0.5, time=TIME):
+    """θ' = ω + rise r² with r = e^{-σt}: θ = ω t + rise (1 - r²) / 2σ."""
+    return np.exp(-sigma * time) * np.cos(omega * time + 0.5 * rise * -np.expm1(-2.0 * sigma * time) / sigma + 0.7)
+
+
+def beating(omega=20.0, sigma=(0.15, 0.2), apart=0.2, time=TIME):
+    first, second = (
+        np.exp(-s * time) * np.cos(w * time + p) for s, w, p in zip(sigma, (omega, omega + apart), (0.3, 2))
+    )
+    return first + 0.5 * second
+
+
+def test_a_mode_on_a_backbone_leaves_noise_and_no_more():
+    beside = np.exp(-0.1 * TIME) * np.cos(50.0 * TIME)
+    noise = 0.01 * bent().std()
+    record = noisy(bent(), 0.01, 0)
+    record = Record(DT, record.outputs + beside, record.output_channels)
+    pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
+    enough = 1.1 * TIME.size * noise**2  # squares of the noise stray by 4 % (one sigma)
+    left = left_by_backbone(record, pair, np.array([-0.1 + 50.0j]), offset=True, enough=enough)
+    assert 0.9 * TIME.size * noise**2 < left < enough
+
+
+def test_two_modes_that_one_sensor_sees_are_two():
+    found = identify(noisy(beating(), 0.01, 1))
+    assert found.modes.n_modes == 2
+    assert (np.abs(found.modes.poles.imag - [20.0, 20.2]) < 4.0 * found.refined.omega_std).all()
+
+
+def test_one_mode_that_shifts_as_it_decays_is_one():
+    """Two linear modes raise its likelihood over one as far as those of the other test do theirs."""
+    found = identify(noisy(bent(), 0.01, 2))
+    assert found.modes.n_modes == 1
+    assert 20.0 < found.modes.omega[0] < 20.5
+
+
+def random_beat(rng):
+    omega = 2.0 * np.pi * rng.uniform(2.0, 8.0)
+    sigma = omega * 10 ** rng.uniform(np.log10(0.003), np.log10(0.015), 2)
+    poles = -sigma + 1j * (omega + np.r_[0.0, rng.uniform(0.2, 1.0) * sigma.sum()])
+    amplitudes = np.r_[1.0, 10 ** rng.uniform(-0.7, 0.0)] * np.exp(2j * np.pi * rng.random(2))
+    return (amplitudes @ np.exp(np.outer(poles, TIME))).real
+
+
+def random_bent(rng, kind):
+    """Springs that harden or soften, drag, friction; shifts of a third to five half-widths of the mode."""
+    omega = 2.0 * np.pi * rng.uniform(2.0, 8.0)
+    sigma = omega * 10 ** rng.uniform(np.log10(0.003), np.log10(0.012))
+    shift = sigma * 10 ** rng.uniform(-0.5, 0.7)
+    cubic = {"harder": 1.0, "softer": -1.0, "drag": 0.3, "friction": 0.3}[kind] * shift * omega * 8.0 / 3.0
+    drag, friction = (
+        (1.5 * shift / omega if kind == "drag" else 0.0),
+        (0.05 * sigma * omega if kind == "friction" else 0.0),
+    )
+
+    def rates(_, state):
+        x, v = state
+        resisted = 2.0 * sigma * v + drag * abs(v) * v + friction * np.tanh(1e3 * v / omega)
+        return [v, -(omega**2) * x - cubic * x**3 - resisted]
+
+    return solve_ivp(rates, (0.0, TIME[-1]), [1.0, 0.0], "DOP853", TIME, rtol=1e-8, atol=1e-10).y[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [0.01, 0.001])
+def test_random_beats_and_backbones_are_told_apart(level):
+    """Forty of each; modes at their third harmonics, which shift too, are told by their frequencies."""
+    missed = false = 0
+    for seed in range(40):
+        rng = np.random.default_rng([seed, 1])
+        missed += identify(noisy(random_beat(rng), level, seed)).modes.n_modes < 2
+        one = random_bent(rng, ("harder", "softer", "drag", "friction")[seed % 4])
+        omega = identify(noisy(one, level, seed)).modes.omega
+        false += (omega < 1.5 * omega[0]).sum() > 1
+    assert missed <= 1 and false <= 1

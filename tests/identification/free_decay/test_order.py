@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+
+from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.refinement import bound, refine
+from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.records.record import Channel, Record
+from workbench.structure.damping import ProportionalDamping
+from workbench.structure.member import Bar
+from workbench.structure.modes import SampledModes, mac
+
+
+def taper(x):
+    return 2.0 * (1.0 - x)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    """Five modes, two of them 2 % apart and one of a hundredth of the largest amplitude, at five sensors."""
+    shapes = np.random.default_rng(3).standard_normal((5, 5)) * [1.0, 0.3, 0.3, 0.01, 0.1]
+    omega = 2 * np.pi * np.array([3.0, 9.0, 9.18, 14.0, 20.0])
+    return SampledModes(omega, [0.01, 0.006, 0.01, 0.005, 0.04], shapes, np.linspace(0, 1, 5))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 0.01])
+def test_the_modes_that_are_there_and_no_others(truth, noise):
+    record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=noise, seed=1)
+    found = identify(record)
+    assert found.modes.n_modes == 5
+    std = bound(truth, record, noise_std=noise or 1e-9).omega_std
+    assert (np.abs(found.modes.omega - truth.omega) < 4 * std).all()
+    assert (found.evidence > found.limit).all()
+
+
+def test_without_noise_every_mode_comes_in_and_nothing_else_is_tried():
+    """The bar of section 4.4 from six sensors: a pole that seems to split another on its way bars no other."""
+    bar = Bar(length=1.0, mass_per_length=taper, axial_stiffness=taper, left="fixed", right="free",
+              damping=ProportionalDamping(g1=0.002, g2=0.1))  # fmt: skip
+    exact = bar.modes(20)
+    decay = struck(exact, at=0.63, positions=np.arange(1, 7) / 6)
+    found = identify(free_decay(decay, sample_time=0.01, n_samples=1500, quantity="acceleration"))
+    assert np.abs(found.modes.omega / exact.omega - 1.0).max() < 1e-11
+    assert found.noise_modes.n_modes == 0
+
+
+def test_a_mode_beneath_the_noise_is_left_out(truth):
+    record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=0.2, seed=1)
+    assert 3 not in np.abs(identify(record).modes.omega[:, None] / truth.omega - 1).argmin(axis=1)
+
+
+def test_noise_alone_is_refused():
+    channels = tuple(Channel(f"y{i}") for i in range(4))
+    noise = Record(0.01, np.random.default_rng(0).standard_normal((4, 600)), channels)
+    with pytest.raises(ValueError, match="holds no mode that rises above its noise"):
+        identify(noise)
+
+
+def test_bound_is_what_refinement_reports(truth):
+    record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=1e-4, seed=2)
+    known = bound(truth, record, noise_std=1e-4)
+    assert np.allclose(refine(record, truth).omega_std, known.omega_std, rtol=0.1)
+
+
+def test_records_of_unequal_length_together_tell_more(truth):
+    first = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=0.01, seed=3)
+    second = free_decay(truth, sample_time=0.01, n_samples=500, noise_std=0.01, seed=4)
+    alone, both = identify(first), identify([first, second])
+    assert both.modes.n_modes == truth.n_modes
+    assert (both.refined.omega_std < alone.refined.omega_std).all()
+
+
+def test_a_mode_that_shifts_as_it_decays_is_no_crowd_of_modes():
+    """1 % higher where strong, as a hardening spring has it, rounded to counts: its side lines are no modes."""
+    time = 0.002 * np.arange(2000)
+    envelope = 50.0 * np.exp(-1.2 * time)
+    strong = envelope * np.cos(2 * np.pi * np.cumsum(18.0 * (1 + 4e-6 * envelope**2)) * 0.002)
+    other = 30.0 * np.exp(-2.0 * time) * np.cos(2 * np.pi * 52.0 * time + 0.4)
+    found = identify(Record(0.002, np.round(strong + other), (Channel("a", "acceleration"),))).modes
+    for frequency in (18.0, 52.0):
+        assert np.abs(found.frequencies_hz - frequency).min() < 0.01 * frequency
+    assert found.n_modes <= 6
+
+
+def test_crowded_modes_at_two_sensors_are_two():
+    """Shapes of two sensors agree to 0.95 in one pair of modes of twenty, by chance; these do, and are far apart."""
+    shapes = np.array([[1.0, 0.9j, 0.5], [0.6, 0.75j, -0.8]])
+    truth = SampledModes(2 * np.pi * np.array([4.0, 4.08, 9.0]), [0.012, 0.014, 0.015], shapes, [0.0, 1.0])
+    assert 0.95 < mac(truth.shapes, truth.shapes)[0, 1] < 0.99
+    record = free_decay(truth, sample_time=0.02, n_samples=1000, noise_std=0.002, seed=0)
+    found, limit = identify(record).modes, bound(truth, record, noise_std=0.002)
+    assert found.n_modes == 3
+    assert (np.abs(found.omega - truth.omega) < 4 * limit.omega_std).all()

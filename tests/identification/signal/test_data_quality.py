@@ -1,0 +1,99 @@
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workbench.identification.free_decay.order import identify
+from workbench.identification.signal.data_quality import ailments, check_fit
+from workbench.identification.signal.synthesis import free_decay
+from workbench.records.record import Channel, Record
+from workbench.structure.modes import SampledModes
+
+ROOT = Path(__file__).resolve().parents[3]
+ARM = Path(os.environ.get("WORKBENCH_SHARED", ROOT.parent / "shared")) / "measured" / "arm-ringdown"
+
+
+@pytest.fixture(scope="module")
+def sound():
+    shapes = np.random.default_rng(3).standard_normal((4, 3))
+    modes = SampledModes([19.0, 57.0, 88.0], [0.01, 0.006, 0.02], shapes, np.linspace(0, 1, 4))
+    return free_decay(modes, sample_time=0.01, n_samples=800, noise_std=0.003, seed=1)
+
+
+def with_row(record, j, row):
+    outputs = record.outputs.copy()
+    outputs[j] = row
+    return replace(record, outputs=outputs)
+
+
+def only(record):
+    [found] = ailments(record)
+    return found
+
+
+def test_a_sound_record_has_none(sound):
+    assert ailments(sound) == ()
+    check_fit(sound)
+
+
+def test_single_mode_without_noise_is_no_copy():
+    modes = SampledModes([19.0], [0.01], [[1.0], [0.5], [-0.7]], np.linspace(0, 1, 3))
+    assert ailments(free_decay(modes, sample_time=0.01, n_samples=800)) == ()
+
+
+@pytest.mark.parametrize("steps", [2, 5, 30, 300])
+@pytest.mark.parametrize("omega", [0.31, 3.0, 57.0])
+@pytest.mark.parametrize("zeta", [0.0002, 0.01])
+def test_rounding_is_neither_clipping_nor_another_rate(steps, omega, zeta):
+    modes = SampledModes([omega], [zeta], [[float(steps)]], [0.0])
+    clean = free_decay(modes, sample_time=0.01, n_samples=4000)
+    assert ailments(replace(clean, outputs=np.round(clean.outputs))) == ()
+
+
+def test_dead_sensor(sound):
+    found = only(with_row(sound, 2, 5.0))
+    assert (found.kind, found.outputs) == ("dead", ("y3",)) and "'y3' stays at 5" in found.message
+
+
+def test_counter_is_no_sensor(sound):
+    assert "clock or a counter" in only(with_row(sound, 2, np.arange(800.0))).message
+
+
+@pytest.mark.parametrize("scale", [1.0, -2.5])
+def test_copied_sensor(sound, scale):
+    found = only(with_row(sound, 3, scale * sound.outputs[1] + 0.2))
+    assert (found.kind, found.outputs) == ("copied", ("y2", "y4"))
+
+
+def test_clipped_sensor_and_when_it_ends(sound):
+    limit = 0.6 * np.abs(sound.outputs[1]).max()
+    found = only(with_row(sound, 1, np.clip(sound.outputs[1], -limit, limit)))
+    last = sound.time[np.abs(sound.outputs[1]) > limit][-1]
+    assert (found.kind, found.outputs) == ("clipped", ("y2",)) and abs(found.until - last) < 0.2
+    assert f"{limit:g}" in found.message and "begin later" in found.message
+
+
+def test_sensor_of_another_rate(sound):
+    slow, time = sound.outputs[0, ::4], sound.time
+    held = only(with_row(sound, 0, np.repeat(slow, 4)))
+    joined = only(with_row(sound, 0, np.interp(time, time[::4], slow)))
+    for found in (held, joined):
+        assert (found.kind, found.outputs) == ("slower", ("y1",)) and "sampled at 25 Hz" in found.message
+    assert "held" in held.message and "straight lines" in joined.message
+
+
+def test_identify_refuses_what_ails(sound):
+    with pytest.raises(ValueError, match="'y3' stays at 5"):
+        identify(with_row(sound, 2, 5.0))
+    with pytest.raises(ValueError, match="same signal"):
+        identify(with_row(sound, 3, sound.outputs[0]))
+
+
+def test_measured_arm_ails_in_nothing():
+    if not ARM.is_dir():
+        pytest.skip(f"measured records are not at {ARM}")
+    for path in sorted(ARM.glob("*.txt")):
+        table = np.loadtxt(path)
+        assert ailments(Record(0.002, table[:, -1][None], (Channel("a"),))) == ()

@@ -1,0 +1,201 @@
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from workbench.identification.transfer import coherence_noise, identify_transfer
+from workbench.records.record import Channel
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import state_space
+from workbench.structure.member import Beam
+from workbench.structure.modes import mac
+
+SHARED = Path(os.environ.get("WORKBENCH_SHARED", Path(__file__).resolve().parents[3] / "shared"))
+RULER = SHARED / "measured" / "ruler" / "ruler.mat"
+F = np.arange(1.0, 26.0, 0.02)
+PLACES = (0.2, 0.45, 0.7, 1.0)
+
+
+def beam(quantity):
+    """Accelerance or receptance of a cantilever of eight modes under two hammers, by python-control.
+
+    Modes 2 to 4 lie in the band, one below and four above.
+    """
+    structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")
+    modes = structure.modes(8)
+    modes = type(modes)(modes.omega, np.full(8, 0.01), modes.shapes, modes.length, modes.essential)
+    sensors = [Sensor(f"y{k}", x, quantity) for k, x in enumerate(PLACES)]
+    plant = state_space(modes, [Actuator("h1", 0.37), Actuator("h2", 0.93)], sensors)
+    return modes, plant(2j * np.pi * F), tuple(Channel(s.name, quantity, at=s.at) for s in sensors)
+
+
+def noisy(h, seed, fraction=0.01):
+    rng = np.random.default_rng(seed)
+    std = fraction * np.abs(h).mean() * np.broadcast_to(1.0 + np.sin(F) ** 2, h.shape)
+    return h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape)), std
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
+def test_modes_of_the_band_whatever_lies_beyond(quantity):
+    modes, h, channels = beam(quantity)
+    errors = []
+    for seed in range(3):
+        measured, std = noisy(h, seed)
+        found = identify_transfer(measured, F, channels=channels, noise_std=std)
+        assert found.modes.n_modes == 3
+        assert np.diag(mac(found.modes.shapes, modes.phi(np.array(PLACES))[:, 1:4])).min() > 0.999
+        assert np.abs(found.fitted - h).max() < 0.02 * np.abs(h).max()
+        errors.append(np.r_[(found.modes.omega - modes.omega[1:4]) / found.omega_std])
+        errors.append((found.modes.zeta - 0.01) / found.zeta_std)
+        # participation of the two hammers goes as the shape where they strike
+        ratio = found.participation[:, 1] / found.participation[:, 0]
+        struck = modes.phi(np.array([0.37, 0.93]))[:, 1:4]
+        assert np.allclose(ratio, struck[1] / struck[0], rtol=0.05)
+    assert 0.3 < (np.array(errors) ** 2).mean() < 2.2
+
+
+def test_noise_told_in_any_unit_counts_between_lines_alone():
+    """Times a thousand it hid every mode."""
+    _, h, channels = beam("acceleration")
+    measured, std = (each[:, :1, ::4] for each in noisy(h, 0, 0.1))
+    told = [identify_transfer(measured, F[::4], channels=channels, noise_std=k * std) for k in (1e-3, 1.0, 1e3)]
+    assert told[1].modes.n_modes == 3
+    for other, k in ((told[0], 1e-3), (told[2], 1e3)):
+        assert np.allclose(other.modes.omega, told[1].modes.omega, rtol=1e-10)
+        assert np.allclose(other.omega_std, told[1].omega_std, rtol=1e-6)
+        assert np.allclose(k * other.misfit, told[1].misfit, rtol=1e-6)
+
+
+def test_errors_grow_where_what_is_left_is_louder():
+    """Noise ten times as loud about mode 3: by the bound of even noise its squared scores would average near 6."""
+    modes, h, channels = beam("acceleration")
+    h, scores = h[:, :1], []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        std = 0.002 * np.abs(h).mean() * np.where(np.abs(F - 9.8) < 2.0, 10.0, 1.0)
+        measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+        found = identify_transfer(measured, F, channels=channels, most_modes=4)
+        r = int(np.argmin(np.abs(found.modes.omega - modes.omega[2])))
+        scores.append((found.modes.omega[r] - modes.omega[2]) / found.omega_std[r])
+        scores.append((found.modes.zeta[r] - 0.01) / found.zeta_std[r])
+    assert 0.1 < np.mean(np.square(scores)) < 3.3  # χ² of 8, one chance in a thousand either way
+
+
+def test_noise_that_goes_with_the_size_needs_not_be_told():
+    """As if even it gave twenty modes too many, one beside another about each peak."""
+    modes, h, channels = beam("acceleration")
+    h, scores = h[:, :1, ::2], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        std = 0.02 * np.abs(h) + 1e-4 * np.abs(h).mean()
+        measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+        found = identify_transfer(measured, F[::2], channels=channels)
+        assert found.modes.n_modes == 3
+        scores += [(found.modes.omega - modes.omega[1:4]) / found.omega_std, (found.modes.zeta - 0.01) / found.zeta_std]
+    assert 0.27 < np.mean(np.square(scores)) < 2.35  # χ² of 18, one chance in a thousand either way
+    rms = np.sqrt((np.abs(measured - h) ** 2).mean(axis=(1, 2)) / 2.0)
+    assert np.allclose(found.misfit, rms, rtol=0.1)  # in the unit of the outputs
+
+
+def test_many_lines_are_fitted_band_after_band():
+    """The same cantilever on 2500 lines: what the bands say together, with modes at their edges found once."""
+    structure = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free")
+    modes, lines = structure.modes(8), np.linspace(1.0, 60.0, 2500)
+    modes = type(modes)(modes.omega, np.full(8, 0.01), modes.shapes, modes.length, modes.essential)
+    sensors = [Sensor(f"y{k}", x, "acceleration") for k, x in enumerate(PLACES)]
+    h = state_space(modes, [Actuator("h1", 0.37)], sensors)(2j * np.pi * lines)
+    rng = np.random.default_rng(0)
+    h = h + 0.01 * np.abs(h).mean() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+    channels = tuple(Channel(s.name, "acceleration", at=s.at) for s in sensors)
+    found = identify_transfer(h, lines, channels=channels)
+    inside = modes.frequencies_hz[(modes.frequencies_hz > 1.0) & (modes.frequencies_hz < 60.0)]
+    rings = np.flatnonzero(found.modes.zeta < 0.05)
+    assert found.fitted.shape == (4, 1, 2500) and found.frequencies_hz.size == 2500
+    assert rings.size == inside.size
+    assert np.abs((found.modes.frequencies_hz[rings] - inside) / (found.omega_std[rings] / 2 / np.pi)).max() < 4.0
+    assert found.covariance.shape == (2 * found.modes.n_modes,) * 2
+
+
+def one_by_one(rng, n=10):
+    """Inertance of three modes, each point on a structure changed by 0.2 % in frequency and 20 % in damping."""
+    lines = np.arange(20.0, 260.0, 0.6)
+    s, h = 2j * np.pi * lines, np.zeros((n, lines.size), complex)
+    shapes = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(5)
+    shapes = shapes.phi(np.linspace(0.0, 1.0, n))[:, 2:]
+    for j in range(n):
+        omega = 2.0 * np.pi * CROWDED_HZ * (1.0 + 2e-3 * rng.standard_normal(3))
+        zeta = np.array([0.010, 0.006, 0.005]) * np.exp(0.2 * rng.standard_normal(3))
+        for r in range(3):
+            h[j] += s**2 * shapes[j, r] * shapes[-1, r] / (s**2 + 2.0 * zeta[r] * omega[r] * s + omega[r] ** 2)
+    return lines, h + 2e-3 * np.abs(h) * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+
+
+CROWDED_HZ = np.array([39.4, 108.6, 212.9])
+
+
+def test_points_that_disagree_make_one_mode_of_a_crowd():
+    """Modes that all points share took up the disagreement, by three to five beside each other."""
+    lines, h = one_by_one(np.random.default_rng(1))
+    found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(10)))
+    assert found.modes.n_modes == 3
+    assert np.abs(found.modes.frequencies_hz / CROWDED_HZ - 1.0).max() < 3e-3
+    assert all(found.parts_hz)
+
+
+def test_close_modes_that_damping_couples_are_two():
+    """Their points swing far out of phase, yet two are no crowd: eigenvalues by numpy."""
+    omega, lines = 2.0 * np.pi * np.array([108.9, 110.5]), np.arange(90.0, 130.0, 0.2)
+    shapes = np.random.default_rng(0).standard_normal((8, 2))
+    c = np.diag(2.0 * np.array([0.006, 0.008]) * omega)
+    c[0, 1] = c[1, 0] = 0.9 * np.sqrt(c[0, 0] * c[1, 1])
+    s = 2j * np.pi * lines
+    inner = np.linalg.solve(s[:, None, None] ** 2 * np.eye(2) + s[:, None, None] * c + np.diag(omega**2), shapes[0])
+    h = s**2 * np.einsum("jr,kr->jk", shapes, inner)
+    rng = np.random.default_rng(1)
+    h = h + 2e-3 * np.abs(h).mean() * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
+    found = identify_transfer(h, lines, channels=tuple(Channel(f"p{j}", "acceleration") for j in range(8)))
+    poles = np.linalg.eigvals(np.block([[np.zeros((2, 2)), np.eye(2)], [-np.diag(omega**2), -c]]))
+    truth = np.sort(np.abs(poles[poles.imag > 0]))
+    assert found.modes.n_modes == 2 and not any(found.parts_hz)
+    assert np.abs(found.modes.omega - truth).max() < 4.0 * found.omega_std.max()
+    assert found.modes.phase_collinearity.min() < 0.8
+
+
+def test_noise_from_coherence():
+    """H1 of noisy averages against its own scatter over many trials."""
+    rng, averages, trials = np.random.default_rng(0), 40, 3000
+    u = rng.standard_normal((trials, averages)) + 1j * rng.standard_normal((trials, averages))
+    y = (2.0 - 1.0j) * u + 0.5 * (rng.standard_normal(u.shape) + 1j * rng.standard_normal(u.shape))
+    crossed, own, out = (y * u.conj()).sum(1), (np.abs(u) ** 2).sum(1), (np.abs(y) ** 2).sum(1)
+    h, squared = crossed / own, np.abs(crossed) ** 2 / (own * out)
+    assert coherence_noise(h, squared, averages=averages).mean() == pytest.approx(h.real.std(), rel=0.05)
+    with pytest.raises(ValueError, match="two averages"):
+        coherence_noise(h, squared, averages=1)
+
+
+def test_what_is_no_transfer_function_is_refused():
+    _, h, channels = beam("displacement")
+    with pytest.raises(ValueError, match="Is frequency the last axis"):
+        identify_transfer(h[:, 0].T, F, channels=channels)
+    with pytest.raises(ValueError, match="0 lines lie between 90 and 95 Hz"):
+        identify_transfer(h, F, channels=channels, band_hz=(90, 95))
+    with pytest.raises(ValueError, match="noise_std must be positive"):
+        identify_transfer(h, F, channels=channels, noise_std=np.zeros(h.shape))
+
+
+@pytest.mark.skipif(not RULER.is_file(), reason=f"the measured ruler is not at {RULER}")
+def test_the_measured_ruler():
+    """Frequencies seen by eye; points measured one after another disagree, and no mode more is told for it."""
+    transfer = loadmat(RULER)["yspec"].T
+    lines = np.linspace(0.0, 10_000.0, transfer.shape[1])
+    places = np.linspace(0.003, 0.983, 10)
+    channels = tuple(Channel(f"point {k}", "acceleration", at=float(x)) for k, x in enumerate(places))
+    rings = identify_transfer(transfer, lines, channels=channels, band_hz=(25.0, 800.0)).modes
+    seen = np.array([39.4, 108.8, 212.0, 352.6, 517.9, 551.0, 729.0])
+    assert rings.n_modes == seen.size
+    assert np.abs(rings.frequencies_hz / seen - 1).max() < 0.005
+    free = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(6)
+    assert np.diag(mac(rings.shapes[:, :4], free.phi(places)[:, 2:6])).min() > 0.95

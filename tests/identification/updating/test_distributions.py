@@ -1,0 +1,151 @@
+import numpy as np
+import pytest
+
+from workbench.identification.updating.distributions import Basis, mass_and_stiffness
+from workbench.identification.updating.self_check import choose_terms, self_check
+from workbench.structure.member import Bar, Beam
+
+X = np.linspace(0.0, 2.0, 81)
+
+
+def mass(x):
+    return 1.0 + 0.3 * x
+
+
+def stiffness(x):
+    return 3.0 - 0.5 * x + 0.2 * x**2
+
+
+@pytest.fixture(
+    scope="module", params=[("beam", "free", "free", 2), ("beam", "clamped", "hinged", 0), ("bar", "fixed", "free", 0)]
+)
+def case(request):
+    """Kind, ends, and six elastic modes of a structure with these distributions."""
+    kind, left, right, first = request.param
+    build = {"beam": Beam, "bar": Bar}[kind]
+    name = {"beam": "bending_stiffness", "bar": "axial_stiffness"}[kind]
+    structure = build(length=2.0, mass_per_length=mass, left=left, right=right, **{name: stiffness})
+    ends = {"kind": kind, "left": left, "right": right, "first_mode": first}
+    return ends, structure.modes(first + 6).select(slice(first, None))
+
+
+@pytest.mark.parametrize("known", [[(1.0, 1.3)], [(0.0, 1.0), (2.0, 1.6)]])
+def test_exact_modes_give_exact_distributions(case, known):
+    ends, modes = case
+    found = mass_and_stiffness(
+        modes,
+        kind=ends["kind"],
+        mass_basis=Basis.polynomial(3),
+        stiffness_basis=Basis.polynomial(4),
+        known_mass=known,
+    )
+    assert np.allclose(found.mass.coefficients, [1, 0.3, 0], atol=1e-9)
+    assert np.allclose(found.stiffness.coefficients, [3, -0.5, 0.2, 0], atol=1e-9)
+    assert np.allclose(found.scales, 1.0, atol=1e-9)
+    assert found.mass.misfit < 1e-10
+    assert self_check(found, modes, **ends).worst < 1e-9
+
+
+def test_scale_of_the_modes_does_not_matter(case):
+    from dataclasses import replace
+
+    ends, modes = case
+    factors = np.array([3.0, -0.2, 1.0, 7.0, 0.5, -1.0])
+    scaled = replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * factors)
+    found = mass_and_stiffness(
+        scaled,
+        kind=ends["kind"],
+        mass_basis=Basis.polynomial(2),
+        stiffness_basis=Basis.polynomial(3),
+        known_mass=[(1.0, 1.3)],
+    )
+    assert np.allclose(found.stiffness(X), stiffness(X), rtol=1e-9)
+    assert np.allclose(found.scales, np.abs(factors), rtol=1e-9)
+
+
+def test_prior_estimate_is_corrected(case):
+    """A right prior needs no series; a wrong one is mended by it (4.20-4.24)."""
+    ends, modes = case
+    options = {"kind": ends["kind"], "known_mass": [(1.0, 1.3)]}
+    right = mass_and_stiffness(
+        modes,
+        mass_basis=Basis.polynomial(1),
+        stiffness_basis=Basis.polynomial(1),
+        prior_mass=mass,
+        prior_stiffness=stiffness,
+        **options,
+    )
+    assert np.abs(right.mass.coefficients).max() < 1e-9
+    assert np.abs(right.stiffness.coefficients).max() < 1e-8
+    mended = mass_and_stiffness(
+        modes,
+        mass_basis=Basis.polynomial(2),
+        stiffness_basis=Basis.polynomial(3),
+        prior_mass=2.0,
+        prior_stiffness=lambda x: 1.0 + x,
+        **options,
+    )
+    assert np.allclose(mended.mass(X), mass(X), rtol=1e-9)
+    assert np.allclose(mended.stiffness(X), stiffness(X), rtol=1e-9)
+
+
+def test_local_functions(case):
+    ends, modes = case
+    splines = {"length": 2.0, "degree": 2}
+    found = mass_and_stiffness(
+        modes,
+        kind=ends["kind"],
+        mass_basis=Basis.splines(4, **splines),
+        stiffness_basis=Basis.splines(5, **splines),
+        known_mass=[(1.0, 1.3)],
+    )
+    assert np.allclose(found.mass(X), mass(X), rtol=1e-8)
+    assert np.allclose(found.stiffness(X), stiffness(X), rtol=1e-8)
+
+
+def test_terms_chosen_by_the_self_check(case):
+    ends, modes = case
+    identified = choose_terms(modes, known_mass=[(1.0, 1.3)], terms=range(1, 5), **ends)
+    assert identified.n_terms == (2, 3)
+    assert identified.check.worst < 1e-9
+    assert identified.check.mac.min() > 1 - 1e-9
+
+
+def test_self_check_tells_a_wrong_answer(case):
+    """Two terms cannot hold this stiffness; the identified structure then has other frequencies."""
+    ends, modes = case
+    found = mass_and_stiffness(
+        modes,
+        kind=ends["kind"],
+        mass_basis=Basis.polynomial(1),
+        stiffness_basis=Basis.polynomial(1),
+        known_mass=[(1.0, 1.3)],
+    )
+    assert self_check(found, modes, **ends).worst > 1e-3
+    nowhere = mass_and_stiffness(
+        modes,
+        kind=ends["kind"],
+        mass_basis=Basis.polynomial(1),
+        stiffness_basis=Basis.polynomial(2),
+        known_mass=[(1.0, 1.3)],
+        prior_stiffness=lambda x: -50.0 * np.cos(9 * x),
+    )
+    assert "must be positive" in self_check(nowhere, modes, **ends).refusal
+
+
+def test_refusals(case):
+    ends, modes = case
+    kind = ends["kind"]
+    one = {"mass_basis": Basis.polynomial(1), "stiffness_basis": Basis.polynomial(1)}
+    with pytest.raises(ValueError, match="give the mass at one point"):
+        mass_and_stiffness(modes, kind=kind, known_mass=[], **one)
+    with pytest.raises(ValueError, match="use more terms or fewer known places"):
+        mass_and_stiffness(modes, kind=kind, known_mass=[(0.0, 1.0), (2.0, 1.6)], **one)
+    with pytest.raises(ValueError, match="use more modes or fewer terms"):
+        mass_and_stiffness(
+            modes.select([0]),
+            kind=kind,
+            mass_basis=Basis.polynomial(1),
+            stiffness_basis=Basis.polynomial(2),
+            known_mass=[(1.0, 1.3)],
+        )

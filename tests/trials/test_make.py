@@ -1,0 +1,226 @@
+"""Blind trials: what is made is what the label says, the labels are out of reach, and scores count rightly."""
+
+import json
+import tempfile
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from workbench.cases.case import Case, KnownPlaces, read_case
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Bar
+from workbench.structure.modes import Modes
+from workbench.trials.hold import hold_trials
+from workbench.trials.make import KINDS, OUTSIDE_KINDS, draw_kinds, make_trial, write_trials
+from workbench.trials.scoring import score, tally
+
+QUICK = (
+    ("clearance",),
+    ("coulomb_friction",),
+    ("truncated_modes",),
+    ("stiffness_drift", "sensor_gain"),
+    (),
+)
+BY_NAME = {kind.name: kind for kind in CATALOGUE}
+
+
+def _effect(told: dict) -> Effect:
+    """The catalogue's own effect with the numbers of a label."""
+    values = {name: value for name, value in told.items() if name not in ("kind", "input", "output")}
+    target = told.get("input", told.get("output"))
+    if told["kind"] == "support_rotation":
+        target = "left" if values.pop("at") == 0 else "right"
+    if told["kind"] == "truncated_modes":
+        target, values = values["needed"], {}
+    return Effect(BY_NAME[told["kind"]], target, values)
+
+
+def _check_against_predictor(kinds: tuple[str, ...], seed: int) -> None:
+    """The predictor of the diagnosis, given what the label tells, leaves what the truth itself leaves: the noise."""
+    case, label = make_trial(seed, kinds=kinds)
+    told = [e for e in label["effects"] if e["kind"] != "none"]
+    assert sorted(e["kind"] for e in told) == sorted(kinds)
+    rig = apply_all(case.rig, [_effect(e) for e in told])
+    for record in (*case.fit, *case.validation):
+        figures = label["records"][record.name]
+        for one, name in ((case.rig, "gap"), (rig, "true_model")):
+            predicted = simulate(one, record.inputs, sample_time=record.sample_time, substeps=16).outputs
+            spread = record.outputs.std(axis=1, keepdims=True)
+            gap = np.sqrt(np.mean(((record.outputs - predicted) / spread) ** 2))
+            assert gap == pytest.approx(figures[name], rel=0.03), (record.name, name)
+        if "sensor_quantisation" not in kinds and "sensor_clipping" not in kinds:
+            assert figures["true_model"] == pytest.approx(figures["noise_floor"], rel=0.05)
+    if kinds and "sensor_quantisation" not in kinds:
+        assert max(f["gap"] / f["noise_floor"] for f in label["records"].values()) > 2.0
+
+
+@pytest.mark.parametrize("kinds", QUICK, ids=lambda kinds: "+".join(kinds) or "none")
+def test_two_numerical_routes_tell_the_same_story(kinds):
+    _check_against_predictor(kinds, seed=11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "random_disturbance"])
+@pytest.mark.parametrize("seed", [21, 22])
+def test_two_numerical_routes_tell_the_same_story_of_every_kind(kind, seed):
+    _check_against_predictor((kind,), seed)
+
+
+def test_a_random_disturbance_is_another_one_in_every_record():
+    case, label = make_trial(5, kinds=("random_disturbance",))
+    for figures in label["records"].values():
+        assert figures["true_model"] == pytest.approx(figures["gap"], rel=1e-6)
+    assert any(figures["gap"] > 2.0 * figures["noise_floor"] for figures in label["records"].values())
+    left = [r.outputs[0] - simulate(case.rig, r.inputs, sample_time=r.sample_time).outputs[0] for r in case.fit[:3]]
+    correlation = np.corrcoef(left)
+    assert np.abs(correlation - np.eye(3)).max() < 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", OUTSIDE_KINDS)
+def test_what_is_outside_the_vocabulary_is_labelled_unknown(kind):
+    _, label = make_trial(7, kinds=(kind,))
+    assert label["effects"] == [{"kind": "unknown", "outside": kind}]
+    assert max(f["gap"] / f["noise_floor"] for f in label["records"].values()) > 2.0
+
+
+def test_a_seed_makes_a_case():
+    first, again, other = (make_trial(seed, kinds=("sensor_bias",)) for seed in (3, 3, 4))
+    assert first[1] == again[1] != other[1]
+    np.testing.assert_array_equal(first[0].fit[0].outputs, again[0].fit[0].outputs)
+
+
+ON_MODAL_DATA = ("point_mass", "cubic_spring", "actuator_gain", "sensor_misplacement", "modulus_error")
+
+
+@pytest.mark.parametrize("kind", ON_MODAL_DATA)
+def test_trials_on_plain_modal_data_use_its_levels_and_places(kind):
+    rng = np.random.default_rng(1)
+    shapes = KnownPlaces(("F1", "F2", "d1", "d2", "d3"), rng.standard_normal((5, 3)))
+    modes = Modes(omega=np.array([3.0, 7.0, 16.0]), damping=np.full(3, 0.01), shapes=shapes, length=4.0)
+    sensors = tuple(Sensor(f"d{i + 1}", 2.0 + i, noise_std=2e-4) for i in range(3))
+    rig = Rig(modes, (Actuator("F1", 0.0), Actuator("F2", 1.0)), sensors)
+    inputs = 0.3 * rng.standard_normal((2, 600))
+    mine = Case("mine", rig, (simulate(rig, inputs, sample_time=0.05, name="high"),), ())
+    case, label = make_trial(6, kinds=(kind,), like=mine)
+    (told,) = label["effects"]
+    assert told.get("at", 0.0) in (0.0, 1.0, 2.0, 3.0, 4.0)
+    high = next(r for r in case.fit if r.name == "high")
+    np.testing.assert_allclose(np.sqrt(np.mean(high.inputs**2, axis=1)), np.sqrt(np.mean(inputs**2, axis=1)).max())
+    assert high.sample_time == 0.05 and [s.noise_std for s in case.rig.sensors] == [2e-4] * 3
+    rig = apply_all(case.rig, [_effect(told)])
+    predicted = simulate(rig, high.inputs, sample_time=0.05, substeps=16).outputs
+    assert np.sqrt(np.mean((high.outputs - predicted) ** 2)) == pytest.approx(2e-4, rel=0.05)
+
+
+def test_an_unknown_kind_is_refused():
+    with pytest.raises(ValueError, match="gremlin"):
+        make_trial(1, kinds=("gremlin",))
+
+
+def test_a_bench_that_cannot_show_a_kind_says_so():
+    damping = ModalDamping(0.01)
+    rod = Bar(length=1.0, mass_per_length=1.0, axial_stiffness=1.0, left="fixed", right="free", damping=damping)
+    sensors = (Sensor("d1", 1.0, noise_std=1e-3),)
+    rig = Rig(rod.modes(4), (Actuator("F1", 0.4), Actuator("F2", 0.9)), sensors, structure=rod)
+    inputs = np.random.default_rng(0).standard_normal((2, 500))
+    like = Case("rod", rig, (simulate(rig, inputs, sample_time=0.05, name="high"),), ())
+    with pytest.raises(ValueError, match="axial_load came about on this bench"):
+        make_trial(2, kinds=("axial_load",), like=like)
+
+
+def test_of_sixty_forty_hide_one_ten_a_pair_five_none_five_something_else():
+    drawn = draw_kinds(60, 1)
+    sizes = Counter("outside" if set(k) & set(OUTSIDE_KINDS) else len(k) for k in drawn)
+    assert sizes == {1: 40, 2: 10, 0: 5, "outside": 5}
+    assert {k for kinds in drawn if len(kinds) == 1 for k in kinds} >= set(KINDS), "every kind stands alone once"
+
+
+def test_labels_lie_outside_the_cases(tmp_path):
+    with pytest.raises(ValueError, match="seal them elsewhere"):
+        write_trials(tmp_path / "cases", tmp_path / "cases" / "labels.json", 1, 1)
+    write_trials(tmp_path / "cases", tmp_path / "labels.json", 2, 1, kinds=[(), ("sensor_gain",)])
+    labels = json.loads((tmp_path / "labels.json").read_text(encoding="utf-8"))
+    assert [e["kind"] for e in labels["case-002"]["effects"]] == ["sensor_gain"]
+    for folder in (tmp_path / "cases").iterdir():
+        written = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+        assert written <= {"case.toml", *(f"records/{r}.npz" for r in labels[folder.name]["records"])}
+        assert "sensor_gain" not in (folder / "case.toml").read_text(encoding="utf-8")
+        case = read_case(folder)
+        assert {r.name for r in (*case.fit, *case.validation)} == set(labels[folder.name]["records"])
+        assert [r.name for r in case.validation] == ["validate"]
+
+
+def test_the_labels_are_gone_from_the_disk_when_a_diagnosis_runs(tmp_path, monkeypatch):
+    vault, seen = tmp_path, []
+    monkeypatch.setattr(tempfile, "tempdir", str(vault))
+
+    def guess(folder):
+        seen.append(folder)
+        assert all(p.suffix in (".toml", ".npz") for p in folder.parent.rglob("*") if p.is_file())
+        assert not list(vault.rglob("labels.json")), "labels are in reach of the diagnosis"
+        return {"effects": [{"kind": "sensor_gain", "output": "nobody", "parameters": {}}], "shrinkage": {}}
+
+    held = hold_trials(2, 4, kinds=[("sensor_gain",), ()], diagnose_case=guess)
+    assert len(seen) == 2
+    assert held.tally.shares == {"single": (1, 1), "none": (0, 1)}
+    assert held.scores["case-001"]["kinds"] and not held.scores["case-001"]["channels"]
+
+
+# --- scores
+
+
+def test_scores_count_kinds_channels_and_places():
+    label = {"effects": [{"kind": "point_mass", "at": 3.0}, {"kind": "sensor_gain", "output": 1, "gain": 2.0}]}
+    verdict = {
+        "effects": [{"kind": "sensor_gain", "output": "d2", "parameters": {}}, {"kind": "point_mass", "at": 3.15}],
+        "shrinkage": {"validate": 0.99, "ci95": [0.9, 1.0]},
+    }
+    found = score(verdict, label, length=10.0, outputs=("d1", "d2"))
+    assert found["family"] == "pair" and found["kinds"] and found["channels"] and found["positions"]
+    assert found["position_errors"] == [pytest.approx(0.015)] and found["shrinkage"] == {"validate": 0.99}
+    assert not score(verdict, label, length=10.0, outputs=("d2", "d1"))["channels"]
+    assert not score(verdict, label, length=5.0, outputs=("d1", "d2"))["positions"]
+    wrong = score({"effects": verdict["effects"][:1]}, label, length=10.0)
+    assert not wrong["kinds"] and wrong["channels"] is None and wrong["positions"] is None
+
+
+def test_two_of_a_kind_are_matched_by_their_places():
+    label = {"effects": [{"kind": "point_mass", "at": 2.0}, {"kind": "point_mass", "at": 8.0}]}
+    verdict = {"effects": [{"kind": "point_mass", "at": 8.1}, {"kind": "point_mass", "at": 2.0}]}
+    assert sorted(score(verdict, label, length=10.0)["position_errors"]) == [0.0, pytest.approx(0.01)]
+
+
+def test_silence_is_right_only_where_nothing_hides():
+    none, bias = {"effects": [{"kind": "none"}]}, {"effects": [{"kind": "sensor_bias", "output": "d1"}]}
+    unknown = {"effects": [{"kind": "unknown", "outside": "magnet"}]}
+    silent, baffled = {"effects": []}, {"effects": [{"kind": "unknown"}]}
+    cases = [(silent, none), (silent, bias), (baffled, unknown), (baffled, bias), (silent, unknown)]
+    scores = [score(verdict, label, length=1.0) for verdict, label in cases]
+    assert [s["kinds"] for s in scores] == [True, False, True, False, False]
+    counted = tally(scores)
+    assert counted.shares == {"single": (0, 2), "none": (1, 1), "unknown": (1, 2)}
+    assert counted.counts["sensor_bias", "none"] == 1 and counted.counts["none", "none"] == 1
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        [("point_damper",), (), ("sensor_gain",)],
+        pytest.param(
+            [("actuator_saturation",), ("ground_spring", "sensor_lag"), ("cross_talk",)], marks=pytest.mark.slow
+        ),
+    ],
+    ids=["single and none", "saturation, pair and outside"],
+)
+def test_a_small_blind_trial_is_passed(kinds):
+    held = hold_trials(len(kinds), 314, kinds=kinds)
+    assert all(s["kinds"] for s in held.scores.values()), held.tally.counts
+    assert held.tally.misplaced == 0

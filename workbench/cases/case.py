@@ -1,0 +1,296 @@
+"""A case folder: a nominal model, and records measured on the real structure."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from workbench.cases.tables import CaseError, check_keys, count, number, numbers, profile, shown, table_of, tables, text
+from workbench.records.file_error import RecordFileError
+from workbench.records.limits import check_size
+from workbench.records.npz_file import arrays as load_arrays
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Bar, Beam, Structure
+from workbench.structure.modes import Modes
+
+MOST_SAMPLES = 5_000_000
+LEAST_SAMPLES = 16
+MOST_MODES = 200
+
+# What each table may hold; a key beside these is a misspelt one.
+TABLES = ("title", "structure", "input", "output", "record")
+MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
+STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
+MODAL = ("kind", "natural_frequencies_hz", "damping_ratios")
+SINGLE = ("kind", "mass", "damping", "stiffness")
+INPUT, OUTPUT, RECORD = ("name", "kind"), ("name", "quantity", "noise_std"), ("name", "file", "sample_time", "use")
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """What a user has in hand when a simulation and a test disagree.
+
+    Attributes:
+        name: of the folder.
+        rig: nominal.
+        fit: records that may be fitted.
+        validation: records only for measuring how far the gap shrank.
+    """
+
+    name: str
+    rig: Rig
+    fit: tuple[Record, ...]
+    validation: tuple[Record, ...]
+
+
+class KnownPlaces:
+    """Shapes known only at named inputs and outputs; place i stands at position i.
+
+    Attributes:
+        names: (n_places,) of the inputs, then of the outputs.
+        places: (n_places,) 0, 1, 2, ...
+    """
+
+    def __init__(self, names: tuple[str, ...], values: np.ndarray):
+        self.names, self.values = names, values
+        self.places = np.arange(len(names), dtype=float)
+
+    def __call__(self, x: np.ndarray, derivative: int) -> np.ndarray:
+        if derivative:
+            raise ValueError("plain modal data tell no slopes; describe the structure as a beam or a rod instead")
+        return self.values[np.clip(np.round(x).astype(int), 0, len(self.names) - 1)]
+
+
+def read_case(folder: str | Path) -> Case:
+    """Read a case folder: case.toml and its records.
+
+    Raises:
+        CaseError: naming the file, the key or channel, the value, and what would be right.
+    """
+    folder = Path(folder)
+    path = folder / "case.toml"
+    if not folder.is_dir():
+        raise CaseError(f"{folder} is not a folder; a case is a folder with case.toml and records")
+    if not path.is_file():
+        raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
+    table = table_of(path)
+    rig = _rig(table, path)
+    records = [(_read_record(folder, entry, rig, path), _use(entry, path)) for entry in tables(table, "record", path)]
+    fit = tuple(record for record, use in records if use == "fit")
+    if not fit:
+        raise CaseError(f'{path}: no record has use = "fit"; a diagnosis needs at least one')
+    return Case(
+        name=folder.resolve().name,
+        rig=rig,
+        fit=fit,
+        validation=tuple(record for record, use in records if use == "validate"),
+    )
+
+
+def read_rig(path: str | Path) -> Rig:
+    """A rig from a TOML file with [structure], [[input]] and [[output]], as a case has; records are not looked at.
+
+    Raises:
+        CaseError: naming the file, the key, the value, and what would be right.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CaseError(f"{path}: there is no such file")
+    return _rig(table_of(path), path)
+
+
+def _rig(table: dict, path: Path) -> Rig:
+    check_keys(table, TABLES, str(path))
+    inputs, outputs = tables(table, "input", path), tables(table, "output", path)
+    names = [entry["name"] for entry in (*inputs, *outputs)]
+    for name in names:
+        if name == "t" or names.count(name) > 1:
+            raise CaseError(f"{path}: an input or output is called {name!r}, as is another or the time; rename it")
+    structure = table.get("structure")
+    if not isinstance(structure, dict):
+        raise CaseError(f"{path}: the table [structure] is missing")
+    build = _modal_rig if structure.get("kind") == "modal" else _member_rig
+    try:
+        return build(structure, inputs, outputs)
+    except (ValueError, TypeError, ArithmeticError) as error:
+        raise CaseError(f"{path}: {error}") from error
+
+
+# --- rigs
+
+
+def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+    kind = table.get("kind")
+    if not isinstance(kind, str) or kind not in STRUCTURES:
+        raise CaseError(f"[structure]: kind is beam, rod or modal; got {shown(kind)}")
+    check_keys(table, STRUCTURES[kind], "[structure]")
+    _check_ports(inputs, outputs, "at")
+    common: dict[str, Any] = {
+        "length": number(table, "length", "[structure]"),
+        "mass_per_length": profile(table, "mass_per_length"),
+        "left": text(table, "left", "[structure]"),
+        "right": text(table, "right", "[structure]"),
+        "damping": ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
+    }
+    structure: Structure
+    if kind == "beam":
+        structure = Beam(
+            bending_stiffness=profile(table, "bending_stiffness"),
+            tension=number(table, "tension", "[structure]") if "tension" in table else 0.0,
+            **common,
+        )
+    else:
+        structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
+    modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
+    actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]")) for e in inputs)
+    sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]")) for e in outputs)
+    return Rig(modes, actuators, sensors, structure=structure)
+
+
+def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+    """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
+    single = "mass" in table
+    check_keys(table, SINGLE if single else MODAL, "[structure]")
+    _check_ports(inputs, outputs, "shape")
+    if single:
+        mass = number(table, "mass", "[structure]", low=1e-300)
+        stiffness = number(table, "stiffness", "[structure]", low=0.0)
+        omega = np.array([np.sqrt(stiffness / mass)])
+        damping = np.array([[number(table, "damping", "[structure]", low=0.0) / mass]])
+        shape = np.array([1.0 / np.sqrt(mass)])
+        for entry in (*inputs, *outputs):
+            if entry.get("shape", [1.0]) != [1.0]:
+                raise CaseError(f"{entry['name']!r}: the shape of a single degree of freedom is [1.0]; leave it out")
+        values = np.tile(shape, (len(inputs) + len(outputs), 1))
+    else:
+        omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
+        damping = numbers(table, "damping_ratios", "[structure]", omega.size)
+        values = np.array(
+            [
+                numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
+                for key, entries in (("[[input]]", inputs), ("[[output]]", outputs))
+                for e in entries
+            ]
+        )
+    names = tuple(e["name"] for e in (*inputs, *outputs))
+    shapes = KnownPlaces(names, values)
+    modes = Modes(omega=omega, damping=damping, shapes=shapes, length=float(max(len(names) - 1, 1)))
+    actuators = tuple(_actuator(e, float(i)) for i, e in enumerate(inputs))
+    sensors = tuple(_sensor(e, float(i + len(inputs))) for i, e in enumerate(outputs))
+    return Rig(modes, actuators, sensors)
+
+
+def _check_ports(inputs: list[dict], outputs: list[dict], *places: str) -> None:
+    for key, entries, keys in (("input", inputs, INPUT), ("output", outputs, OUTPUT)):
+        for entry in entries:
+            check_keys(entry, (*keys, *places), f"[[{key}]] {entry['name']!r}")
+
+
+def _place(entry: dict, length: float, where: str) -> float:
+    at = number(entry, "at", f"{where} {entry['name']!r}")
+    if not 0 <= at <= length:
+        raise CaseError(f"{where} {entry['name']!r}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
+    return at
+
+
+def _actuator(entry: dict, at: float) -> Actuator:
+    kind = entry.get("kind")
+    if kind not in ("actuator", "hammer"):
+        raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {shown(kind)}")
+    return Actuator(entry["name"], at, direct=kind == "hammer")
+
+
+def _sensor(entry: dict, at: float) -> Sensor:
+    where = f"[[output]] {entry['name']!r}"
+    quantity = entry.get("quantity")
+    if quantity not in MEASURED:
+        raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {shown(quantity)}")
+    noise = number(entry, "noise_std", where, low=0.0)
+    if noise == 0:
+        raise CaseError(f"{where}: noise_std must be positive; the diagnosis weighs every residual by it")
+    return Sensor(entry["name"], at, quantity, noise_std=noise)
+
+
+# --- records
+
+
+def _use(entry: dict, path: Path) -> str:
+    if entry.get("use") not in ("fit", "validate"):
+        raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {shown(entry.get('use'))}")
+    return entry["use"]
+
+
+def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
+    name = entry["name"]
+    where = f"{path}: record {name!r}"
+    check_keys(entry, RECORD, where)
+    sample_time = number(entry, "sample_time", where)
+    if sample_time <= 0:
+        raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
+    try:
+        file = (folder / text(entry, "file", where)).resolve()
+    except (OSError, RuntimeError) as error:  # links that go in a circle
+        raise CaseError(f"{where}: file {entry['file']!r} cannot be found: {error}") from error
+    if not file.is_relative_to(folder.resolve()):
+        raise CaseError(f"{where}: file {entry['file']!r} lies outside the case folder")
+    arrays = _arrays(file, where)
+    names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
+    missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})
+    if missing:
+        raise CaseError(f"{file}: channel {missing[0]!r} of case.toml is missing; it holds {shown(sorted(arrays))}")
+    if extra:
+        raise CaseError(f"{file}: channel {shown(extra[0])} is not named in case.toml; name it there or leave it out")
+    if "t" not in arrays:
+        raise CaseError(f"{file}: the array t of sample instants is missing")
+    n_samples = arrays["t"].size
+    for channel, values in arrays.items():
+        if values.shape != (n_samples,):
+            raise CaseError(f"{file}: channel {channel!r} has shape {values.shape}; t has {n_samples} samples")
+        bad = ~np.isfinite(values)
+        if bad.any():
+            raise CaseError(f"{file}: channel {channel!r}, sample {int(np.argmax(bad))} is {values[bad][0]}")
+    steps = np.diff(arrays["t"])
+    if n_samples < LEAST_SAMPLES or np.abs(steps - sample_time).max() > 0.01 * sample_time:
+        raise CaseError(
+            f"{file}: t must rise by sample_time = {sample_time:g} over at least {LEAST_SAMPLES} samples;"
+            f" it has {n_samples} and steps from {steps.min() if steps.size else np.nan:g} to"
+            f" {steps.max() if steps.size else np.nan:g}"
+        )
+    elastic = rig.modes.omega[rig.modes.omega > 0]
+    if elastic.size and n_samples * sample_time < 2.0 * np.pi / elastic[0]:
+        raise CaseError(
+            f"{file} lasts {n_samples * sample_time:g} s, less than a period of the first mode"
+            f" ({2.0 * np.pi / elastic[0]:g} s); take a longer record"
+        )
+    for sensor in rig.sensors:
+        if np.ptp(arrays[sensor.name]) == 0:
+            raise CaseError(
+                f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?"
+            )
+    return Record(
+        sample_time=sample_time,
+        outputs=np.array([arrays[s.name] for s in rig.sensors]),
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
+        inputs=np.array([arrays[a.name] for a in rig.actuators]),
+        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
+        name=name,
+    )
+
+
+def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
+    if not file.is_file():
+        raise CaseError(f"{where}: there is no file {file}")
+    try:
+        check_size(file)
+        arrays = load_arrays(file)
+    except RecordFileError as error:
+        raise CaseError(str(error)) from error
+    for name, values in arrays.items():
+        if values.dtype.kind not in "fiu" or values.size > MOST_SAMPLES:
+            raise CaseError(f"{file}: array {name!r} must hold at most {MOST_SAMPLES} real numbers")
+    return {name: values.astype(float) for name, values in arrays.items()}

@@ -1,0 +1,210 @@
+"""The closed loop of all modes, controlled and residual, propagated exactly."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg import expm
+
+from workbench.design.estimation.modal_filter import ModalFilter
+from workbench.design.laws.law import Law
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes, frozen
+
+UNSEEN = 1e-9
+WELL_CONDITIONED = 1e6
+RESONANT = 1e-6
+EVEN = 1e-15
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedLoop:
+    """x' = A x, x = (q, q') of every mode, then the states of an observer where there is one, forces u = -K x̂ in it.
+
+    Attributes:
+        modes: all of them.
+        law: that closes the loop.
+        matrix: (n_states, n_states) A, rad/s; n_states is 2 n_modes but for an observer's.
+        feedback: (n_actuators, n_states) from the state to the actuator forces, sign included.
+    """
+
+    modes: Modes
+    law: Law
+    matrix: np.ndarray
+    feedback: np.ndarray
+
+    @cached_property
+    def poles(self) -> np.ndarray:
+        """Closed-loop poles (n_states,), rad/s."""
+        return frozen(np.linalg.eigvals(self.matrix), complex)
+
+    @property
+    def stable(self) -> bool:
+        """Whether no pole is to the right of the axis (undamped residual modes sit on it)."""
+        return bool(self.poles.real.max() <= 1e-9 * max(np.abs(self.poles).max(), 1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """Modal motion and forces over time.
+
+    Attributes:
+        time: (n_times,) s.
+        modal: (2n, n_times) states (q, q').
+        forces: (n_actuators, n_times).
+        modes: whose shapes carry the motion.
+    """
+
+    time: np.ndarray
+    modal: np.ndarray
+    forces: np.ndarray
+    modes: Modes
+
+    def __post_init__(self) -> None:
+        for name in ("time", "modal", "forces"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def displacement(self, x) -> np.ndarray:
+        """w(x, t): (n_points, n_times)."""
+        return self.modes.phi(x) @ self.modal[: self.modes.n_modes]
+
+    @property
+    def energy(self) -> np.ndarray:
+        """Energy of each mode, (n_modes, n_times): ½ (q'² + ω² q²)."""
+        n = self.modes.n_modes
+        return 0.5 * (self.modal[n:] ** 2 + (self.modes.omega[:, None] * self.modal[:n]) ** 2)
+
+
+def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> ClosedLoop:
+    """The loop through exact modal coordinates, or through a modal filter of the controlled modes.
+
+    Args:
+        modes: all modes, controlled and residual.
+        filter_: rows are the controlled modes, in the law's order; rates are read through the same weights.
+
+    Raises:
+        ValueError: a filter of another number of modes, or one whose sensors cannot see a controlled mode.
+    """
+    n = modes.n_modes
+    if filter_ is None:
+        seen = np.zeros((law.n_controlled, n))
+        seen[np.arange(law.n_controlled), list(law.controlled)] = 1.0
+    else:
+        seen = filter_.seen(modes)
+        if seen.shape[0] != law.n_controlled:
+            raise ValueError(f"the filter gives {seen.shape[0]} modes; the law controls {law.n_controlled}")
+        strength = np.abs(seen[np.arange(law.n_controlled), list(law.controlled)])
+        if strength.min() < UNSEEN:
+            raise ValueError(
+                f"the filter's sensors at {', '.join(f'{x:g}' for x in filter_.positions)} cannot see mode"
+                f" {law.controlled[strength.argmin()] + 1}: they all stand at its nodes; move or add a sensor"
+            )
+    estimate = np.kron(np.eye(2), seen)
+    feedback = -law.gain @ estimate
+    b = input_matrix(modes, law.actuators)
+    open_loop = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]])
+    return ClosedLoop(modes, law, open_loop + np.vstack([np.zeros_like(b), b]) @ feedback, feedback)
+
+
+def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> np.ndarray:
+    """State (2n,) just after an impulse (N s) at x: q_r' = impulse φ_r(x) (5.58)."""
+    return np.r_[np.zeros(modes.n_modes), impulse * modes.phi(at)[0]]
+
+
+def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
+    """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
+
+    A state (2 n_modes,) of the modes alone starts an observer from zero. Through exact modal coordinates every instant
+    has a closed form; else uniform instants share one matrix exponential, and others cost one each.
+
+    Raises:
+        ValueError: times that do not increase from zero or later.
+    """
+    time = np.asarray(time, float)
+    if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
+        raise ValueError("times must increase, from zero or later")
+    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    modal = _cascade(loop, state, time)
+    if modal is None:
+        modal = _stepped(loop.matrix, state, time)
+    modal.flags.writeable = False  # a response of many modes fills the memory once, not twice
+    motion = modal if modal.shape[0] == 2 * loop.modes.n_modes else modal[: 2 * loop.modes.n_modes]
+    fed = np.flatnonzero(loop.feedback.any(axis=0))
+    return Response(time, motion, loop.feedback[:, fed] @ modal[fed], loop.modes)
+
+
+def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """e^{At} x0 (n_states, n_times), from instant to instant; even instants doubled up, x_{k+m} = (e^{Ah})^m x_k."""
+    modal = np.empty((state.size, time.size))
+    modal[:, 0] = expm(matrix * time[0]) @ state
+    steps = np.diff(time)
+    if steps.size and np.ptp(steps) <= 1e-12 * time[-1]:
+        step, known = expm(matrix * steps[0]), 1
+        while known < time.size:
+            more = min(known, time.size - known)
+            modal[:, known : known + more] = step @ modal[:, :more]
+            known += more
+            if known < time.size:
+                step = step @ step
+        return modal
+    for k in range(1, time.size):
+        modal[:, k] = expm(matrix * steps[k - 1]) @ modal[:, k - 1]
+    return modal
+
+
+def _cascade(loop: ClosedLoop, state: np.ndarray, time: np.ndarray) -> np.ndarray | None:
+    """The same in closed form where nothing residual is fed back: the controlled modes drive the others, one by one.
+
+    With z = q' - p* q of a residual mode, z' = p z + g and g = Σ_k g_k e^{λ_k t} of the controlled loop,
+    z = e^{pt} z0 + Σ_k g_k (e^{λ_k t} - e^{pt}) / (λ_k - p). None where the loop is not of this kind.
+    """
+    modes, n = loop.modes, loop.modes.n_modes
+    own = [*loop.law.controlled, *(n + r for r in loop.law.controlled)]
+    rest = np.setdiff1d(np.arange(n), loop.law.controlled)
+    c = np.diag(modes.damping)
+    others = np.setdiff1d(np.arange(loop.matrix.shape[0]), own)
+    apart = loop.matrix.shape[0] == 2 * n and modes.proportional and not loop.feedback[:, others].any()
+    if not apart or not (modes.omega[rest] > 0.5 * c[rest]).all():
+        return None
+    values, vectors = np.linalg.eig(loop.matrix[np.ix_(own, own)])
+    if not np.linalg.cond(vectors) < WELL_CONDITIONED:
+        return None
+    held = vectors * np.linalg.solve(vectors, state[own].astype(complex))
+    outer, inner = _halves(time)
+    left, right = np.exp(np.outer(outer, values)), np.exp(np.outer(values, inner))
+    modal = np.empty((2 * n, time.size))
+    for row, amplitudes in zip(own, held):
+        modal[row] = _added_up(amplitudes, left, right)[: time.size]
+    if not rest.size:
+        return modal
+    sigma, damped = 0.5 * c[rest], np.sqrt(modes.omega[rest] ** 2 - 0.25 * c[rest] ** 2)
+    pole = -sigma + 1j * damped
+    apart = values - pole[:, None]
+    if np.abs(apart).min() < RESONANT * np.abs(pole).max():
+        return None
+    driven = loop.matrix[np.ix_(n + rest, np.asarray(own))] @ held / apart
+    free = state[n + rest] + (sigma + 1j * damped) * state[rest] - driven.sum(axis=1)
+    # q = Im z / ω_d and q' = Im(p z) / ω_d
+    z = -1j * np.column_stack([driven, free]) / damped[:, None]
+    for r, p, amplitudes in zip(rest, pole, z):
+        factors = np.column_stack([left, np.exp(p * outer)]), np.vstack([right, np.exp(p * inner)])
+        modal[r] = _added_up(amplitudes, *factors)[: time.size]
+        modal[n + r] = _added_up(p * amplitudes, *factors)[: time.size]
+    return modal
+
+
+def _halves(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Instants (n_outer,), (n_inner,) whose sums, row by row, begin with `time`: √n_times of each where it is even."""
+    n = time.size
+    step = (time[-1] - time[0]) / max(n - 1, 1)
+    if np.abs(time - time[0] - step * np.arange(n)).max() > EVEN * time[-1]:
+        return time, np.zeros(1)
+    width = int(np.ceil(np.sqrt(n)))
+    return time[0] + step * width * np.arange(-(-n // width)), step * np.arange(width)
+
+
+def _added_up(amplitudes: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Re Σ_k a_k e^{λ_k (t_a + t_b)} at all instants, from factors (n_outer, n_poles) and (n_poles, n_inner)."""
+    scaled = left * amplitudes
+    return (np.hstack([scaled.real, -scaled.imag]) @ np.vstack([right.real, right.imag])).ravel()

@@ -1,0 +1,102 @@
+"""A controller as the full plant meets it: from the readings of sensors to the forces of actuators.
+
+    z' = A_z z + B_z y,   u = C_z z + D_z y,   y = R x
+
+A law through a modal filter has no state z; an observer has one. Both close the same loop.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.design.estimation.closed_loop import ClosedLoop, close_loop
+from workbench.design.estimation.modal_filter import ModalFilter
+from workbench.design.laws.law import Law
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.statespace import input_matrix, output_matrix
+from workbench.structure.modes import Modes, frozen
+
+
+@dataclass(frozen=True, eq=False)
+class Controller:
+    """A law with what it knows of the state.
+
+    Attributes:
+        law: whose forces it commands.
+        sensors: that it reads, one a channel: displacement, slope, velocity or angular velocity.
+        state: (n_states, n_states) A_z, 1/s; empty for a filter.
+        reads: (n_states, n_channels) B_z.
+        commands: (n_actuators, n_states) C_z.
+        direct: (n_actuators, n_channels) D_z.
+        name: for tables and plots.
+    """
+
+    law: Law
+    sensors: tuple[Sensor, ...]
+    state: np.ndarray
+    reads: np.ndarray
+    commands: np.ndarray
+    direct: np.ndarray
+    name: str
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sensors", tuple(self.sensors))
+        for name in ("state", "reads", "commands", "direct"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def places(self) -> tuple[float, ...]:
+        """Distinct places of the sensors, m, increasing."""
+        return tuple(sorted({sensor.at for sensor in self.sensors}))
+
+
+def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
+    """R (n_channels, 2 n_modes), from the state (q, q') to the readings.
+
+    Raises:
+        ValueError: an accelerometer, whose reading is not a function of the state alone.
+    """
+    for sensor in sensors:
+        if MEASURED[sensor.quantity][1] > 1:
+            raise ValueError(f"sensor {sensor.name} reads {sensor.quantity}; a controller here reads motion or rates")
+    shapes = output_matrix(modes, sensors)
+    rates = np.array([MEASURED[sensor.quantity][1] for sensor in sensors])[:, None]
+    return np.hstack([np.where(rates == 0, shapes, 0.0), np.where(rates == 1, shapes, 0.0)])
+
+
+def filtered(law: Law, filter_: ModalFilter) -> Controller:
+    """A law through a modal filter: displacements and velocities at its places, slopes and theirs where it has any."""
+    weights, kinds = [filter_.displacement], [("displacement", "velocity", "")]
+    if filter_.slope.size:
+        weights.append(filter_.slope)
+        kinds.append(("slope", "angular velocity", "s"))
+    n = law.n_controlled
+    columns, sensors = [], []
+    for order in (0, 1):
+        for weight, kind in zip(weights, kinds, strict=True):
+            columns.append(-law.gain[:, order * n : (order + 1) * n] @ weight)
+            sensors += [
+                Sensor(f"{'v' if order else 'y'}{kind[2]}{i + 1}", float(x), kind[order])
+                for i, x in enumerate(filter_.positions)
+            ]
+    m = len(law.actuators)
+    direct = np.hstack(columns)
+    empty = np.zeros((0, 0)), np.zeros((0, direct.shape[1])), np.zeros((m, 0))
+    return Controller(law, tuple(sensors), *empty, direct, f"{law.name} through a modal filter")
+
+
+def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
+    """The loop of all modes, controlled and residual, states (q, q', z); a law alone reads exact modal coordinates."""
+    if isinstance(controller, Law):
+        return close_loop(modes, controller)
+    n = modes.n_modes
+    b = input_matrix(modes, controller.law.actuators)
+    force = np.vstack([np.zeros_like(b), b])
+    r = reading(modes, controller.sensors)
+    plant = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]])
+    feedback = np.hstack([controller.direct @ r, controller.commands])
+    matrix = np.block(
+        [[plant + force @ controller.direct @ r, force @ controller.commands], [controller.reads @ r, controller.state]]
+    )
+    return ClosedLoop(modes, controller.law, matrix, feedback)

@@ -1,0 +1,98 @@
+"""Observers: the state of the controlled modes from the readings, by a model that knows nothing of the residual ones.
+
+    x̂' = (A - B K - L C) x̂ + L y,   u = -K x̂
+
+What the residual modes add to y is observation spillover (Balas, IEEE Trans. Automatic Control 23 (1978) 673).
+"""
+
+from collections.abc import Sequence
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.design.estimation.controller import Controller, reading
+from workbench.design.laws.coupled import controlled_plant
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.pole_assignment import assign
+from workbench.rig.sensors import Sensor
+from workbench.structure.modes import Modes
+
+UNSEEN = 1e-9
+
+
+def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: ArrayLike) -> Controller:
+    """The law on the state of a Luenberger observer.
+
+    Args:
+        modes: at hand; the observer knows the controlled ones.
+        law: u = -K x on those.
+        sensors: displacement, slope, velocity or angular velocity; one will do.
+        poles: (n_controlled,) of the observer's error, one of each conjugate pair a mode, rad/s.
+
+    Raises:
+        DesignError: a mode that no sensor sees, or poles that these sensors cannot place.
+    """
+    a, b, c = _plant(modes, law, sensors)
+    n = law.n_controlled
+    names = [f"mode {r + 1} of the observer" for r in law.controlled]
+    # along (q_r, q_r' = λ q_r) the readings see mode r with c_q + λ c_v
+    seen = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
+    gain = assign(a.T, c.T, poles, seen.conj(), names).T
+    return _controller(law, sensors, a, b, c, gain, "Luenberger observer")
+
+
+def kalman(
+    modes: Modes, law: Law, sensors: Sequence[Sensor], *, disturbance: ArrayLike, noise: ArrayLike
+) -> Controller:
+    """The law on the state of a steady Kalman filter (python-control's `lqe`).
+
+    Args:
+        modes, law, sensors: as for `luenberger`.
+        disturbance: intensity of white modal forces, scalar, (n_controlled,) or (n_controlled, n_controlled).
+        noise: intensity of the readings' white noise, scalar, (n_channels,) or (n_channels, n_channels); positive.
+
+    Raises:
+        DesignError: a mode that no sensor sees, intensities that are not positive.
+    """
+    a, b, c = _plant(modes, law, sensors)
+    n = law.n_controlled
+    push = _intensity(disturbance, n, "disturbance")
+    spread = _intensity(noise, len(sensors), "noise")
+    try:
+        gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, push, spread)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise DesignError(f"no Kalman filter settles with these sensors: {error}; move or add one") from error
+    return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter")
+
+
+def _plant(modes: Modes, law: Law, sensors: Sequence[Sensor]):
+    index = list(law.controlled)
+    own = modes.select(index)
+    c = reading(own, sensors)
+    if not len(sensors):
+        raise DesignError("an observer needs a sensor; there are none")
+    grid = np.abs(own.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9))).max(axis=0)
+    n = len(index)
+    for j, r in enumerate(index):
+        strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
+        if strength <= UNSEEN * grid[j]:
+            raise DesignError(f"no sensor sees mode {r + 1}: all stand at its nodes; move or add one")
+        if modes.omega[r] == 0 and np.abs(c[:, j]).max() <= UNSEEN * grid[j]:
+            raise DesignError(f"rates alone do not tell where rigid-body mode {r + 1} is; add a displacement sensor")
+    a, b = controlled_plant(modes, index, law.actuators)
+    return a, b, c
+
+
+def _intensity(value: ArrayLike, size: int, name: str) -> np.ndarray:
+    value = np.asarray(value, float)
+    matrix = value * np.eye(size) if value.ndim == 0 else np.diag(value) if value.ndim == 1 else value
+    if matrix.shape != (size, size) or not (np.linalg.eigvalsh(0.5 * (matrix + matrix.T)) > 0).all():
+        raise DesignError(f"the {name} must be positive, one figure or {size}; got {value}")
+    return matrix
+
+
+def _controller(law: Law, sensors, a, b, c, gain, how: str) -> Controller:
+    state = a - b @ law.gain - gain @ c
+    direct = np.zeros((len(law.actuators), len(sensors)))
+    return Controller(law, tuple(sensors), state, gain, -law.gain, direct, f"{law.name} on a {how}")

@@ -1,0 +1,84 @@
+"""Coupled control: one law for all controlled modes together, by the Riccati equation or by poles."""
+
+from collections.abc import Sequence
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.design.laws.law import DesignError, Law, controlled_indices, moved, participation
+from workbench.design.laws.pole_assignment import assign
+from workbench.rig.actuators import Actuator
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes
+
+
+def controlled_plant(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]):
+    """A (2n, 2n) and B (2n, n_actuators) of the controlled modes alone."""
+    index = list(controlled)
+    n = len(index)
+    b = input_matrix(modes, actuators)[index]
+    a = np.block(
+        [[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega[index] ** 2), -modes.damping[np.ix_(index, index)]]]
+    )
+    return a, np.vstack([np.zeros_like(b), b])
+
+
+def coupled_lqr(
+    modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, weight: ArrayLike
+) -> Law:
+    """The regulator that minimises ∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt over the actuator forces F.
+
+    Args:
+        modes, controlled, actuators: as for `imsc`; fewer actuators than modes will do.
+        weight: R, scalar, (n_actuators,) or (n_actuators, n_actuators).
+
+    Raises:
+        DesignError: a weight that is not positive definite, or modes that the actuators cannot stabilise.
+    """
+    index = controlled_indices(modes, controlled)
+    actuators = tuple(actuators)
+    if len(index) <= len(actuators):
+        participation(modes, index, actuators)
+    else:
+        moved(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
+    a, b = controlled_plant(modes, index, actuators)
+    q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
+    r = np.asarray(weight, float)
+    r = r * np.eye(len(actuators)) if r.ndim == 0 else np.diag(r) if r.ndim == 1 else r
+    if r.shape != (len(actuators),) * 2 or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
+        raise DesignError(
+            f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {r}"
+        )
+    try:
+        gain, _, poles = control.lqr(a, b, q, r)
+    except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:
+        raise DesignError(
+            f"no regulator stabilises modes {[i + 1 for i in index]} from these places: {error}"
+        ) from error
+    if not (np.real(poles) < 0).all():
+        raise DesignError(
+            f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
+        )
+    return Law(np.asarray(gain), index, actuators, "coupled LQR")
+
+
+def coupled_poles(
+    modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actuator], *, poles: ArrayLike
+) -> Law:
+    """The law that puts the poles of all controlled modes together, from any number of actuators.
+
+    Each mode's pole is moved by the forces that act on that mode best, F ∝ b_r (see `assign`), which keeps gains low.
+
+    Args:
+        modes, controlled, actuators: as for `imsc`; fewer actuators than modes will do.
+        poles: (n_controlled,) one of each conjugate pair per controlled mode, rad/s.
+
+    Raises:
+        DesignError: a pole that is not stable, a mode that no actuator moves, poles that cannot be held apart.
+    """
+    index = controlled_indices(modes, controlled)
+    b = moved(modes, index, actuators)
+    a, full = controlled_plant(modes, index, actuators)
+    gain = assign(a, full, poles, b.T.astype(complex), [f"mode {r + 1}" for r in index])
+    return Law(gain, index, tuple(actuators), "coupled poles")

@@ -1,0 +1,272 @@
+"""What is asked of a placement: modes, disturbance and weight, all that does not depend on the places.
+
+With IMSC the modal forces do not depend on the places, so W_R = ½ Σ_r E|φ_r(x)ᵀ B(x)⁻¹ f̂_r|² with the modal forces'
+transforms f̂_r = f̂(iω_r) known once and for all, in the mean over the disturbances that may come.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+from workbench.design.laws.imsc import riccati_gains
+from workbench.design.laws.law import DesignError
+from workbench.design.placement.peak import largest
+from workbench.structure.modes import Modes, frozen
+
+SINGULAR_SHARE = 1e-14
+SHOWN_INSTANTS = 240
+SETTLED = 1e-3
+NOTHING = 1e-7
+MOST_FORCES = 10_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Places of the actuators and what they cost.
+
+    Attributes:
+        positions: (n_actuators,) m, increasing.
+        residual_work: W_R.
+        by_mode: (n_residual,) W_r.
+        effort: ∫ FᵀF dt.
+        peak_force: largest force of any actuator at any time, to a millionth.
+        condition: of B, in the Frobenius norm ‖B‖‖B⁻¹‖, which bounds the spectral one.
+        status: why the search stopped.
+        local_optima: distinct local optima met from all starts, (positions, W_R), best first.
+    """
+
+    positions: np.ndarray
+    residual_work: float
+    by_mode: np.ndarray
+    effort: float
+    peak_force: float
+    condition: float
+    status: str
+    local_optima: tuple[tuple[np.ndarray, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "positions", frozen(self.positions))
+        object.__setattr__(self, "by_mode", frozen(self.by_mode))
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementTask:
+    """The task; n modes controlled by as many actuators.
+
+    Attributes:
+        modes: controlled first, then residual; undamped or nearly so.
+        n_controlled: n.
+        roots: (n_residual, n, n_columns) real T_r with T_r T_rᵀ = E Re f̂ f̂ᴴ at the residual frequency.
+        force_gramian: (n, n) E ∫ f fᵀ dt.
+        forces: (n, n_instants) modal forces at instants of every disturbance, for their peak.
+        poles: (2n,) of the controlled modes, rad/s.
+        swings: (n_places, n, 2n) of the modal forces after a blow at each place, f = Re Σ_k swings e^{λ_k t}.
+        span: s, over which their peak is sought.
+        envelope: (n,) C_j of ω√E|f̂_j(iω)|² <= C_j above the last frequency; inf where there is no such bound.
+    """
+
+    modes: Modes
+    n_controlled: int
+    roots: np.ndarray
+    force_gramian: np.ndarray
+    forces: np.ndarray
+    poles: np.ndarray
+    swings: np.ndarray
+    span: float
+    envelope: np.ndarray
+
+    def shapes(self, positions: ArrayLike, derivative: int = 0) -> np.ndarray:
+        """(..., n_modes) of the modes at places (...)."""
+        positions = np.asarray(positions, float)
+        return self.modes.phi(positions.ravel(), derivative).reshape(*positions.shape, self.modes.n_modes)
+
+    def placed(self, positions: ArrayLike, status: str, optima=()) -> Placement:
+        """A `Placement` of given positions; infinite work where B is singular."""
+        positions = np.sort(np.asarray(positions, float))
+        shapes = self.shapes(positions)
+        figures = batch_figures(self, shapes[None])
+        peak = np.inf
+        if np.isfinite(figures.work[0]):
+            forces = np.linalg.inv(shapes[:, : self.n_controlled].T) @ self.swings
+            peak = largest(self.poles, forces.reshape(-1, self.poles.size), self.span)
+        return Placement(
+            positions=positions,
+            residual_work=float(figures.work[0]),
+            by_mode=figures.by_mode[0],
+            effort=float(figures.effort[0]),
+            peak_force=peak,
+            condition=float(figures.condition[0]),
+            status=status,
+            local_optima=tuple(optima),
+        )
+
+    def tail_bound(self, positions: ArrayLike, *, growth: float) -> float:
+        """A bound on the work in all modes beyond those at hand, for frequencies that grow as ω_r >= ω_N (r/N)^growth.
+
+        With ω|f̂_j| <= C_j beyond ω_N, W_tail <= ½ max φ² (Σ_ij |B⁻¹|_ij C_j)² Σ_{r>N} ω_r⁻², and Σ_{r>N} (N/r)^{2g} <=
+        N / (2g - 1). Growth is 2 for a beam in bending, 1 for a bar.
+
+        Raises:
+            DesignError: growth of ½ or less, for which the sum has no bound, or a finite time.
+        """
+        if not growth > 0.5:
+            raise DesignError(f"the frequencies must grow faster than the root of their number; got growth {growth:g}")
+        if not np.isfinite(self.envelope).all():
+            raise DesignError("the bound on the tail is for t_f to infinity and frequencies above the closed loop's")
+        n, modes = self.n_controlled, self.modes
+        inverse = np.abs(np.linalg.inv(self.shapes(positions)[:, :n].T))
+        largest = np.abs(modes.phi(np.linspace(0.0, modes.length, 20 * modes.n_modes))).max()
+        series = modes.n_modes / (2 * growth - 1) / modes.omega[-1] ** 2
+        return float(0.5 * (largest * (inverse @ self.envelope).sum()) ** 2 * series)
+
+
+def placement_task(
+    modes: Modes,
+    n_controlled: int,
+    *,
+    impulse_at: ArrayLike,
+    weight: ArrayLike,
+    impulse: float = 1.0,
+    chances: ArrayLike | None = None,
+    final_time: float = np.inf,
+) -> PlacementTask:
+    """The task for an impulse (N s) at a place, or at any of several, IMSC with control weight R (5.43).
+
+    White-noise forces of intensity s at those places, together Σ chances, are impulses of √s N s at every instant: W_R
+    and effort are then powers.
+
+    Args:
+        impulse_at: a place, or (n_places,), m.
+        weight: R, scalar or one a controlled mode.
+        impulse: N s.
+        chances: (n_places,) of each place; even unless given.
+        final_time: t_f; work is counted up to it.
+
+    Raises:
+        DesignError: no residual mode, chances that are none, or a time that is not positive.
+    """
+    if not 1 <= n_controlled < modes.n_modes:
+        raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
+    if not final_time > 0:
+        raise DesignError(f"the final time must be positive; got {final_time}")
+    places = np.atleast_1d(np.asarray(impulse_at, float))
+    shares = np.full(places.size, 1.0 / places.size) if chances is None else np.asarray(chances, float)
+    if shares.shape != places.shape or not (shares >= 0).all() or not shares.sum() > 0:
+        raise DesignError(f"{places.size} places need as many chances, none negative; got {shares}")
+    n = n_controlled
+    omega = modes.omega[:n]
+    g1, g2 = riccati_gains(omega, weight)
+    rates = impulse * modes.phi(places)[:, :n] * np.sqrt(shares)[:, None]
+    s = 1j * modes.omega[n:, None]
+    unit = -(g1 + g2 * s) / (s**2 + g2 * s + omega**2 + g1)
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2 + g1), -np.diag(g2)]])
+    gains = np.hstack([np.diag(g1), np.diag(g2)])
+    slowest = -np.linalg.eigvals(a).real.max()
+    if np.isfinite(final_time):
+        # what is left of the loop at t_f answers no more
+        end = expm(a * final_time)
+        left = np.array([-gains @ np.linalg.solve(si * np.eye(2 * n) - a, end[:, n:]) for si in s[:, 0]])
+        unit = unit[:, :, None] * np.eye(n) - left * np.exp(-s * final_time)[:, :, None]
+    else:
+        unit = unit[:, :, None] * np.eye(n)
+    transforms = unit @ rates.T
+    roots = np.array([_root((t @ t.conj().T).real) for t in transforms])
+    # one blow has a root of two columns; columns that hold nothing cost time and tell nothing
+    weights = np.abs(roots).max(axis=(0, 1))
+    roots = roots[:, :, weights > NOTHING * weights.max()]
+    share = (omega**2 + g1) / modes.omega[-1] ** 2
+    envelope = np.full(n, np.inf)
+    if np.isinf(final_time) and (share < 1).all():
+        envelope = np.linalg.norm(rates, axis=0) * np.sqrt(g2**2 + (g1 / modes.omega[-1]) ** 2) / (1 - share)
+    span = min(final_time, -np.log(SETTLED) / slowest)
+    # the rate jumps at the blow and the forces with it: instants lie close at first
+    instants = span * np.linspace(0.0, 1.0, SHOWN_INSTANTS) ** 2
+    starts = np.vstack([np.zeros((n, places.size)), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
+    values, vectors = np.linalg.eig(a)
+    held = np.linalg.solve(vectors, starts[:, shares > 0].astype(complex))
+    motion = np.einsum("ik,kt,kp->ipt", vectors, np.exp(np.outer(values, instants)), held).real
+    forces = -(gains @ motion.reshape(2 * n, -1))
+    gramian = _force_gramian(a, gains, rates, final_time)
+    swings = -(gains @ vectors) * held.T[:, None, :]
+    swings.flags.writeable = values.flags.writeable = False
+    return PlacementTask(
+        modes, n, frozen(roots), frozen(gramian), frozen(forces), values, swings, final_time, frozen(envelope)
+    )
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _force_gramian(a: np.ndarray, gains: np.ndarray, rates: np.ndarray, final_time: float) -> np.ndarray:
+    n = rates.shape[1]
+    start = np.vstack([np.zeros((n, rates.shape[0])), rates.T])
+    gramian = solve_continuous_lyapunov(a, -start @ start.T)
+    if np.isfinite(final_time):
+        end = expm(a * final_time)
+        gramian = gramian - end @ gramian @ end.T
+    return gains @ gramian @ gains.T
+
+
+@dataclass(frozen=True, eq=False)
+class Figures:
+    """What many placements cost: each (n_placements,), inf where B is singular; by_mode (n_placements, n_residual).
+
+    The peak force is that at the task's instants: never more than the true one, and a little less.
+    """
+
+    work: np.ndarray
+    by_mode: np.ndarray
+    effort: np.ndarray
+    peak_force: np.ndarray
+    condition: np.ndarray
+
+
+def batch_figures(task: PlacementTask, shapes: np.ndarray) -> Figures:
+    """All that is asked of many placements at once, from `shapes` (n_placements, n_actuators, n_modes)."""
+    inverse, singular = _inverses(task, shapes)
+    n = task.n_controlled
+    spread = shapes[:, :, n:].transpose(0, 2, 1) @ inverse
+    by_mode = 0.5 * (np.einsum("prk,rkj->prj", spread, task.roots, optimize=True) ** 2).sum(axis=2)
+    effort = np.einsum("pik,kl,pil->p", inverse, task.force_gramian, inverse, optimize=True)
+    few = max(1, MOST_FORCES // task.forces.size)
+    peak = np.concatenate(
+        [np.abs(inverse[i : i + few] @ task.forces).max(axis=(1, 2)) for i in range(0, len(inverse), few)]
+    )
+    condition = np.linalg.norm(inverse, axis=(1, 2)) * np.linalg.norm(shapes[:, :, :n], axis=(1, 2))
+    by_mode[singular] = np.inf
+    return Figures(
+        np.where(singular, np.inf, by_mode.sum(axis=1)),
+        by_mode,
+        *(np.where(singular, np.inf, x) for x in (effort, peak, condition)),
+    )
+
+
+def batch_work(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """W_R and effort of many placements at once.
+
+    Args:
+        shapes: (n_placements, n_actuators, n_modes) of the modes at the actuators.
+
+    Returns:
+        W_R (n_placements,) and effort (n_placements,); inf where B is singular.
+    """
+    inverse, singular = _inverses(task, shapes)
+    n, columns = task.n_controlled, task.roots.shape[2]
+    # Σ_r |T_rᵀ B⁻ᵀ φ_r|² as one product over actuators: P_r = B⁻¹ T_r for all r together
+    pushes = inverse @ task.roots.transpose(1, 0, 2).reshape(n, -1)
+    pushes = pushes.reshape(len(shapes), n, -1, columns)
+    work = 0.5 * (np.einsum("pir,pirk->prk", shapes[:, :, n:], pushes) ** 2).sum(axis=(1, 2))
+    effort = np.einsum("pik,kl,pil->p", inverse, task.force_gramian, inverse, optimize=True)
+    return np.where(singular, np.inf, work), np.where(singular, np.inf, effort)
+
+
+def _inverses(task: PlacementTask, shapes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """B⁻¹ of each placement, and where B is singular."""
+    b = shapes[:, :, : task.n_controlled].transpose(0, 2, 1)
+    # Hadamard: |det B| against the product of its row lengths, so that mass and units do not matter
+    singular = np.abs(np.linalg.det(b)) <= SINGULAR_SHARE * np.linalg.norm(b, axis=2).prod(axis=1)
+    return np.linalg.inv(np.where(singular[:, None, None], np.eye(task.n_controlled), b)), singular

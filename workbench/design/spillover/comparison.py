@@ -1,0 +1,142 @@
+"""Several laws on the same structure after the same blow, on one yardstick."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.design.estimation.closed_loop import close_loop, respond
+from workbench.design.estimation.controller import Controller, filtered
+from workbench.design.estimation.modal_filter import displacement_filter
+from workbench.design.estimation.observers import luenberger
+from workbench.design.laws.coupled import coupled_lqr, coupled_poles
+from workbench.design.laws.imsc import imsc, imsc_poles
+from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.design.spillover.explain import Explanation, explain
+from workbench.design.spillover.spillover import Spillover, effort, finite_spillover, quadratic_cost
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.structure.modes import Modes, frozen
+from workbench.structure.profile import ProfileLike
+
+# as fast as the mode that is watched, and damped enough to forget where it started within two periods
+OBSERVER_POLES = -0.3 + 1j
+SHOWN_INSTANTS = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What one law does and costs.
+
+    Attributes:
+        law: it.
+        cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt of the controlled modes, over all time.
+        effort: ∫ FᵀF dt over all time.
+        peak_force: largest |F| of any actuator up to the final time.
+        work: in every mode up to the final time.
+        poles: (2 n_modes,) of the loop through exact modal coordinates, rad/s.
+    """
+
+    law: Law
+    cost: float
+    effort: float
+    peak_force: float
+    work: Spillover
+    poles: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "poles", frozen(self.poles, complex))
+
+    @property
+    def most_fed(self) -> int | None:
+        """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
+        residual = self.work.residual
+        return residual[int(np.argmax(self.work.residual_work))] if residual else None
+
+
+def laws_of(
+    modes: Modes, controlled: int, actuators: Sequence[Actuator], *, weight: float, damping: float | None = None
+) -> tuple[list[Law], list[str]]:
+    """The laws to be had, IMSC and coupled LQR, and by poles of a damping ratio where one is given; why IMSC is not.
+
+    Raises:
+        DesignError: no law is to be had.
+    """
+    makers: list[Callable[[], Law]] = [lambda: imsc(modes, controlled, actuators, weight=weight)]
+    coupled: list[Callable[[], Law]] = [lambda: coupled_lqr(modes, controlled, actuators, weight=weight)]
+    if damping is not None:
+        if not 0 < damping < 1:
+            raise DesignError(f"the damping ratio wanted must lie between 0 and 1; got {damping:g}")
+        omega = modes.omega[list(controlled_indices(modes, controlled))]
+        poles = omega * (-damping + 1j * np.sqrt(1 - damping**2))
+        makers.append(lambda: imsc_poles(modes, controlled, actuators, poles=poles))
+        coupled.append(lambda: coupled_poles(modes, controlled, actuators, poles=poles))
+    if controlled <= len(actuators):
+        return [make() for make in (*makers, *coupled)], []
+    why = f"IMSC needs as many actuators as controlled modes, {controlled}; there are {len(actuators)}: add actuators"
+    return [make() for make in coupled], [why]
+
+
+def compare(
+    modes: Modes, laws: Sequence[Law], state: np.ndarray, *, weight: float, final_time: float
+) -> tuple[Compared, ...]:
+    """Each law's cost, effort, peak force, work by mode and poles, from the same state (2 n_modes,).
+
+    Args:
+        modes: controlled and residual.
+        laws: to compare; all control the same modes if the costs are to mean the same.
+        state: at t = 0; residual modes at rest make W_r what control alone puts there.
+        weight: R of the cost.
+        final_time: s, of work and peak force.
+    """
+    if not (np.isfinite(final_time) and final_time > 0):
+        raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
+    time = np.linspace(0.0, final_time, SHOWN_INSTANTS)
+    rows = []
+    for law in laws:
+        loop = close_loop(modes, law)
+        rows.append(
+            Compared(
+                law=law,
+                cost=quadratic_cost(modes, law, state, weight),
+                effort=effort(modes, law, state),
+                peak_force=float(np.abs(respond(loop, state, time).forces).max()),
+                work=finite_spillover(loop, state, final_time),
+                poles=loop.poles,
+            )
+        )
+    return tuple(rows)
+
+
+def through_sensors(
+    modes: Modes, laws: Sequence[Law], places: Sequence[float], mass_per_length: ProfileLike | None
+) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
+    """Each law on what sensors of displacement and velocity at the places tell: a modal filter, a Luenberger observer.
+
+    Args:
+        modes: controlled and residual.
+        laws: to try.
+        places: of the sensors, m.
+        mass_per_length: for the filters; none are tried where it is not known.
+
+    Returns:
+        Controller, explanation on the full plant, and where it cannot be, (None, None, why).
+    """
+    stands = np.unique(np.asarray(places, float))
+    tried: list[tuple[Controller | None, Explanation | None, str]] = []
+    for law in laws:
+        own = modes.select(law.controlled)
+        ways = [
+            lambda law=law, own=own: luenberger(
+                modes, law, [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)], poles=OBSERVER_POLES * own.omega
+            )
+        ]
+        if mass_per_length is not None:
+            ways.insert(0, lambda law=law, own=own: filtered(law, displacement_filter(own, stands, mass_per_length)))
+        for way in ways:
+            try:
+                controller = way()
+                tried.append((controller, explain(modes, controller), ""))
+            except ValueError as error:
+                tried.append((None, None, f"{law.name}: {error}"))
+    return tuple(tried)

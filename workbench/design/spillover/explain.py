@@ -1,0 +1,206 @@
+"""Which residual mode a design unsettles on the full plant, and by which path from sensor to actuator.
+
+Without mode r the rest of the loop answers readings y with forces T(s) y. Mode r closes that loop at s = λ + Δ:
+
+    (s - λ)(s - λ*) = b_rᵀ T(s) c_r(s),   so   Δ = Σ_ji b_rj T_ji(s) c_ir(s) / (s - λ*),
+
+one term for each actuator j and sensor i. At s = λ this is the perturbation of the eigenvalue to first order; at the
+pole of the full loop it is exact. Either spillover at zero, b_r or c_r, leaves the mode where it was (Balas 1978).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from workbench.design.estimation.closed_loop import ClosedLoop
+from workbench.design.estimation.controller import Controller, close_with, reading
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes
+
+SECANT_STEPS = 40
+TWIN = 1e-12
+SUSPECTS = 12  # residual modes, the most moved, whose absence is tried
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """How far one actuator, fed by the sensors at one place, moves a mode's pole.
+
+    Attributes:
+        actuator: name.
+        sensor_at: place of the sensors, m; all the channels read there count together.
+        shift: its share of the exact movement, rad/s; the real part is what it adds to the growth.
+        first_order: the same from the open-loop pole.
+    """
+
+    actuator: str
+    sensor_at: float
+    shift: complex
+    first_order: complex
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """What a controller does to one residual mode.
+
+    Attributes:
+        mode: zero-based index.
+        pole: open loop, upper half plane, rad/s.
+        closed_pole: of the full closed loop.
+        paths: the most destabilising first; their shifts add up to the movement.
+    """
+
+    mode: int
+    pole: complex
+    closed_pole: complex
+    paths: tuple[Path, ...]
+
+    @property
+    def shift(self) -> complex:
+        """Movement of the pole, rad/s."""
+        return self.closed_pole - self.pole
+
+    @property
+    def first_order(self) -> complex:
+        """The movement to first order; far from `shift` where the spillover is not small."""
+        return sum(path.first_order for path in self.paths)
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A controller on the full plant.
+
+    Attributes:
+        loop: of all modes.
+        moved: every residual mode, the least stable first.
+        reduced_margin: of the loop of the controlled modes alone, 1/s.
+        culprit: the residual mode that unsettles the loop: one that grows, else the one without which the loop is
+            stable (a residual mode can stay stable itself and make a controlled one grow). None where the loop is
+            stable, and where no single mode is to blame, as when the reduced model fails already.
+    """
+
+    loop: ClosedLoop
+    moved: tuple[Moved, ...]
+    reduced_margin: float
+    culprit: Moved | None
+
+    @property
+    def poles(self) -> np.ndarray:
+        """Of the whole closed loop, rad/s."""
+        return self.loop.poles
+
+    @property
+    def margin(self) -> float:
+        """Distance of the rightmost pole from the axis, 1/s; negative where the loop is unstable."""
+        return stability_margin(self.loop)
+
+
+def stability_margin(loop: ClosedLoop) -> float:
+    """-max Re of the poles, 1/s."""
+    return float(-loop.poles.real.max())
+
+
+def explain(modes: Modes, controller: Controller) -> Explanation:
+    """The poles of the whole, and what moved each residual mode, by path.
+
+    Args:
+        modes: of the fuller plant; those that the law does not control are residual.
+        controller: from `filtered`, `luenberger` or `kalman`.
+    """
+    loop = close_with(modes, controller)
+    residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
+    poles = loop.poles
+    upper = poles[poles.imag > 0]
+    moved = []
+    if residual:
+        rest = _Rest(modes, controller)
+        at = [_OneMode(rest, r) for r in residual]
+        far = np.abs(np.array([mode.closed_pole() for mode in at])[:, None] - upper[None, :])
+        for i, k in zip(*linear_sum_assignment(far), strict=True):
+            closed = complex(upper[k])
+            moved.append(Moved(residual[i], at[i].pole, closed, at[i].paths(closed)))
+    moved.sort(key=lambda m: -m.closed_pole.real)
+    alone = close_with(modes.select(controller.law.controlled), controller)
+    return Explanation(loop, tuple(moved), stability_margin(alone), _behind(modes, controller, loop, moved))
+
+
+def _behind(modes: Modes, controller: Controller, loop: ClosedLoop, moved: list[Moved]) -> Moved | None:
+    """The residual mode that unsettles a loop: one that grows, else one without which the loop is stable."""
+    if loop.stable or not moved:
+        return None
+    if moved[0].closed_pole.real > 0:
+        return moved[0]
+
+    def margin_without(one: Moved) -> float:
+        return stability_margin(
+            close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller)
+        )
+
+    suspects = sorted(moved, key=lambda m: -abs(m.shift))[:SUSPECTS]
+    margins = [margin_without(one) for one in suspects]
+    best = int(np.argmax(margins))
+    return suspects[best] if margins[best] > 0 else None
+
+
+class _Rest:
+    """A loop from which one mode at a time is taken out: T = (I - C G)⁻¹ C, C the controller and G all other modes."""
+
+    def __init__(self, modes: Modes, controller: Controller) -> None:
+        self.modes, self.controller, self._apart = modes, controller, modes.proportional
+        self.pushed = input_matrix(modes, controller.law.actuators)
+        self.seen = reading(modes, controller.sensors)
+
+    def forces(self, r: int, s: complex) -> np.ndarray:
+        """T(s) (n_actuators, n_channels) without mode r."""
+        n, c = self.modes.n_modes, self.controller
+        others = np.arange(n) != r
+        seen = self.seen[:, :n][:, others] + s * self.seen[:, n:][:, others]
+        pushed = self.pushed[others]
+        if self._apart:
+            stiff = s**2 + s * np.diag(self.modes.damping)[others] + self.modes.omega[others] ** 2
+            # an undamped twin of the mode answers without bound at their pole: a hair beside it
+            plant = (seen / np.where(stiff == 0, TWIN * abs(s) ** 2, stiff)) @ pushed
+        else:
+            stiff = np.diag(s**2 + self.modes.omega[others] ** 2) + s * self.modes.damping[np.ix_(others, others)]
+            plant = seen @ np.linalg.solve(stiff, pushed)
+        own = c.direct + c.commands @ np.linalg.solve(s * np.eye(len(c.state)) - c.state, c.reads)
+        return np.linalg.solve(np.eye(len(own)) - own @ plant, own)
+
+
+class _OneMode:
+    """One residual mode in the loop of all the rest."""
+
+    def __init__(self, rest: _Rest, r: int) -> None:
+        modes = rest.modes
+        self._rest, self._r = rest, r
+        self._pushed, self._seen = rest.pushed[r], rest.seen[:, [r, modes.n_modes + r]]
+        c, omega = modes.damping[r, r], modes.omega[r]
+        self.pole = complex(-0.5 * c + 1j * np.sqrt(max(omega**2 - 0.25 * c**2, 0.0)))
+
+    def _terms(self, s: complex) -> np.ndarray:
+        """Shares (n_actuators, n_channels) of the movement that s would be."""
+        answer = self._rest.forces(self._r, s)
+        return self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
+
+    def closed_pole(self) -> complex:
+        """Where the mode goes: s = λ + Δ(s) by the secant method, else to first order."""
+        first = self.pole + self._terms(self.pole).sum()
+        near, s = self.pole, first
+        miss = near - first
+        for _ in range(SECANT_STEPS):
+            now = s - self.pole - self._terms(s).sum()
+            if abs(now) < 1e-12 * abs(s) or now == miss:
+                break
+            near, s, miss = s, s - now * (s - near) / (now - miss), now
+        return s if abs(s - self.pole) < 0.5 * abs(self.pole) else first
+
+    def paths(self, closed: complex) -> tuple[Path, ...]:
+        exact, first = self._terms(closed), self._terms(self.pole)
+        at = np.array([sensor.at for sensor in self._rest.controller.sensors])
+        found = [
+            Path(actuator.name, place, complex(exact[j, at == place].sum()), complex(first[j, at == place].sum()))
+            for j, actuator in enumerate(self._rest.controller.law.actuators)
+            for place in self._rest.controller.places
+        ]
+        return tuple(sorted(found, key=lambda path: -path.shift.real))

@@ -1,0 +1,74 @@
+"""A design judged on the full plant: cost, effort, spillover and margin of one motion, however the state is known."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.design.estimation.closed_loop import ClosedLoop
+from workbench.design.laws.law import DesignError
+from workbench.design.spillover.on_off import OnOffLaw, on_off_work, respond_on_off
+from workbench.design.spillover.spillover import second_moments
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes
+
+INSTANTS = 20_001
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a design does up to the final time; cost, effort and W_R are infinite where the loop is unstable.
+
+    Attributes:
+        cost: ∫ (Σ q_r'² + ω_r² q_r² + R FᵀF) dt, Σ over the controlled modes as they are, not as they are estimated.
+        effort: ∫ FᵀF dt.
+        spilled: W_R, work in the residual modes.
+        margin: distance of the rightmost pole from the axis, 1/s; nan where a loop has no poles.
+    """
+
+    cost: float
+    effort: float
+    spilled: float
+    margin: float
+
+
+def judge(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Judged:
+    """A linear loop, exactly: every figure is a quadratic form of the state, its integral one matrix.
+
+    Args:
+        loop: from `close_loop` or `close_with`.
+        state: (2 n_modes,) at t = 0; an observer starts from zero.
+        weight: R of the actuator forces.
+        final_time: s.
+    """
+    _check(weight, final_time)
+    modes, n = loop.modes, loop.modes.n_modes
+    margin = float(-loop.poles.real.max())
+    if not loop.stable:
+        return Judged(np.inf, np.inf, np.inf, margin)
+    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    moments = second_moments(loop.matrix, state, final_time)
+    own = list(loop.law.controlled)
+    energy = modes.omega[own] ** 2 @ np.diag(moments)[own] + np.diag(moments)[[n + r for r in own]].sum()
+    effort = float(np.trace(loop.feedback @ moments @ loop.feedback.T))
+    rest = [r for r in range(n) if r not in own]
+    push = input_matrix(modes, loop.law.actuators)[rest] @ loop.feedback
+    spilled = float(sum(row @ moments[:, n + r] for row, r in zip(push, rest)))
+    return Judged(float(energy) + weight * effort, effort, spilled, margin)
+
+
+def judge_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: float, final_time: float) -> Judged:
+    """The same of on-off control, whose motion is exact and whose integrals are sums over it."""
+    _check(weight, final_time)
+    time = np.linspace(0.0, final_time, INSTANTS)
+    response = respond_on_off(modes, law, state, time).response
+    own = list(law.controlled)
+    effort = float(np.trapezoid((response.forces**2).sum(axis=0), time))
+    energy = float(np.trapezoid(2.0 * response.energy[own].sum(axis=0), time))
+    return Judged(energy + weight * effort, effort, on_off_work(modes, law, state, final_time).residual_total, np.nan)
+
+
+def _check(weight: float, final_time: float) -> None:
+    if not (np.isfinite(final_time) and final_time > 0):
+        raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
+    if not weight > 0:
+        raise DesignError(f"the control weight R must be positive; got {weight:g}")

@@ -1,0 +1,154 @@
+"""How a design fares on the structures that the identification leaves possible.
+
+Frequencies and damping ratios are drawn from their covariance, shapes from theirs at the sensors, carried everywhere by
+the modes themselves: φ_r + Σ_s e_rs φ_s. A design survives a draw where the loop of all its modes is stable.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.design.estimation.controller import Controller, close_with
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.spillover.explain import stability_margin
+from workbench.design.spillover.spillover import finite_spillover
+from workbench.structure.modes import Modes, frozen
+
+LEAST_OMEGA = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Survival:
+    """A design on many possible structures.
+
+    Attributes:
+        margins: (n_draws,) stability margin of each, 1/s.
+        work: (n_draws,) W_R up to the final time; nan where unstable.
+    """
+
+    margins: np.ndarray
+    work: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "margins", frozen(self.margins))
+        object.__setattr__(self, "work", frozen(self.work))
+
+    @property
+    def share(self) -> float:
+        """Of the draws that the design survives."""
+        return float(np.mean(self.margins > 0))
+
+    @property
+    def standard_error(self) -> float:
+        """Of the share, from the number of draws."""
+        return float(np.sqrt(self.share * (1 - self.share) / self.margins.size))
+
+    def spread(self, level: float = 0.9) -> tuple[float, float, float]:
+        """W_R of the surviving draws: lower end of the interval, median, upper end; nan where none survives."""
+        there = self.work[np.isfinite(self.work)]
+        if not there.size:
+            return np.nan, np.nan, np.nan
+        low, middle, high = np.quantile(there, (0.5 - 0.5 * level, 0.5, 0.5 + 0.5 * level))
+        return float(low), float(middle), float(high)
+
+
+def draw_modes(
+    modes: Modes,
+    count: int,
+    *,
+    seed: int | np.random.Generator = 0,
+    scale: float = 1.0,
+    shape_covariance: ArrayLike | None = None,
+    positions: ArrayLike | None = None,
+) -> list[Modes]:
+    """Structures that the identification leaves possible.
+
+    Args:
+        modes: identified, with the covariance of (ω, ζ).
+        count: how many.
+        seed: of the draws.
+        scale: of all standard errors; 1 as identified.
+        shape_covariance: (n_modes, n_sensors, n_sensors) of the shapes, relative to the largest entry of each.
+        positions: (n_sensors,) of the sensors, m.
+
+    Raises:
+        DesignError: modes without covariance, or shapes without positions.
+    """
+    if modes.covariance is None:
+        raise DesignError("these modes carry no covariance; identify them with `refine` and `eigenfunctions`")
+    if (shape_covariance is None) != (positions is None):
+        raise DesignError("errors of shape need both their covariance and the positions of the sensors")
+    rng = np.random.default_rng(seed)
+    n = modes.n_modes
+    centre = np.r_[modes.omega, modes.zeta]
+    drawn = centre + scale * rng.standard_normal((count, 2 * n)) @ _root(modes.covariance).T
+    mixing = np.zeros((count, n, n))
+    if shape_covariance is not None and positions is not None:
+        at = modes.phi(positions)
+        known = np.linalg.pinv(at)
+        for r, covariance in enumerate(np.asarray(shape_covariance, float)):
+            largest = np.abs(at[:, r]).max()
+            error = largest * rng.standard_normal((count, len(at))) @ _root(covariance).T
+            mixing[:, :, r] = scale * error @ known.T
+    return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
+    n = modes.n_modes
+    omega = np.maximum(figures[:n], LEAST_OMEGA * modes.omega)
+    c = np.diag(2.0 * figures[n:] * omega)
+    blend = np.eye(n) + mixing
+    return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.length, modes.essential)
+
+
+def wrong_by(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> list[Modes]:
+    """Structures unlike the model by a relative standard error, where no identification tells how unlike they may be.
+
+    Frequencies and damping ratios are off by it each; every shape has some of all others in it, in mean square this
+    share of its own size.
+
+    Raises:
+        DesignError: an error that is not positive.
+    """
+    if not 0 < error < np.inf:
+        raise DesignError(f"the relative error of the models must be positive; got {error:g}")
+    rng, n = np.random.default_rng(seed), modes.n_modes
+    centre = np.r_[modes.omega, modes.zeta]
+    drawn = centre * (1.0 + error * rng.standard_normal((count, 2 * n)))
+    mixing = error / np.sqrt(n) * rng.standard_normal((count, n, n))
+    return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
+
+
+def survival_of(possible: list[Modes], design: Controller | Law) -> float:
+    """Share of the structures on which a design is stable."""
+    return float(np.mean([close_with(modes, design).stable for modes in possible]))
+
+
+def survive(
+    possible: list[Modes], designs: Mapping[str, Controller | Law], *, state: np.ndarray, final_time: float
+) -> dict[str, Survival]:
+    """Each design on each possible structure.
+
+    Args:
+        possible: from `draw_modes`.
+        designs: by name.
+        state: (2 n_modes,) at t = 0.
+        final_time: s, of W_R.
+    """
+    found = {}
+    for name, controller in designs.items():
+        margins, work = np.empty(len(possible)), np.full(len(possible), np.nan)
+        for i, modes in enumerate(possible):
+            loop = close_with(modes, controller)
+            margins[i] = stability_margin(loop)
+            if margins[i] > 0:
+                work[i] = finite_spillover(loop, state, final_time).residual_total
+        found[name] = Survival(margins, work)
+    return found

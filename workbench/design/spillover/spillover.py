@@ -1,0 +1,205 @@
+"""The work of the actuators in every mode: what control takes from the controlled, and spills into the residual.
+
+Dissertation (5.18)-(5.44). With W_r the work of all actuators in mode r, W_C sums the controlled modes and W_R the
+residual ones. For an undamped residual mode at rest and t_f to infinity the double integral (5.43) is
+
+    W_r = ½ |b_rᵀ F(iω_r)|²,   F(s) = -K (s I - A_C)⁻¹ x_C(0),
+
+the energy that the actuators' forces leave in it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
+
+from workbench.design.estimation.closed_loop import ClosedLoop
+from workbench.design.laws.coupled import controlled_plant
+from workbench.design.laws.imsc import riccati_matrices
+from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.rig.statespace import input_matrix
+from workbench.structure.modes import Modes, frozen
+
+
+@dataclass(frozen=True, eq=False)
+class Spillover:
+    """Work by mode, J (or the consistent unit).
+
+    Attributes:
+        by_mode: (n_modes,) W of every mode.
+        controlled: zero-based indices of the controlled modes.
+        final_time: s; inf for the limit.
+    """
+
+    by_mode: np.ndarray
+    controlled: tuple[int, ...]
+    final_time: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "by_mode", frozen(self.by_mode))
+
+    @property
+    def residual(self) -> tuple[int, ...]:
+        return tuple(r for r in range(self.by_mode.size) if r not in self.controlled)
+
+    @property
+    def residual_work(self) -> np.ndarray:
+        """W_r of the residual modes, (n_residual,)."""
+        return self.by_mode[list(self.residual)]
+
+    @property
+    def controlled_total(self) -> float:
+        """W_C."""
+        return float(self.by_mode[list(self.controlled)].sum())
+
+    @property
+    def residual_total(self) -> float:
+        """W_R."""
+        return float(self.residual_work.sum())
+
+    @property
+    def total(self) -> float:
+        """W = W_C + W_R (5.27)."""
+        return float(self.by_mode.sum())
+
+
+def force_transform(modes: Modes, law: Law, state: np.ndarray, s: np.ndarray) -> np.ndarray:
+    """Laplace transforms (n_actuators, n_s) of the actuator forces, exact modal coordinates fed back.
+
+    Args:
+        state: (2 n_modes,) at t = 0, all modes; only the controlled ones matter.
+        s: (n_s,) complex, rad/s.
+    """
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    loop = a - b @ law.gain
+    index = list(law.controlled)
+    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+    values, vectors = np.linalg.eig(loop)
+    if np.linalg.cond(vectors) < 1e6:
+        weights = -(law.gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
+        return weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None]))
+    eye = np.eye(loop.shape[0])
+    return np.array([-law.gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
+
+
+def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
+    """Work in every mode for t_f to infinity, in closed form, exact modal coordinates fed back.
+
+    The controlled modes give all their energy: W_r = -E_r(0). A residual mode must be undamped; at rest at first it
+    gains ½|b_rᵀF(iω_r)|², and one already moving also Re(conj(q_r'(0) + iω_r q_r(0)) b_rᵀ F(iω_r)).
+
+    Raises:
+        DesignError: damped residual modes (take a finite time), or a loop that does not settle.
+    """
+    n, index = modes.n_modes, list(law.controlled)
+    residual = [r for r in range(n) if r not in law.controlled]
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    if np.linalg.eigvals(a - b @ law.gain).real.max() >= 0:
+        raise DesignError("the controlled modes do not settle, so their work has no limit; take a finite time")
+    if np.diag(modes.damping).max() > 0:
+        raise DesignError("modes are damped, so friction shares the work: use finite_spillover with a final time")
+    work = np.zeros(n)
+    work[index] = -_energies(modes, state)[index]
+    if residual:
+        omega = modes.omega[residual]
+        force = input_matrix(modes, law.actuators)[residual]
+        push = np.einsum("rj,jr->r", force, force_transform(modes, law, state, 1j * omega))
+        moving = state[[n + r for r in residual]] + 1j * omega * state[residual]
+        work[residual] = 0.5 * np.abs(push) ** 2 + _cross(push, moving)
+    return Spillover(work, law.controlled, np.inf)
+
+
+def _cross(push: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """The share of W_r from motion already there: with z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)."""
+    return (np.conj(moving) * push).real
+
+
+def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> Spillover:
+    """Work of the actuators in every mode up to a finite time, exactly, damping and filters included.
+
+    W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, taken from one matrix exponential
+    (Van Loan, IEEE Trans. Automatic Control 23 (1978) 395).
+    """
+    if not (np.isfinite(final_time) and final_time > 0):
+        raise ValueError(f"the final time must be positive and finite; got {final_time}")
+    n = loop.modes.n_modes
+    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    moments = second_moments(loop.matrix, state, final_time)
+    force_rows = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
+    work = np.array([force_rows[r] @ moments[:, n + r] for r in range(n)])
+    return Spillover(work, loop.law.controlled, final_time)
+
+
+def second_moments(a: np.ndarray, state: np.ndarray, final_time: float) -> np.ndarray:
+    """∫_0^t x xᵀ dt for x' = A x: from dM/dt = A M + M Aᵀ + x0 x0ᵀ, doubled up from a short time.
+
+    Balanced first: displacements and rates of a fast structure differ by its frequency, and round-off by its square.
+    """
+    a, (scale, _) = matrix_balance(a, permute=False, separate=True)
+    state = state / scale
+    size = a.shape[0]
+    halvings = max(0, int(np.ceil(np.log2(max(np.abs(a).sum(axis=1).max() * final_time, 1.0)))))
+    h = final_time / 2**halvings
+    block = np.block([[-a, np.outer(state, state)], [np.zeros_like(a), a.T]]) * h
+    exponential = expm(block)
+    transition = exponential[size:, size:].T
+    moments = transition @ exponential[:size, size:]
+    for _ in range(halvings):
+        moments = moments + transition @ moments @ transition.T
+        transition = transition @ transition
+    return scale[:, None] * moments * scale
+
+
+def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
+    """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation."""
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    index = list(law.controlled)
+    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+    gramian = solve_continuous_lyapunov(a - b @ law.gain, -np.outer(start, start))
+    return float(np.trace(law.gain @ gramian @ law.gain.T))
+
+
+def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
+    """∫ (Σ q_r'² + ω_r² q_r² + Fᵀ R F) dt of the controlled modes over all time: the same yardstick for every law.
+
+    Args:
+        weight: R, a number or (n_actuators, n_actuators); R BᵀB weighs modal forces, R fᵀf.
+    """
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    index = list(law.controlled)
+    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+    gramian = solve_continuous_lyapunov(a - b @ law.gain, -np.outer(start, start))
+    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + _weighed(law.gain, weight)
+    return float(np.trace(q @ gramian))
+
+
+def _weighed(gain: np.ndarray, weight: float | np.ndarray) -> np.ndarray:
+    return weight * gain.T @ gain if np.ndim(weight) == 0 else gain.T @ weight @ gain
+
+
+def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
+    """`quadratic_cost` with modal forces weighed, R fᵀf, f = B F."""
+    b = input_matrix(modes, law.actuators)[list(law.controlled)]
+    return quadratic_cost(modes, law, state, weight * b.T @ b)
+
+
+def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.ndarray, weight: float) -> float:
+    """The least `modal_cost` of any law: that of distributed control, f(x, t) = Σ m φ_r f_r (5.5), with W_R = 0.
+
+    Modal forces are then at will, one a mode, so the cost is Σ x_rᵀ P_r x_r of the closed-form Riccati equations.
+    """
+    index = list(controlled_indices(modes, controlled))
+    p = riccati_matrices(modes.omega[index], weight, np.diag(modes.damping)[index])
+    x = np.array([state[index], state[[modes.n_modes + r for r in index]]])
+    return float(np.einsum("ir,rij,jr->", x, p, x))
+
+
+def _energies(modes: Modes, state: np.ndarray) -> np.ndarray:
+    n = modes.n_modes
+    return 0.5 * (state[n:] ** 2 + (modes.omega * state[:n]) ** 2)
+
+
+def energy_gained(loop: ClosedLoop, state: np.ndarray, final_time: float) -> np.ndarray:
+    """Energy of each mode at the final time less that at the start, (n_modes,), from the motion itself."""
+    return _energies(loop.modes, expm(loop.matrix * final_time) @ state) - _energies(loop.modes, state)

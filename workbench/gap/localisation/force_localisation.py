@@ -1,0 +1,157 @@
+"""The place of a missing force along the structure, with its uncertainty, before any law is guessed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from workbench.gap.effects.structural import known_places
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_lines import Lines, lines_of
+
+VALLEYS = 3  # of the misfit that are gone into
+ROUNDS = 3  # in each: where the force is, which lines tell of it
+BESIDE, RESOLVED = 0.95, 1e-3  # of the spacing of places
+TWO_SIGMA = 4.0  # rise of the misfit
+NOISE, ALL_BUT = 0.1, 1e-5  # left by what may be one force: of the noise, and of the gap
+CHANCE = 3.0  # deviations of a sum of squares
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """How likely one force, of any law, is at each place, and where it is likeliest.
+
+    Attributes:
+        places: (n_places,) m.
+        profile: (n_places,) log-likelihood there, less that of the likeliest place.
+        at: the likeliest place, m.
+        at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
+            beyond the noise; 0 for named places.
+        share: of the gap's power above the noise, what one force there accounts for.
+        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing tells:
+            no gap, one sensor, or records too short.
+    """
+
+    places: np.ndarray
+    profile: np.ndarray
+    at: float
+    at_std: float
+    share: float
+    holds: bool | None
+
+
+def placed(evidence: Evidence) -> Placed:
+    """Where one force, of any law, would make the simulation agree with the test.
+
+    One sensor tells no place: a force anywhere accounts for all that it reads. Sensors that lag are left out.
+    """
+    evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
+    named = known_places(evidence.rig) is not None
+    guess, places, length = evidence.peaks[0], evidence.places, evidence.length
+    if len(evidence.rig.sensors) < 2:
+        return Placed(places, np.zeros(places.size), guess, 0.0 if named else length / np.sqrt(12.0), 0.0, None)
+    lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
+    search = _Search(evidence, lines)
+    telling = search.telling(guess)
+    profile = search.along(telling, places)
+    if named:
+        at, std = float(places[int(np.argmin(profile))]), 0.0
+    else:
+        at = min(evidence.workers.map(search.refined, _valleys(places, profile)), key=search.judged)
+        telling = search.telling(at)
+        profile, std = search.along(telling, places), search.deviation(telling, at)
+    lowest = min(search.misfit(telling, at), profile.min())
+    std *= np.sqrt(max(search.left(at), 0.0) + 1.0)
+    return Placed(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
+
+
+def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
+    """The places of the deepest valleys."""
+    padded = np.r_[np.inf, misfit, np.inf]
+    bottoms = np.flatnonzero((misfit <= padded[:-2]) & (misfit <= padded[2:]))
+    return places[bottoms[np.argsort(misfit[bottoms])][:VALLEYS]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    evidence: Evidence
+    lines: list[Lines]
+
+    def shape(self, x: float) -> np.ndarray:
+        return self.evidence.rig.modes.phi(x)[0]
+
+    def telling(self, x: float) -> list[Lines]:
+        """The lines by how much they tell of a force at x."""
+        shape = self.shape(x)
+        return [each.weighed(each.telling(shape)) for each in self.lines]
+
+    def misfit(self, lines: list[Lines], x: float) -> float:
+        shape = self.shape(x)
+        return sum(each.misfit(shape) for each in lines)
+
+    @property
+    def freedom(self) -> int:
+        return sum(each.freedom for each in self.lines)
+
+    def left(self, at: float) -> float:
+        """What a force there leaves beyond the noise, per value, in units of the noise."""
+        return self.misfit(self.lines, at) / max(self.freedom, 1) - 1.0
+
+    def of_one_force(self, at: float) -> tuple[float, bool | None]:
+        """Share of the gap's power that a force there accounts for, and whether it is all of it."""
+        values = 2 * sum(each.left.size for each in self.lines)
+        gap = sum(each.power for each in self.lines) - values
+        if self.freedom == 0 or gap < CHANCE * np.sqrt(2.0 * values):
+            return 0.0, None
+        left, chance = self.left(at), CHANCE * np.sqrt(2.0 / self.freedom)
+        share = float(np.clip(1.0 - left * self.freedom / gap, 0.0, 1.0))
+        return share, bool(left < NOISE + chance or share > 1.0 - ALL_BUT)
+
+    def along(self, lines: list[Lines], places: np.ndarray) -> np.ndarray:
+        """The misfit at each of the places."""
+        return np.array(self.evidence.workers.map(lambda x: self.misfit(lines, x), places))
+
+    def refined(self, top: float) -> float:
+        """The bottom of a valley."""
+        at, telling = float(top), self.telling(top)
+        spacing = self.evidence.places[1] - self.evidence.places[0]
+        for _ in range(ROUNDS):
+            found = minimize_scalar(
+                lambda x, lines: self.misfit(lines, x),
+                bounds=self._inside(at - BESIDE * spacing, at + BESIDE * spacing),
+                args=(telling,),
+                method="bounded",
+                options={"xatol": RESOLVED * spacing},
+            )
+            moved, at = abs(found.x - at), float(found.x)
+            telling = self.telling(at)
+            if moved < RESOLVED * spacing:
+                break
+        return at
+
+    def judged(self, at: float) -> float:
+        """The misfit of a valley by all lines alike: those that one of them weighs would favour it."""
+        return self.misfit(self.lines, at)
+
+    def deviation(self, lines: list[Lines], at: float) -> float:
+        """Half of one standard deviation either way, from where the misfit is two higher."""
+        lowest = self.misfit(lines, at)
+        return sum(self._rises(lines, at, side, lowest + TWO_SIGMA) for side in (-1.0, 1.0)) / 4.0
+
+    def _rises(self, lines: list[Lines], at: float, side: float, level: float) -> float:
+        """How far on one side the misfit comes to a level."""
+        length = self.evidence.length
+        inside, outside = 0.0, 1e-5 * length
+        while outside < length and 0 < at + side * outside < length:
+            if self.misfit(lines, at + side * outside) > level:
+                break
+            inside, outside = outside, 2.0 * outside
+        for _ in range(6):
+            middle = 0.5 * (inside + outside)
+            beyond = not 0 < at + side * middle < length or self.misfit(lines, at + side * middle) > level
+            inside, outside = (inside, middle) if beyond else (middle, outside)
+        return outside
+
+    def _inside(self, low: float, high: float) -> tuple[float, float]:
+        edge = 1e-4 * self.evidence.length
+        return max(low, edge), min(high, self.evidence.length - edge)

@@ -1,0 +1,152 @@
+"""Where a simulation and a test disagree: by record, mode, band, time, sensor and level, and along which path."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect
+from workbench.gap.localisation.coherence import linear_share
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.force_localisation import Placed
+from workbench.gap.prediction.residuals import FitData
+
+MODE_SHARE = 0.05
+ONE_SENSOR = 0.97  # of the gap
+OCTAVES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Where:
+    """The gap of the nominal model, taken apart.
+
+    Shares are of the squared residual above the noise, each sensor scaled by its own standard deviation.
+
+    Attributes:
+        path: "actuator", "structure", "sensor", "environment", or "none".
+        modes: one-based numbers of the modes around whose frequencies at least a twentieth of the gap lies.
+        amplitude_dependent: whether the gap changes with level.
+        mode_shares: (n_modes,) share of the gap in the band around each natural frequency.
+        band_edges_hz: (n_bands + 1,) of octaves down from half the sample rate, the lowest open to zero.
+        band_shares: (n_bands,) share of the gap in each.
+        sensor_shares: (n_outputs,).
+        time_shares: (n_records, 8) of each record's gap, by eighths of its length.
+        record_gaps: (n_records,) gap as the case format defines it.
+        input_levels: (n_records,) root mean square of the inputs.
+        linear_share: of the gap's power, what one linear reply to the inputs explains.
+        place: of a missing force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
+    """
+
+    path: str
+    modes: tuple[int, ...]
+    amplitude_dependent: bool
+    mode_shares: np.ndarray
+    band_edges_hz: np.ndarray
+    band_shares: np.ndarray
+    sensor_shares: np.ndarray
+    time_shares: np.ndarray
+    record_names: tuple[str, ...]
+    record_gaps: np.ndarray
+    input_levels: np.ndarray
+    linear_share: float
+    place: Placed
+
+    @property
+    def at(self) -> float:
+        return self.place.at
+
+    @property
+    def at_std(self) -> float:
+        return self.place.at_std
+
+
+def locate(evidence: Evidence, effects: Sequence[Effect], place: Placed) -> Where:
+    """Take the gap on the fit records apart.
+
+    Args:
+        evidence: of the nominal rig.
+        effects: that explain the gap, where they are known: the path is theirs.
+        place: of a missing force; without sensors that are known to be at fault, which it would have to explain too.
+    """
+    data = evidence.data
+    scaled = [
+        r / record.outputs.std(axis=1, keepdims=True)
+        for record, r in zip(data.counted, evidence.residuals, strict=True)
+    ]
+    floors = [(data.noise / record.outputs.std(axis=1)) ** 2 for record in data.counted]
+    excess = np.array([(s**2).mean(axis=1) - f for s, f in zip(scaled, floors, strict=True)])
+    by_sensor = np.maximum(excess, 0.0).sum(axis=0)
+    frequencies = evidence.rig.modes.frequencies_hz
+    between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
+    mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
+    octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - OCTAVES, 1)]
+    levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
+    gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
+    return Where(
+        path=_path(evidence, excess, effects),
+        modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > MODE_SHARE)),
+        amplitude_dependent=_amplitude_dependent(effects, excess, data),
+        mode_shares=mode_shares,
+        band_edges_hz=octaves,
+        band_shares=_shares_between(octaves, evidence, scaled),
+        sensor_shares=by_sensor / max(by_sensor.sum(), 1e-300),
+        time_shares=np.array([_by_eighths(s) for s in scaled]),
+        record_names=tuple(record.name for record in data.counted),
+        record_gaps=gaps,
+        input_levels=levels,
+        linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
+        place=place,
+    )
+
+
+def _shares_between(edges: np.ndarray, evidence: Evidence, scaled: list[np.ndarray]) -> np.ndarray:
+    """Share of the residual's power above the noise between each edge (Hz) and the next."""
+    power = np.zeros(edges.size - 1)
+    for record, s in zip(evidence.data.counted, scaled, strict=True):
+        spectrum = (np.abs(np.fft.rfft(s, axis=1)) ** 2).sum(axis=0) / s.shape[1]
+        grid = np.fft.rfftfreq(s.shape[1], record.sample_time)
+        band = np.clip(np.searchsorted(edges, grid, side="right") - 1, 0, power.size - 1)
+        floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).sum()
+        power += np.bincount(band, spectrum - floor, power.size)
+    power = np.maximum(power, 0.0)
+    return power / max(power.sum(), 1e-300)
+
+
+def _by_eighths(scaled: np.ndarray) -> np.ndarray:
+    power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
+    return power / max(power.sum(), 1e-300)
+
+
+def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> str:
+    paths = [effect.kind.path for effect in effects]
+    if paths:
+        return paths[0]
+    power = np.maximum(excess, 0.0).sum(axis=0)
+    if power.sum() <= 0 or evidence.data.by_channel(_joined(evidence)).mean() < 1.03:
+        return "none"
+    if of_one_sensor(power):
+        return "sensor"
+    direct = {a.name for a in evidence.rig.actuators if a.direct}
+    for record, row in zip(evidence.data.counted, excess, strict=True):
+        active = {n for n, values in zip(record.input_names, record.inputs, strict=True) if np.any(values)}
+        if active and active <= direct:
+            floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).mean()
+            return "structure" if row.mean() > 0.1 * floor else "actuator"
+    return "structure"
+
+
+def of_one_sensor(excess: np.ndarray) -> bool:
+    """Whether one sensor alone disagrees, by the power above the noise in each (n_outputs,)."""
+    return bool(excess.max() > ONE_SENSOR * excess.sum())
+
+
+def _joined(evidence: Evidence) -> np.ndarray:
+    return np.concatenate([(r / evidence.data.noise[:, None]).ravel() for r in evidence.residuals])
+
+
+def _amplitude_dependent(effects: Sequence[Effect], excess: np.ndarray, data: FitData) -> bool:
+    if effects:
+        return any(effect.kind.nonlinear for effect in effects)
+    gaps = np.sqrt(np.maximum(excess.mean(axis=1), 0.0))
+    floors = np.array([np.sqrt(((data.noise / r.outputs.std(axis=1)) ** 2).mean()) for r in data.counted])
+    return bool((gaps + floors).max() > 2.0 * (gaps + floors).min() and gaps.max() > 2.0 * floors.max())

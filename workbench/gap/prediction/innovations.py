@@ -1,0 +1,118 @@
+"""Predictions one sample ahead: a rig, with all its laws, that every sample of a record sets right."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.gap.effects.structural import known_places
+from workbench.gap.prediction.unmodelled_force import driven, force_filter, sampled_model
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import follow, move, read
+
+LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
+
+
+@dataclass(frozen=True, eq=False)
+class Follower:
+    """What holds a rig beside the records: a steady Kalman filter of its modes, under random forces on all of them.
+
+    Attributes:
+        gain: (2, n_modes, n_outputs) of their displacements and velocities.
+        whitening: (n_outputs, n_outputs) to errors of unit covariance.
+    """
+
+    gain: np.ndarray
+    whitening: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        rig: Rig,
+        noise: np.ndarray,
+        force: float,
+        sample_time: float,
+        *,
+        at: float = 0.0,
+        rms: float = 0.0,
+        loose: float = LOOSE,
+    ) -> "Follower":
+        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, m, N.
+
+        Args:
+            loose: how far the rig may go its own way: random forces on it, as a share of the inputs, the less the more.
+        """
+        modes, n = rig.modes, rig.modes.n_modes
+        places = known_places(rig)
+        along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
+        forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
+        patterns, variances = np.column_stack([np.eye(n), modes.phi(at)[0]]), np.r_[forces**2, rms**2]
+        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), patterns, variances, 0.0)
+        gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
+        return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
+
+    def errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
+
+        What sensors lose by lag or clipping is not followed: it is made up for as the whole record has it.
+        """
+        return self.whitening @ self._followed(rig, record, substeps)
+
+    def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """What a rig leaves of a whole record (n_outputs, n_samples) whose laws act on the motion that was measured.
+
+        The laws then make no more of what else is missing than they really did: what is left is the structure's linear
+        answer to it. That of a rig without laws is measured less predicted.
+        """
+        errors = self._followed(rig, record, substeps)
+        model = sampled_model(rig.modes, rig.sensors, np.ones(len(rig.sensors)), record.sample_time)
+        gain = self._gain_for(rig.modes.n_modes).reshape(-1, errors.shape[0])
+        # every correction goes on to be a motion
+        return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]
+
+    def _followed(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
+        """Errors one sample ahead, in the sensors' units."""
+        slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
+        quick = _at_once(slow)
+        if quick is not slow:
+            motion = move(rig, record.inputs, sample_time=dt, substeps=substeps)
+            measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
+        gain = self._gain_for(rig.modes.n_modes)
+        return follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps)
+
+    def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
+        """What the errors of a linear rig over a whole record leave of themselves when every sample sets it right.
+
+        Args:
+            rig: with its predictions in closed form.
+            left: (n_outputs, n_samples) measured less predicted.
+            sample_time: s.
+            substeps: of a sample, where damping couples the modes.
+        """
+        sensors = tuple(Sensor(sensor.name, sensor.at, sensor.quantity, gain=sensor.gain) for sensor in rig.sensors)
+        bare = replace(rig, actuators=(), elements=(), sensors=sensors)
+        gain, no_inputs = self._gain_for(rig.modes.n_modes), np.zeros((0, left.shape[1]))
+        substeps = 1 if rig.modes.proportional else substeps
+        return self.whitening @ follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
+
+    def _gain_for(self, n_modes: int) -> np.ndarray:
+        """The gain with none for modes that are more than it knows of."""
+        gain = np.zeros((2, n_modes, self.whitening.shape[0]))
+        known = min(n_modes, self.gain.shape[1])
+        gain[:, :known] = self.gain[:, :known]
+        return gain
+
+
+def _unrounded(rig: Rig) -> Rig:
+    """The rig itself where no sensor rounds."""
+    if not any(sensor.step for sensor in rig.sensors):
+        return rig
+    return replace(rig, sensors=tuple(replace(s, step=0.0) if s.step else s for s in rig.sensors))
+
+
+def _at_once(rig: Rig) -> Rig:
+    """The rig itself where no sensor lags or clips."""
+    if not any(sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors):
+        return rig
+    return replace(rig, sensors=tuple(replace(sensor, time_constant=0.0, limit=np.inf) for sensor in rig.sensors))

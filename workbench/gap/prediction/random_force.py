@@ -1,0 +1,174 @@
+"""A random disturbance: no prediction can hold it, so it is found by what it does to the statistics."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from workbench.gap.effects.environment import tone
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import (
+    ForceFilter,
+    SampledModel,
+    force_filter,
+    log_likelihood,
+    sampled_model,
+    smoothed_states,
+    whiten,
+)
+from workbench.rig.rig import Rig
+
+COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))
+LEVEL_SPREAD = 0.15
+WHITENED = 0.08
+FOLLOWS = 0.1
+TONAL = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class RandomForceFit:
+    """A random force at x with the same strength and colour in every record.
+
+    Attributes:
+        at: m.
+        rms: of the process, N; its part above what the structure answers to is a guess.
+        at_std: standard deviation, m.
+        memory, stages: colour of the force; see `force_filter`.
+        cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
+        chi2_by_record: (n_records,) mean squares of the whitened residual.
+        rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records tell.
+        follows: largest share of the force that the inputs and the motion of its record account for.
+        tonal: least share of the force of a record that one sinusoid accounts for.
+    """
+
+    at: float
+    rms: float
+    at_std: float
+    memory: float
+    stages: int
+    cost: float
+    chi2_by_record: np.ndarray
+    rms_by_record: np.ndarray
+    follows: float
+    tonal: float
+
+    @property
+    def seen_rms(self) -> tuple[float, float]:
+        """Rms over all records of the force that acted, N, and the standard deviation of that, from their scatter."""
+        power = self.rms_by_record**2
+        rms = float(np.sqrt(power.mean()))
+        scatter = float(power.std(ddof=1)) if power.size > 1 else float(power[0])
+        return rms, scatter / (2.0 * rms * np.sqrt(power.size))
+
+    @property
+    def holds(self) -> bool:
+        """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
+        no single tone, which could be predicted.
+        """
+        spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
+        whitened = np.abs(self.chi2_by_record - 1.0).max()
+        return bool(spread < LEVEL_SPREAD and whitened < WHITENED and self.follows < FOLLOWS and self.tonal < TONAL)
+
+
+def fit_random_force(
+    rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[float], size: float
+) -> RandomForceFit:
+    """Maximum likelihood of place, strength and colour, from the best of a grid.
+
+    Args:
+        residuals: (n_outputs, n_samples) a record, in the sensors' units.
+        places: positions to start from, m.
+        size: a typical force, N.
+    """
+    model = sampled_model(rig.modes, rig.sensors, data.noise, data.counted[0].sample_time)
+    residuals, length = list(residuals), rig.modes.length
+    quick = residuals[:2]
+
+    def filter_at(x: float, log_rms: float, memory: float, stages: int) -> ForceFilter:
+        variance = np.exp(2.0 * log_rms) / _power(memory, stages)
+        return force_filter(model, rig.modes.phi(x * length).T, np.array([variance]), memory, stages)
+
+    def loss(point: np.ndarray, stages: int, records: list[np.ndarray]) -> float:
+        x, memory = point[0], 1.0 / (1.0 + np.exp(-point[2]))
+        if not 0.0 < x < 1.0 or memory > 0.9995:
+            return 1e300
+        value = -2.0 * log_likelihood(filter_at(x, point[1], memory, stages), records)
+        return value if np.isfinite(value) else 1e300
+
+    grid = [
+        (np.array([x / length, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))]), stages)
+        for x in places
+        for share in (3e-3, 3e-2, 3e-1)
+        for memory, stages in COLOURS
+    ]
+    start, stages = min(grid, key=lambda candidate: loss(candidate[0], candidate[1], quick))
+    simplex = np.array([start, start + (0.03, 0, 0), start + (0, 0.5, 0), start + (0, 0, 0.7)])
+    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 160}
+    found = minimize(loss, start, args=(stages, residuals), method="Nelder-Mead", options=options)
+    x, log_rms, logit = found.x
+    memory = float(1.0 / (1.0 + np.exp(-logit)))
+    kalman = filter_at(x, log_rms, memory, stages)
+    n_values = sum(r.size for r in residuals)
+    noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
+    forces = [smoothed_states(kalman, r)[2 * rig.modes.n_modes] for r in residuals]
+    return RandomForceFit(
+        at=float(x * length),
+        rms=float(np.exp(log_rms)),
+        at_std=_deviation(lambda p: loss(p, stages, residuals), found.x, 0, 2e-3) * length,
+        memory=memory,
+        stages=stages,
+        cost=float((found.fun - noise_part) / n_values),
+        chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
+        rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
+        follows=max(
+            followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
+            for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
+        ),
+        tonal=min(tonal(force, data.counted[0].sample_time) for force in forces),
+    )
+
+
+def tonal(force: np.ndarray, sample_time: float) -> float:
+    """Share of a force that its strongest sinusoid accounts for."""
+    _, amplitude, _ = tone(force, sample_time)
+    return float(min(0.5 * amplitude**2 / max(force.var(), 1e-300), 1.0))
+
+
+def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceFilter:
+    """The filter of a fitted random force."""
+    variance = found.rms**2 / _power(found.memory, found.stages)
+    return force_filter(model, rig.modes.phi(found.at).T, np.array([variance]), found.memory, found.stages)
+
+
+def _power(memory: float, stages: int) -> float:
+    """Variance of the force per variance of what drives its colour: Σ C(k + s - 1, s - 1)² m^2k over k, of s stages."""
+    x = memory**2
+    return {1: 1.0, 2: 1.0 + x, 3: 1.0 + 4.0 * x + x**2}[stages] / (1.0 - x) ** (2 * stages - 1)
+
+
+def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:
+    """Share of the force that the inputs and the motion they cause account for, chance taken off.
+
+    The motion (2, n_samples), displacement and velocity at the force, is the model's without the force: that of the
+    real structure has part of the force in it, whatever the force follows.
+    """
+    active = [row for row in inputs if np.any(row)]
+    if not active:
+        return 0.0
+    w, v = motion
+    lags = [np.roll(row, lag) for row in active for lag in (0, 1, 2, 4, 8, 16)]
+    followed = np.array([*lags, w, v, w**2, w**3, v * np.abs(v)])[:, 16:]
+    followed = (followed / np.linalg.norm(followed, axis=1, keepdims=True).clip(1e-300)).T
+    target = force[16:] - force[16:].mean()
+    fitted = followed @ np.linalg.lstsq(followed, target, rcond=None)[0]
+    return float(max(fitted @ fitted / (target @ target) - 3.0 * followed.shape[1] / target.size, 0.0))
+
+
+def _deviation(loss, point: np.ndarray, j: int, step: float) -> float:
+    """From the curvature of minus twice the log-likelihood."""
+    ahead, behind = point.copy(), point.copy()
+    ahead[j] += step
+    behind[j] -= step
+    curvature = (loss(ahead) - 2.0 * loss(point) + loss(behind)) / step**2
+    return float(np.sqrt(2.0 / curvature)) if 0 < curvature < 1e300 else 0.0

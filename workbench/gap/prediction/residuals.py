@@ -1,0 +1,172 @@
+"""The fit records as a yardstick: how far a rig's prediction stands from them, in units of the noise."""
+
+from collections import OrderedDict
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from threading import Lock
+
+import numpy as np
+
+from workbench.gap.prediction.innovations import LOOSE, Follower
+from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import Motion, is_stepped, move, read, steps_exactly
+
+REMEMBERED = 24
+
+
+@dataclass(frozen=True, eq=False)
+class FitData:
+    """Records that a fit may see. Validation records never become part of one.
+
+    Attributes:
+        records: measured, all with the rig's inputs and outputs.
+        noise: (n_outputs,) standard deviation of each sensor's noise, rounding included.
+        substeps: of a sample, for rigs that are not linear.
+        lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
+            rest that the simulation assumes to the motion it really had.
+        whitener: filter of a random force on the structure, through which every residual is seen; None where there is
+            none. With a follower, laws then act on the motion that was measured: that of the rig has no such force.
+        given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
+            believed figures that are fitted along with every candidate to first order; None where none are.
+        follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
+            they are of the whole record.
+    """
+
+    records: tuple[Record, ...]
+    noise: np.ndarray
+    substeps: int = 4
+    lead: int = 0
+    whitener: ForceFilter | None = None
+    given_way: tuple[np.ndarray, np.ndarray] | None = None
+    follower: Follower | None = None
+    _memory: OrderedDict = field(default_factory=OrderedDict, repr=False, init=False)
+    _lock: Lock = field(default_factory=Lock, repr=False, init=False)
+
+    @property
+    def n_values(self) -> int:
+        """Number of measured values."""
+        return sum(record.outputs.size for record in self.counted)
+
+    def only(self, names: tuple[str, ...]) -> "FitData":
+        """The same yardstick on some of the records."""
+        return replace(self, records=tuple(r for r in self.records if r.name in names))
+
+    def of_outputs(self, names: tuple[str, ...]) -> "FitData":
+        """The same yardstick on some of the outputs."""
+        kept = [self.records[0].output_names.index(name) for name in names]
+        return replace(self, records=tuple(r.only(names) for r in self.records), noise=self.noise[kept])
+
+    def stepped(self, substeps: int) -> "FitData":
+        """The same yardstick with other substeps."""
+        return replace(self, substeps=substeps)
+
+    def through(self, whitener: ForceFilter, follower: Follower) -> "FitData":
+        """The same yardstick beside a random force."""
+        return replace(self, whitener=whitener, follower=follower)
+
+    def giving_way(self, sensitivity: np.ndarray) -> "FitData":
+        """The same yardstick with residuals as small as believed figures make them, to first order.
+
+        Their squares sum to min over δ of |r + S δ|² + |δ|²: that of r times the root of I - S (Sᵀ S + I)⁻¹ Sᵀ.
+
+        Args:
+            sensitivity: (n_values, n_figures) S, in units of the belief in each figure.
+        """
+        directions, sizes, _ = np.linalg.svd(sensitivity, full_matrices=False)
+        return replace(self, given_way=(directions, 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)))
+
+    def following(self, rig: Rig, loose: float = LOOSE) -> "FitData":
+        """The same yardstick on predictions one sample ahead, by a rig held beside the records as this one would be.
+
+        Args:
+            loose: random forces on it, as a share of the inputs: the less, the more it goes its own way.
+        """
+        if self.whitener is not None:  # its innovations are errors one sample ahead as they are
+            return replace(self, given_way=None)
+        follower = Follower.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
+        return replace(self, follower=follower, given_way=None)
+
+    @cached_property
+    def force_rms(self) -> float:
+        """Root mean square of the inputs that are not at rest, N."""
+        squares = [row[row != 0] ** 2 for record in self.counted for row in record.inputs if np.any(row)]
+        return float(np.sqrt(np.mean(np.concatenate(squares)))) if squares else 1.0
+
+    @cached_property
+    def counted(self) -> tuple[Record, ...]:
+        """The records without their lead."""
+        if self.lead == 0:
+            return self.records
+        return tuple(record.between(record.time[min(self.lead, record.n_samples - 1)]) for record in self.records)
+
+    def motions(self, rig: Rig) -> tuple[Motion, ...]:
+        """The rig's motion on each record; the last few are remembered, since a sensor's fault does not change it."""
+        key = (id(rig.modes), rig.actuators, rig.elements, rig.stiffness_rate)
+        with self._lock:
+            if key in self._memory:
+                self._memory.move_to_end(key)
+                return self._memory[key][1]
+        motions = tuple(
+            move(rig, record.inputs, sample_time=record.sample_time, substeps=self.substeps).after(self.lead)
+            for record in self.records
+        )
+        with self._lock:
+            self._memory[key] = (rig.modes, motions)
+            while len(self._memory) > REMEMBERED:
+                self._memory.popitem(last=False)
+        return motions
+
+    def predictions(self, rig: Rig) -> tuple[np.ndarray, ...]:
+        """(n_outputs, n_samples) a record."""
+        return tuple(
+            read(rig, motion, sample_time=record.sample_time)
+            for record, motion in zip(self.counted, self.motions(rig), strict=True)
+        )
+
+    def residual(self, rig: Rig) -> np.ndarray:
+        """(measured - predicted) / noise, or their innovations of unit variance, all records joined: (n_values,)."""
+        residual = self._left(rig)
+        if self.given_way is not None:
+            directions, shares = self.given_way
+            residual -= directions @ (shares * (directions.T @ residual))
+        return residual
+
+    def _left(self, rig: Rig) -> np.ndarray:
+        follower = self.follower
+        if self.whitener is not None:
+            return np.concatenate([whiten(self.whitener, r).ravel() for r in self.left_beside(rig, follower)])
+        if follower is None:
+            return np.concatenate([(r / self.noise[:, None]).ravel() for r in self._whole(rig)])
+        if is_stepped(rig) or steps_exactly(rig):
+            substeps = self.substeps if is_stepped(rig) else 1
+            ahead = [follower.errors(rig, record, substeps) for record in self.records]
+        else:
+            dt, whole = self.records[0].sample_time, self._from_the_first_sample._whole(rig)
+            ahead = [follower.errors_of_linear(rig, left, dt, self.substeps) for left in whole]
+        return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
+
+    @cached_property
+    def _from_the_first_sample(self) -> "FitData":
+        return replace(self, lead=0) if self.lead else self
+
+    def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
+        """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
+        if follower is None or not is_stepped(rig) or rig.stiffness_rate:
+            return self._whole(rig)
+        return [follower.left(rig, record, self.substeps)[:, self.lead :] for record in self.records]
+
+    def _whole(self, rig: Rig) -> list[np.ndarray]:
+        both = zip(self.counted, self.predictions(rig), strict=True)
+        return [record.outputs - prediction for record, prediction in both]
+
+    def by_channel(self, residual: np.ndarray) -> np.ndarray:
+        """Mean square of a residual by record and channel: (n_records, n_outputs)."""
+        rows, start = [], 0
+        for record in self.counted:
+            size = record.outputs.size
+            with np.errstate(over="ignore"):  # of a motion that runs away
+                rows.append((residual[start : start + size].reshape(record.outputs.shape) ** 2).mean(axis=1))
+            start += size
+        return np.array(rows)

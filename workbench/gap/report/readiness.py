@@ -1,0 +1,259 @@
+"""Before a fit: do the records fit the model, which effects could they show, and which could they not tell apart?"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.structural import RESOLUTION
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.residuals import FitData
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import simulate
+
+ALIKE = 0.995
+SEEN = 25.0  # of chi-squared: five standard deviations
+TURNED = -0.95
+FAR_OFF, HEARD = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
+ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
+STUCK = 0.5
+THINNING = 3
+COARSELY = 2  # substeps of a sample: whether an effect shows needs no more
+STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
+DECADES = (1e2, 1e-2, 1e4, 1e-4)
+
+
+class RecordsError(ValueError):
+    """Records that cannot be of the rig they came with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readiness:
+    """What the records could tell, before anything is fitted.
+
+    Attributes:
+        strengths: label of an effect -> how far it would move the residual, in standard deviations, at the first
+            strength that these records show, or at the one they show most.
+        invisible: labels of effects that these records show at no strength.
+        alike: pairs of labels whose responses are the same up to a factor, with their correlation.
+    """
+
+    strengths: dict[str, float]
+    invisible: tuple[str, ...]
+    alike: tuple[tuple[str, str, float], ...]
+
+
+def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -> None:
+    """Refuse records whose channels cannot be what the rig says they are.
+
+    Args:
+        settle: seconds at the start of each record that are not compared.
+
+    Raises:
+        RecordsError: a sensor that reads with the wrong sign or in other units, a saturated or flat channel, a record
+            shorter than a period of the first mode, inputs that are all at rest.
+    """
+    elastic = rig.modes.omega[rig.modes.omega > 0]
+    _check_not_stuck(rig, records)
+    signs, sizes = [], []
+    lead = round(settle / records[0].sample_time)
+    for record in records:
+        if elastic.size and record.n_samples * record.sample_time < 2 * np.pi / elastic[0]:
+            raise RecordsError(
+                f"record {record.name!r} lasts {record.n_samples * record.sample_time:g} s, less than a period of the"
+                f" first mode ({2 * np.pi / elastic[0]:g} s); take a longer record"
+            )
+        if (record.n_inputs and not np.any(record.inputs)) or record.n_samples < lead + 2:
+            continue
+        predicted = simulate(rig, record.inputs, sample_time=record.sample_time).outputs[:, lead:]
+        outputs = record.outputs[:, lead:]
+        row = []
+        for sensor, measured, expected in zip(rig.sensors, outputs, predicted, strict=True):
+            if np.ptp(measured) == 0:
+                raise RecordsError(f"record {record.name!r}: output {sensor.name!r} is flat; is the sensor alive?")
+            row.append(np.corrcoef(measured, expected)[0, 1] if np.ptp(expected) > 0 else 0.0)
+        signs.append(row)
+        sizes.append(_sizes(rig, outputs, predicted, np.array(row)))
+    if not signs:
+        raise RecordsError("every input of every record is at rest; there is nothing to compare")
+    _check_units(rig, records[0], np.array(sizes))
+    turned = np.flatnonzero((np.array(signs) < TURNED).all(axis=0))
+    if turned.size and turned.size < len(rig.sensors):
+        name = rig.sensors[turned[0]].name
+        raise RecordsError(
+            f"output {name!r} reads with the wrong sign: its correlation with the model is"
+            f" {np.array(signs)[:, turned[0]].mean():.2f} in every record; turn it round"
+        )
+
+
+def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndarray) -> np.ndarray:
+    """Each sensor's reading over the model's (n_sensors,); NaN where the model's is lost in the noise, or is another's.
+
+    Args:
+        alike: (n_sensors,) correlation of the two. What nobody modelled may be far stronger than the inputs, but does
+            not go as their reply does.
+    """
+    noise = np.array([sensor.noise_std for sensor in rig.sensors])
+    expected = predicted.std(axis=1)
+    told = (expected > HEARD * noise) & (np.abs(alike) > ALIKE_IN_SHAPE)
+    return np.where(told, measured.std(axis=1) / np.where(told, expected, 1.0), np.nan)
+
+
+def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
+    """A channel that goes as the model does, and reads fifty times too much or too little in every record.
+
+    Args:
+        record: any, for its units.
+        sizes: (n_records, n_sensors) readings over the model's.
+    """
+    heard = [column[np.isfinite(column)] for column in sizes.T]
+    off = [j for j, ratios in enumerate(heard) if ratios.size and _always_far_off(ratios)]
+    if not off:
+        return
+    if len(off) == sum(ratios.size > 0 for ratios in heard) > 1:
+        raise RecordsError(
+            f"the outputs read about {_about(np.concatenate(heard))} times what the model makes of the inputs: are"
+            f" outputs, inputs and model in units that fit, {_units(record)}?"
+        )
+    name, unit = rig.sensors[off[0]].name, record.output_channels[off[0]].unit or "its unit"
+    raise RecordsError(
+        f"output {name!r} reads about {_about(heard[off[0]])} times what the model predicts in every record: is it in"
+        f" {unit}?"
+    )
+
+
+def _always_far_off(ratios: np.ndarray) -> bool:
+    return bool((ratios > FAR_OFF).all() or (ratios < 1.0 / FAR_OFF).all())
+
+
+def _about(ratios: np.ndarray) -> str:
+    return f"{float(f'{np.median(ratios):.2g}'):g}"
+
+
+def _units(record: Record) -> str:
+    units = (channel.unit for channel in (*record.input_channels, *record.output_channels))
+    return ", ".join(dict.fromkeys(unit for unit in units if unit))
+
+
+def check_modes(rig: Rig) -> None:
+    """Refuse modes that are not those of the structure behind them.
+
+    Effects of the structure are solved anew on it: what was changed on the modes alone would be lost in them.
+
+    Raises:
+        ValueError: a natural frequency or a damping that the structure does not have.
+    """
+    if rig.structure is None:
+        return
+    modes, own = rig.modes, rig.structure.modes(rig.modes.n_modes, tolerance=RESOLUTION)
+    remedy = "; take the structure's own modes, or structure=None for modes of your own"
+    off = np.abs(modes.omega - own.omega) > STRAY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
+    if off.any():
+        r = int(np.argmax(off))
+        raise ValueError(
+            f"mode {r + 1} of the rig has {modes.frequencies_hz[r]:.6g} Hz, that of its structure"
+            f" {own.frequencies_hz[r]:.6g} Hz{remedy}"
+        )
+    damping, expected = np.diag(modes.damping), np.diag(own.damping)
+    off = np.abs(damping - expected) > MISJUDGED * np.maximum(expected, expected.max() / own.n_modes**2)
+    if off.any():
+        r = int(np.argmax(off))
+        raise ValueError(
+            f"mode {r + 1} of the rig is damped by {damping[r]:.4g} rad/s, that of its structure by"
+            f" {expected[r]:.4g} rad/s{remedy}"
+        )
+
+
+def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
+    """A sensor that clips in some records is an effect to be named; one that clips most of the time shows nothing."""
+    for j, sensor in enumerate(rig.sensors):
+        top = max(float(np.abs(record.outputs[j]).max()) for record in records)
+        stuck = [np.abs(record.outputs[j]) >= top * (1 - 1e-9) for record in records]
+        share = np.concatenate(stuck).mean()
+        if top > 0 and share > STUCK:
+            raise RecordsError(
+                f"record {records[int(np.argmax([s.mean() for s in stuck]))].name!r}: output {sensor.name!r} stands at"
+                f" ±{top:g} for {100 * share:.0f} % of all its samples: it is saturated; lower the level or the gain"
+            )
+
+
+def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) -> Readiness:
+    """Simulate each effect at a strength that the records show, and compare the responses."""
+    rig, data = evidence.rig, evidence.data.stepped(COARSELY)
+    base = data.residual(rig)
+    labels, signatures, strengths = [], [], {}
+    things = [(k, target) for k in catalogue if k is not RANDOM_DISTURBANCE for target in k.targets(rig)]
+    for effect, change in evidence.workers.map(lambda thing: _first_seen(*thing, evidence, data, base), things):
+        if effect is None:
+            continue
+        size = float(np.linalg.norm(change))
+        strengths[effect.label] = size * float(np.sqrt(THINNING))
+        if size**2 * THINNING > SEEN:
+            labels.append(effect.label)
+            signatures.append((change / size).astype(np.float32))
+    correlation = np.abs(np.array(signatures) @ np.array(signatures).T) if signatures else np.zeros((0, 0))
+    alike = [
+        (labels[i], labels[j], float(correlation[i, j]))
+        for i in range(len(labels))
+        for j in range(i + 1, len(labels))
+        if correlation[i, j] > ALIKE and labels[i].split("[")[0] != labels[j].split("[")[0]
+    ]
+    return Readiness(
+        strengths=strengths,
+        invisible=tuple(label for label, size in strengths.items() if size**2 <= SEEN),
+        alike=tuple(sorted(alike, key=lambda pair: -pair[2])),
+    )
+
+
+def _first_seen(kind: Kind, target, evidence: Evidence, data: FitData, base: np.ndarray):
+    """The first strength of a kind that these records show, or the one that they show most; and what it changes."""
+    best, change, most = None, np.zeros(0), -1.0
+    for effect in _strengths(kind, target, evidence):
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                moved = (data.residual(effect.apply(evidence.rig)) - base)[::THINNING]
+                size = float(moved @ moved) * THINNING
+            except (ValueError, np.linalg.LinAlgError):
+                continue
+        if np.isfinite(size) and size > most:
+            best, change, most = effect, moved, size
+        if most > SEEN:
+            break
+    return best, change
+
+
+def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
+    """Where a search would start, and from the first and the last start each number by decades up and down.
+
+    A search starts from the missing force, and where none is missing it starts from nothing, and anywhere: also by a
+    support, where nothing shows. So the last resort is where the structure moves most.
+    """
+    starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+    if starts:
+        yield starts[0]
+        yield from _by_decades(starts[0], evidence.rig)
+        yield from starts[1:]
+        yield from _by_decades(starts[-1], evidence.rig)
+        if "at" in starts[0].values:
+            liveliest = replace(starts[0], values={**starts[0].values, "at": _liveliest(evidence)})
+            yield liveliest
+            yield from _by_decades(liveliest, evidence.rig)
+
+
+def _liveliest(evidence: Evidence) -> float:
+    """The place that moves most, of those where a force is looked for, m."""
+    power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
+    shapes = evidence.rig.modes.phi(evidence.places)
+    return float(evidence.places[np.argmax(np.sum((shapes @ power) * shapes, axis=1))])
+
+
+def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
+    for factor in DECADES:
+        for parameter in effect.parameters(rig):
+            if parameter.name != "at":
+                moved = float(np.clip(effect.values[parameter.name] * factor, parameter.low, parameter.high))
+                yield replace(effect, values={**effect.values, parameter.name: moved})

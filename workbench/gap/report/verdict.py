@@ -1,0 +1,251 @@
+"""The verdict on a gap: where, which, how far, in a sentence and as JSON."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.gap.effects.beyond import any_beyond
+from workbench.gap.effects.effect import ALL, Effect
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.nominal import NOMINAL_FIGURES
+from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
+from workbench.gap.effects.structural import known_places, place_name
+from workbench.gap.localisation.where import Where
+from workbench.gap.report.experiment import Experiment
+from workbench.gap.report.readiness import Readiness
+from workbench.gap.report.shrinkage import Shrinkage
+from workbench.gap.search.attribute import Attribution
+from workbench.rig.rig import Rig
+
+BESIDE = 0.02  # of the length: as near as a place is asked for
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict:
+    """What a diagnosis says.
+
+    Attributes:
+        case: its name.
+        outcome: "none" (no gap beyond noise), "explained", "part" (explained in part) or "unknown".
+        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown".
+        alternatives: (label of a rival set, probability), best first.
+        where: the gap taken apart.
+        shrinkage: on validation records; None without any.
+        corrected: the rig with the effects in it.
+        nominal: the rig as it was handed in.
+        attribution: the whole search.
+        readiness: what the records could tell before anything was fitted.
+        experiment: what to measure next, where rivals remain.
+        notes: what else a reader should know.
+    """
+
+    case: str
+    outcome: str
+    effects: tuple[Effect, ...]
+    alternatives: tuple[tuple[str, float], ...]
+    where: Where
+    shrinkage: Shrinkage | None
+    corrected: Rig
+    nominal: Rig
+    attribution: Attribution
+    readiness: Readiness
+    experiment: Experiment | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def _told(self) -> tuple[Effect, ...]:
+        """The effects, rounding or clipping of every sensor told once."""
+        told = [e for e in self.effects if e.kind is not NOMINAL_FIGURES] or list(self.effects)
+        for kind, field in ((SENSOR_QUANTISATION, "step"), (SENSOR_CLIPPING, "limit")):
+            same = [e for e in told if e.kind is kind]
+            if len(same) == len(self.nominal.sensors) > 1:
+                told = [e for e in told if e.kind is not kind]
+                told.insert(0, Effect(kind, ALL, {field: float(np.median([e.values[field] for e in same]))}))
+        return tuple(told)
+
+    @property
+    def place_stands(self) -> bool:
+        """Whether one force, of any law, makes the gap, and effects that explain it do not contradict its place."""
+        if not self.where.place.holds:
+            return False
+        if self.outcome != "explained":
+            return True
+        near = max(3.0 * self.where.at_std, BESIDE * self.nominal.modes.length)
+        acting = [e for e in self.effects if "at" in e.values and e.kind.path in ("structure", "environment")]
+        return any(abs(effect.values["at"] - self.where.at) < near for effect in acting)
+
+    @property
+    def nominal_figures(self) -> dict[str, float | None]:
+        """Factors on the nominal figures that were fitted along with the effects; empty where none were."""
+        freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES]
+        return _rounded_all(freed[0].values) if freed else {}
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in one sentence."""
+        if self.outcome == "none":
+            return "There is no gap beyond the noise of the sensors."
+        words = " and ".join(_described(effect, self.nominal) for effect in self._told)
+        closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
+        if any(effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION) for effect in self.effects):
+            verb = "accounts" if len(self._told) == 1 else "account"
+            text = f"{words} {verb} for the gap, part of which nothing can predict."
+        elif self.outcome == "explained":
+            text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
+            freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES and e not in self._told]
+            text += f", with nominal figures a little off ({_off_by(freed[0])})" if freed else ""
+            text += self._not_excluded
+        else:
+            text = "No effect of the catalogue, alone or with another, explains the gap"
+            if not any_beyond(self.effects):
+                text += f"; the nearest, {words}, would close {closed or 'part of '}it."
+            elif self.alternatives:
+                text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
+            else:
+                text += f"; {words} explains {closed}it."
+        return text[0].upper() + text[1:]
+
+    @property
+    def _not_excluded(self) -> str:
+        """The end of the sentence: rivals that remain."""
+        near = [label for label, probability in self.alternatives if probability > 0.01]
+        return f"; {' and '.join(near)} cannot be excluded." if near else "."
+
+    def to_json(self) -> dict:
+        """The verdict as the case format asks for it, and what stands behind it."""
+        known = self.outcome in ("none", "explained")
+        effects = [effect_json(effect, self.nominal) for effect in self._told]
+        shrink = self.shrinkage
+        return {
+            "case": self.case,
+            "outcome": self.outcome,
+            "sentence": self.sentence,
+            "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
+            "nearest": [] if known else effects,
+            "alternatives": [{"kind": label, "probability": _rounded(p)} for label, p in self.alternatives],
+            "where": where_json(self.where),
+            "gap": {
+                "before": _rounded_all(shrink.before if shrink else {}),
+                "after": _rounded_all(shrink.after if shrink else {}),
+                "floor": _rounded_all(shrink.floor if shrink else {}),
+            },
+            "shrinkage": {
+                **_rounded_all(shrink.share if shrink else {}),
+                **({"ci95": [_rounded(c) for c in shrink.ci95]} if shrink else {}),
+            },
+            "residual": {
+                "nominal": _rounded(self.attribution.nominal_cost),
+                "corrected": _rounded(self.attribution.best.cost),
+            },
+            "check": {
+                "invisible": list(self.readiness.invisible),
+                "alike": [list(pair[:2]) for pair in self.readiness.alike],
+            },
+            "next_experiment": None if self.experiment is None else self.experiment.sentence,
+            "nominal_figures": self.nominal_figures,
+            "notes": list(self.notes),
+        }
+
+
+def effect_json(effect: Effect, nominal: Rig) -> dict:
+    """One effect: kind, parameters with their standard deviations, place, input or output."""
+    values = {name: value for name, value in effect.values.items() if name != "at"}
+    if effect.kind.name == "truncated_modes":
+        values = {"kept": nominal.modes.n_modes, "needed": int(effect.target or 0)}
+    if "phase" in values:
+        values["phase"] = float((values["phase"] + np.pi) % (2.0 * np.pi) - np.pi)
+    entry: dict = {"kind": effect.kind.name, "parameters": {n: _rounded(v) for n, v in values.items()}}
+    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n != "at"}
+    if deviations:
+        entry["parameters_std"] = deviations
+    if effect.kind.path in ("actuator", "sensor"):
+        entry["input" if effect.kind.path == "actuator" else "output"] = effect.target
+    if effect.kind.name == "support_rotation":
+        entry["at"], entry["at_std"] = (0.0 if effect.target == "left" else nominal.modes.length), 0.0
+    elif "at" in effect.values:
+        entry["at"] = _rounded(effect.values["at"])
+        entry["at_std"] = _rounded(effect.deviations.get("at", 0.0))
+    return entry
+
+
+def where_json(where: Where) -> dict:
+    """Where, as plain numbers."""
+    return {
+        "path": where.path,
+        "modes": list(where.modes),
+        "amplitude_dependent": where.amplitude_dependent,
+        "linear_share": _rounded(where.linear_share),
+        "point": {
+            "at": _rounded(where.at),
+            "at_std": _rounded(where.at_std),
+            "share": _rounded(where.place.share),
+            "one_force": where.place.holds,
+        },
+        "by_mode": [_rounded(s) for s in where.mode_shares],
+        "by_band": {
+            "edges_hz": [_rounded(f) for f in where.band_edges_hz],
+            "shares": [_rounded(s) for s in where.band_shares],
+        },
+        "by_sensor": [_rounded(s) for s in where.sensor_shares],
+        "by_record": {
+            name: {"gap": _rounded(gap), "input_rms": _rounded(level), "by_eighth": [_rounded(s) for s in shares]}
+            for name, gap, level, shares in zip(
+                where.record_names, where.record_gaps, where.input_levels, where.time_shares, strict=True
+            )
+        },
+    }
+
+
+def _described(effect: Effect, nominal: Rig) -> str:
+    """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
+    units = {p.name: p.unit for p in effect.parameters(nominal)}
+    numbers = [
+        " ".join((name.replace("_", " "), _with_deviation(effect.values[name], effect.deviations.get(name, 0.0)), unit))
+        for name, unit in units.items()
+        if name != "at"
+    ]
+    text = effect.kind.words
+    if effect.kind is NOMINAL_FIGURES:
+        text += f" ({_off_by(effect)})"
+    elif effect.kind.name == "truncated_modes":
+        text += f" ({effect.target} are needed, {nominal.modes.n_modes} are kept)"
+    elif numbers:
+        text += f" ({', '.join(n.strip() for n in numbers)})"
+    if effect.kind.path in ("actuator", "sensor"):
+        text += ", all of them" if effect.target == ALL else f", {effect.target}"
+    elif effect.kind.name == "support_rotation":
+        text += f" at the {effect.target} end"
+    if "at" in effect.values and known_places(nominal) is not None:
+        text += f" at {place_name(nominal, effect.values['at'])}"
+    elif "at" in effect.values:
+        text += f" at x = {_with_deviation(effect.values['at'], effect.deviations.get('at', 0.0))}"
+    return text
+
+
+def _off_by(figures: Effect) -> str:
+    """How far the nominal figures are off: frequencies -0.5 to 0.6 %, damping ratios -10 to 13 %."""
+    ranges = []
+    for one, more, name in (("frequency", "frequencies", "frequency"), ("damping ratio", "damping ratios", "damping")):
+        percent = [100.0 * (value - 1.0) for figure, value in figures.values.items() if figure.startswith(name)]
+        ends = f"{min(percent):.2g}", f"{max(percent):.2g}"
+        ranges.append(f"{one if len(percent) == 1 else more} {' to '.join(dict.fromkeys(ends))} %")
+    return ", ".join(ranges)
+
+
+def _with_deviation(value: float, deviation: float) -> str:
+    if not deviation > 0 or not np.isfinite(deviation):
+        return f"{value:.4g}"
+    if deviation < 5e-4 * abs(value):
+        return f"{value:.4g}"
+    digits = max(0, -int(np.floor(np.log10(deviation))))
+    if digits > 4 or abs(value) >= 1e5:
+        return f"{value:.4g} ± {deviation:.1g}"
+    return f"{value:.{digits}f} ± {deviation:.{digits}f}"
+
+
+def _rounded(value: float) -> float | None:
+    return float(f"{value:.6g}") if np.isfinite(value) else None
+
+
+def _rounded_all(values: dict[str, float]) -> dict[str, float | None]:
+    return {name: _rounded(value) for name, value in values.items()}

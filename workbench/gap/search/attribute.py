@@ -1,0 +1,234 @@
+"""Which effects: every kind of the catalogue tried alone, then in pairs, until the residual is noise."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.ports import clipped_level, rounding_step
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.where import of_one_sensor
+from workbench.gap.prediction.random_force import RandomForceFit
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.search.beside_nominal import decide_beside_nominal, decide_with_figures_freed
+from workbench.gap.search.beside_random import decide_on_random
+from workbench.gap.search.decide import decide
+from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.one_law import one_law, unless_another, weighed_against
+from workbench.gap.search.outcome import Decision
+from workbench.gap.search.pairs import Pairs
+from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
+from workbench.gap.search.screening import Weighed
+from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+
+FINALISTS = 8  # single effects that are fitted to whole records
+BRIEFLY = 2  # iterations, where there may be no effect at all
+SHOWN = 7  # others that are, where they are to be shown beside them
+ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
+
+
+@dataclass(frozen=True, eq=False)
+class Attribution:
+    """What the search found on the fit records.
+
+    Attributes:
+        outcome: "none", "explained", "part" or "unknown".
+        best: the chosen set of effects, fitted; empty for none; for "part" and "unknown" the nearest one, which may be
+            a law beyond the catalogue.
+        random: statistics of a random disturbance, where the set holds one.
+        rivals: other sets, best first, with their probabilities against the best.
+        nominal_cost: mean square of the nominal residual in noise units.
+        tried: effects alone that were fitted to whole records; beside the random disturbance, where one holds.
+        ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
+        evidence: of the nominal rig.
+        search: what was searched in, the records with the noise of rounded sensors among it.
+    """
+
+    outcome: str
+    best: Fit
+    random: RandomForceFit | None
+    rivals: tuple[tuple[Fit, float], ...]
+    nominal_cost: float
+    tried: tuple[Fit, ...]
+    ahead: tuple[Fit, ...]
+    evidence: Evidence
+    search: Search
+
+    @cached_property
+    def singles(self) -> tuple[Fit, ...]:
+        """The likeliest kinds alone on whole records, best first; those that were no rivals are fitted now."""
+        kinds = {f.effects[0].kind for f in self.tried if f.effects}
+        others = [f for f in spread_over_kinds(self.ahead, 1) if f.effects[0].kind not in kinds][:SHOWN]
+
+        def on_all(candidate: Fit) -> Fit:
+            return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ALIKE)
+
+        with threadpool_limits(1, user_api="blas"):
+            fitted = self.search.workers.map(on_all, others)
+        return tuple(sorted((*self.tried, *fitted), key=lambda f: f.cost))
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """Records laid beside a rig, before any effect is guessed.
+
+    Attributes:
+        seen: rounding and clipping, which show in the readings themselves.
+        nominal: evidence of the nominal rig.
+        evidence: of the rig with what is seen.
+    """
+
+    seen: tuple[Effect, ...]
+    nominal: Evidence
+    evidence: Evidence
+
+
+def opened(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers: Workers = ALONE) -> Opened:
+    """What a rig leaves of its fit records, where a force is missing and what it does there.
+
+    Args:
+        rig: nominal.
+        records: to fit; validation records have no business here.
+        settle: seconds at the start of each record that are simulated but not counted.
+        workers: processes that share the work.
+    """
+    noise = np.array([sensor.noise_std for sensor in rig.sensors])
+    if not (noise > 0).all():
+        name = rig.sensors[int(np.argmin(noise))].name
+        raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
+    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, lead=round(settle / records[0].sample_time)))
+    evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
+    _ = evidence.at_peaks  # found once, before the work parts
+    if not seen:
+        return Opened(seen, evidence, evidence)
+    nominal = replace(Evidence.of(rig, data, workers=workers), sized=evidence.size)
+    _ = nominal.at_peaks
+    return Opened(seen, nominal, evidence)
+
+
+def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
+    """Rounding and clipping show in the readings themselves; rounding then adds its own noise to the channel's."""
+    evidence = Evidence.of(rig, data)
+    kinds = {kind.name: kind for kind in CATALOGUE}
+    seen, noise = [], data.noise.copy()
+    for j, sensor in enumerate(rig.sensors):
+        step = rounding_step(evidence, sensor.name)
+        if step is not None and step**2 / 12.0 > 0.02 * sensor.noise_std**2:
+            seen.append(Effect(kinds["sensor_quantisation"], sensor.name, {"step": step}, {"step": 0.0}))
+            noise[j] = np.hypot(noise[j], step / np.sqrt(12.0))
+        elif step is None:
+            level = clipped_level(evidence, sensor.name)
+            if level is not None:
+                seen.append(Effect(kinds["sensor_clipping"], sensor.name, {"limit": level}, {"limit": 0.0}))
+    return tuple(seen), replace(data, noise=noise)
+
+
+def attribute(
+    found: Opened,
+    *,
+    catalogue: tuple[Kind, ...] = CATALOGUE,
+    report: Callable[[str, float], None] = lambda text, share: None,
+    free_nominal: bool = False,
+) -> Attribution:
+    """Find the effects that turn the residual of a rig on its fit records into noise.
+
+    Each kind is tried alone from many starts; if none alone leaves only noise, the best few are each joined by a
+    second. A set counts as an explanation only when every record is left at its noise floor; else the outcome is
+    "part" or "unknown".
+
+    Args:
+        found: before any effect is guessed.
+        catalogue: kinds of effects to try.
+        report: told (what, share done) as the search proceeds.
+        free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
+            a little off; otherwise they are freed where no set explains the records without.
+    """
+    seen, evidence = found.seen, found.evidence
+    rig, data, workers = evidence.rig, evidence.data, evidence.workers
+    nominal = data.by_channel(data.residual(found.nominal.rig))
+    start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0, "read off the records")
+    telling = _telling(data, start)
+    quick, first = data.only(telling).stepped(2), data.only(telling[:1]).stepped(2)
+    search = Search(rig, data, quick, first, catalogue, report, workers, nominal)
+    decision: Decision | None = None
+    singles: list[Fit] = []
+    ahead: list[Fit] = []
+    if free_nominal and not search.explains(start):
+        decision, singles = decide_with_figures_freed(search, start)
+    elif not search.explains(start) and not _of_one_sensor(start):
+        decision, singles = decide_on_random(search, evidence)
+    if decision is None:
+        report("one effect", 0.1)
+        weighed = Weighed.of(search, (), evidence)
+        ahead = one_more(search, (), evidence, weighed)
+        report("one effect, on whole records", 0.3)
+        singles = _alone(search, start, ahead)
+        alone = decide(search, start, singles)
+        decision = unless_another(search, alone, evidence) if alone else None
+        decision = decision or _beside_one_sensor(search, start, evidence)
+        decision = decision or _with_a_second(search, start, ahead, weighed, evidence)
+    outcome, best, random, rivals = decision
+    if seen:
+        best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
+        outcome = "explained" if outcome == "none" else outcome
+    report("done", 1.0)
+    return Attribution(
+        outcome=outcome,
+        best=best,
+        random=random,
+        rivals=rivals,
+        nominal_cost=float(nominal.mean()),
+        tried=tuple(singles),
+        ahead=tuple(ahead),
+        evidence=found.nominal,
+        search=search,
+    )
+
+
+def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
+    """Single effects on whole records, best first."""
+    hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
+    if not search.explains(start):
+        return on_whole_records(search, hopeful, FINALISTS)
+    # only what leaves far less is of use, and there may be none
+    enough = start.cost - WORTHWHILE
+    return on_whole_records(search, hopeful, FINALISTS, to_cost=enough, at_first=BRIEFLY)
+
+
+def _of_one_sensor(start: Fit) -> bool:
+    """Whether one of several disagrees alone: its own fault is likelier than a random force, and quicker to find."""
+    excess = np.maximum(start.cost_by_channel.mean(axis=0) - 1.0, 0.0)
+    return excess.size > 1 and of_one_sensor(excess)
+
+
+def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decision | None:
+    """A random disturbance that one sensor alone shows, where its own faults do not explain that."""
+    return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
+
+
+def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighed, evidence: Evidence) -> Decision:
+    """What a second effect explains, or one law that the catalogue does not hold, or figures that are a little off."""
+    law = one_law(search, evidence)
+    pairs = Pairs(search)
+    explained = pairs.at_once(weighed)
+    if law is not None:
+        return weighed_against(law, search, pairs.decision(start))
+    if explained or pairs.by_exchange():
+        return pairs.decision(start)
+    return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, ahead)
+
+
+def _telling(data: FitData, start: Fit) -> tuple[str, ...]:
+    """The names of the two records that say most: the largest residual against the noise, and against the signal."""
+    by_record = start.cost_by_channel.mean(axis=1)
+    scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.counted])
+    order = [int(np.argmax(by_record)), *np.argsort(-(by_record - 1.0) / scale)]
+    chosen = list(dict.fromkeys(int(i) for i in order))[:2]
+    return tuple(data.records[i].name for i in chosen)

@@ -1,0 +1,169 @@
+"""What holds beside a random disturbance, which no search for effects can predict away."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
+from workbench.gap.search.finish import finished, plainest, ranked, simplest
+from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.outcome import Decision
+from workbench.gap.search.pursuit import on_whole_records, one_more
+from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped
+
+NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
+RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
+FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
+SPREAD = 0.5  # of the missing force's level over records: most forces of the rig's own follow the level of the inputs
+FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
+
+
+def looks_random(evidence: Evidence) -> bool:
+    """Whether the missing force is as strong in every record, follows little that the rig does, and is no tone."""
+    records, place = evidence.data.counted, evidence.at_peaks[0]
+    forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
+    levels = np.array([np.sqrt(np.mean(force**2)) for force in forces])
+    if len(forces) < 2 or np.ptp(levels) > SPREAD * levels.mean():
+        return False
+    if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
+        return False
+    shape = evidence.rig.modes.phi(place.at)[0]
+    motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in evidence.motions]
+    each = zip(forces, records, motions, strict=True)
+    return max(followed(force, record.inputs, motion) for force, record, motion in each) < FOLLOWS
+
+
+def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
+    """A random disturbance, alone or beside one effect, and all that was tried; None where it does not hold.
+
+    It takes much upon itself: where an effect explains the records without it, there is none.
+    """
+    search, evidence = _heard(search, (), evidence)
+    evidence = _by_laws_on_measured_motion(search, evidence)
+    if not looks_random(evidence):
+        return None, []
+    alone = with_random(search, _nothing(search), evidence)
+    if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
+        return None, []
+    beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _follower(search, search.rig, alone[1]))
+    search.report("beside a random disturbance", 0.2)
+    gaining = beside.side_by_side(simplest, _gaining(beside, evidence)[:TRIED])
+    if any(search.explains(finished(search, single)) for single in gaining):
+        return None, []
+    tried = [alone, *(with_random(search, single) for single in gaining)]
+    return _likeliest(search, tried), [found[0] for found in tried]
+
+
+def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
+    """The fits of single effects that the filter of a random force leaves something to explain, best first.
+
+    The missing force stands where the random one does; where the best of them stands, all laws are tried again.
+    """
+    cost = cost_of(beside.rig, (), beside.data)
+
+    def fitted(evidence: Evidence) -> list[Fit]:
+        fits = on_whole_records(beside, one_more(beside, (), evidence), FINALISTS)
+        return [f for f in fits if beside.surely_better(f, cost, f.n_parameters)]
+
+    found = fitted(evidence)
+    places = [f.effects[0].values["at"] for f in found if "at" in f.effects[0].values]
+    if places:
+        found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
+    return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RIVAL]
+
+
+def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decision | None:
+    """The given effects beside a random disturbance, where one holds.
+
+    Args:
+        evidence: of the rig with the given effects.
+    """
+    search, evidence = _heard(search, given.effects, evidence)
+    evidence = _by_laws_on_measured_motion(search, evidence)
+    if not looks_random(evidence):
+        return None
+    return _likeliest(search, [with_random(search, given, evidence), with_random(search, _nothing(search))])
+
+
+def _nothing(search: Search) -> Fit:
+    left = search.data.by_channel(search.data.residual(search.rig))
+    return Fit((), float(left.mean()), left, 0, "nothing added")
+
+
+def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
+    """The search and its evidence without the sensors that clip."""
+    hearing = search.hearing()
+    deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in hearing.rig.sensors}
+    if not deaf or any(effect.target in deaf for effect in effects):
+        return search, evidence
+    return hearing, hearing.evidence_of(apply_all(hearing.rig, effects))
+
+
+def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
+    """The likeliest that holds; one effect more must be worth its numbers, and so must a law over a simpler one."""
+    holding = [found for found in tried if found[1].holds]
+    if not holding:
+        return None
+    fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
+    worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
+    plain = plainest(search, [found[0] for found in worth], worth=WORTHWHILE)
+    best, rivals = ranked(search, plain)
+    return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
+
+
+def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
+    return search.surely_better(candidate, simpler.cost, candidate.n_parameters - simpler.n_parameters)
+
+
+def with_random(search: Search, given: Fit, evidence: Evidence | None = None) -> tuple[Fit, RandomForceFit]:
+    """The given effects and a random disturbance, each fitted beside the other.
+
+    Args:
+        evidence: of the rig with the given effects, where it is at hand.
+    """
+    if evidence is None:
+        evidence = search.evidence_of(apply_all(search.rig, given.effects))
+        evidence = _by_laws_on_measured_motion(search, evidence)
+    found = _random_beside(search, given, evidence)
+    if given.effects and not found[1].holds and search.near(found[0], NEAR):
+        follower = _follower(search, evidence.rig, found[1])
+        data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), follower)
+        refitted = fit(search.rig, given.effects, data, iterations=8)
+        rig = apply_all(search.rig, refitted.effects)
+        again = replace(refitted, cost_by_channel=search.data.by_channel(search.data.residual(rig)))
+        evidence = search.evidence_of(rig)
+        evidence = _by_laws_on_measured_motion(search, evidence, follower)
+        found = _random_beside(search, again, evidence)
+    return found
+
+
+def _follower(search: Search, rig: Rig, found: RandomForceFit | None = None) -> Follower:
+    """What holds a rig beside the records, a random force and all."""
+    data = search.data
+    force, at = (0.0, 0.0) if found is None else (found.rms, found.at)
+    return Follower.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
+
+
+def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Follower | None = None) -> Evidence:
+    """The evidence as it is where laws have not made much else of a force that the rig lacks."""
+    if not is_stepped(evidence.rig):
+        return evidence
+    follower = follower or _follower(search, evidence.rig)
+    return replace(evidence, residuals=tuple(search.data.left_beside(evidence.rig, follower)))
+
+
+def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
+    found = fit_random_force(evidence.rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.data.force_rms)
+    rms, rms_std = found.seen_rms
+    effect = Effect(RANDOM_DISTURBANCE, None, {"at": found.at, "rms": rms}, {"at": found.at_std, "rms": rms_std})
+    combined = Fit(
+        (*given.effects, effect), found.cost, given.cost_by_channel, given.n_parameters + 2, "maximum likelihood"
+    )
+    return combined, found

@@ -1,0 +1,163 @@
+"""A set of effects brought to its end: finer steps, other places, simpler forms, and its rank among others."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, apply_all, key_of
+from workbench.gap.effects.limiting_cases import simpler_sets, with_one_simpler
+from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.pursuit import FINE
+from workbench.gap.search.search import Search, promise
+from workbench.rig.simulate import is_stepped
+
+FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on they are tried
+STEPPING = 1e-4  # of the gap's power: what coarser substeps may leave of it
+IDLE = 0.5  # of the noise power: what an effect may take away and still be none
+NO_NEARER = 0.9
+AT_FIRST, TOO_FAR = 4, 30.0  # iterations of a simpler form on the quick records, and times a set's cost: it is none
+TRIED = 2  # iterations at each other place, before the likeliest are chosen
+LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
+APART = 0.02  # of the length: nearer, a place is the same valley
+FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
+
+
+def finished(search: Search, candidate: Fit) -> Fit:
+    """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
+    if candidate.falling == 0 and not search.explains(candidate):
+        finely = cost_of(search.rig, candidate.effects, search.data.stepped(FINE))
+        if finely - 1.0 > NO_NEARER * (candidate.cost - 1.0):
+            return _by_finest_steps(search, candidate)
+    ended = fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=25, tolerance=1e-7)
+    return _by_finest_steps(search, ended)
+
+
+def _by_finest_steps(search: Search, ended: Fit) -> Fit:
+    """The fit by the finest substeps, where it explains the records but for errors of stepping."""
+    near = ended.cost < ALL_BUT or search.near(ended, STEPPING)
+    if search.explains(ended) or not near or not is_stepped(apply_all(search.rig, ended.effects)):
+        return ended
+    # its numbers have made up for errors of stepping, so its cost by finer steps tells nothing before a fit
+    finely = fit(search.rig, ended.effects, search.data.stepped(FINEST), iterations=6, tolerance=1e-5)
+    return finely if finely.cost < ended.cost else ended
+
+
+def simplified(search: Search, candidate: Fit) -> Fit:
+    """A near miss with an effect as what it turns into at a bound, where that comes nearer.
+
+    A hysteretic spring finds its way from where a plain one does not, and then never yields.
+    """
+    here = cost_of(search.rig, candidate.effects, search.quick)
+    for effects in with_one_simpler(candidate.effects, search.rig):
+        started = fit(search.rig, effects, search.quick, iterations=6)
+        if promise(started) < here:
+            trial = finished(search, fit(search.rig, started.effects, search.data, iterations=10))
+            if trial.cost < candidate.cost:
+                return trial
+    return candidate
+
+
+def relocated(search: Search, candidate: Fit) -> Fit:
+    """The set with its places tried elsewhere: a symmetric structure has a twin valley at the mirrored place."""
+    for i, effect in enumerate(candidate.effects):
+        if "at" not in effect.values or effect.kind.path not in ("structure", "environment"):
+            continue
+        here = fit(search.rig, candidate.effects, search.quick, iterations=6)
+        for moved in _elsewhere(search, candidate.effects, i):
+            started = fit(search.rig, moved, search.quick, iterations=6)
+            if promise(started) > LOWER * here.cost:
+                continue
+            trial = fit(search.rig, started.effects, search.data, iterations=10)
+            if trial.cost < candidate.cost:
+                candidate, here = trial, started
+    return finished(search, candidate)
+
+
+def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tuple[Effect, ...]]:
+    """The set with effect i at the two likeliest other places, and mirrored."""
+    effect, length = effects[i], search.rig.modes.length
+
+    def moved(at: float, factor: float = 1.0) -> tuple[Effect, ...]:
+        values = {**effect.values, "at": float(at)}
+        if strength is not None:
+            values[strength.name] = float(np.clip(factor * values[strength.name], strength.low, strength.high))
+        return (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
+
+    strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name != "at"), None)
+    # where the structure moves less, the same effect takes more strength
+    factors = FACTORS if strength is not None else (1.0,)
+    tried = []
+    for at in length * np.linspace(0.04, 0.96, 13):
+        likeliest = min((moved(at, factor) for factor in factors), key=lambda s: cost_of(search.rig, s, search.first))
+        tried.append(fit(search.rig, likeliest, search.first, iterations=TRIED))
+    tried.sort(key=lambda f: f.cost)
+    elsewhere = [f for f in tried if abs(f.effects[i].values["at"] - effect.values["at"]) > APART * length]
+    # the mirrored place is always worth a fit of its own, whatever its cost before it
+    return [*(f.effects for f in elsewhere[:2]), moved(length - effect.values["at"])]
+
+
+def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list[Fit]:
+    """The fits without those that come to another of them at a bound, and are no better than it.
+
+    Args:
+        worth: of the noise power, what a fit must be better by at least.
+    """
+    by_key = {candidate.key: candidate for candidate in fits}
+
+    def needless(candidate: Fit) -> bool:
+        others = (by_key.get(key_of(form)) for form in simpler_sets(candidate.effects, search.rig))
+        simpler = (other for other in others if other is not None and other is not candidate)
+        return any(not (_pays(search, candidate, f) and f.cost - candidate.cost > worth) for f in simpler)
+
+    return [candidate for candidate in fits if not needless(candidate)]
+
+
+def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
+    extra = max(candidate.n_parameters - simpler.n_parameters, 1)
+    return search.surely_better(candidate, simpler.cost, extra)
+
+
+def simplest(search: Search, candidate: Fit) -> Fit:
+    """The set with effects replaced by simpler or fewer ones, where the records cannot tell them apart."""
+    here = cost_of(search.rig, candidate.effects, search.quick)
+
+    def tried(effects: tuple[Effect, ...]) -> Fit | None:
+        if promise(fit(search.rig, effects, search.quick, iterations=AT_FIRST)) > TOO_FAR * here:
+            return None
+        trial = fit(search.rig, effects, search.data.stepped(FINE), iterations=12, tolerance=1e-7)
+        return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
+
+    simpler = next(filter(None, search.workers.map(tried, _simpler_sets(search, candidate))), None)
+    return candidate if simpler is None else simplest(search, simpler)
+
+
+def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]]:
+    for effect in candidate.effects if len(candidate.effects) > 1 else ():
+        rest = tuple(other for other in candidate.effects if other is not effect)
+        if cost_of(search.rig, rest, search.data) < 1.0 + IDLE:
+            yield rest
+    yield from simpler_sets(candidate.effects, search.rig)
+
+
+def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, float], ...]]:
+    """The set of least description length, and the others with their probabilities.
+
+    The likelihood of tens of thousands of values is over-confident of small misfits, so its logarithm counts half.
+    """
+    n = search.data.n_values
+    fits = best_of_each(sorted(fits, key=lambda f: f.cost))
+    score = np.array([n * f.cost + f.n_parameters * np.log(n) for f in fits])
+    order = np.argsort(score)
+    weights = np.exp(-0.25 * (score[order] - score[order[0]]))
+    weights /= weights.sum()
+    rivals = tuple((fits[i], float(w)) for i, w in zip(order[1:], weights[1:], strict=True))
+    return fits[order[0]], rivals[:6]
+
+
+def best_of_each(fits: Sequence[Fit]) -> list[Fit]:
+    """The first fit of every set, in the order of the fits."""
+    distinct: dict[tuple, Fit] = {}
+    for candidate in fits:
+        distinct.setdefault(candidate.key, candidate)
+    return list(distinct.values())

@@ -1,0 +1,281 @@
+"""Fit of a set of effects to the fit records: nonlinear least squares of the simulation error."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, Parameter, apply_all, key_of
+from workbench.gap.prediction.residuals import FitData
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped
+
+HOPELESS = 1e300
+BENT, MOST_BENT = 0.1, 0.75
+SLOPE_SUBSTEPS = 2
+PROMISED = 0.1  # of the tolerance: a step that promises less is not worth trying
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A set of effects with fitted numbers.
+
+    Attributes:
+        effects: with values and standard deviations.
+        cost: what was minimised per measured value: 1 at the noise floor.
+        cost_by_channel: (n_records, n_outputs) of the same, without the share of a random disturbance's statistics.
+        n_parameters: numbers fitted.
+        status: why the fit stopped.
+        falling: share of the cost that the last iteration took away; 0 where the fit came to rest.
+    """
+
+    effects: tuple[Effect, ...]
+    cost: float
+    cost_by_channel: np.ndarray
+    n_parameters: int
+    status: str
+    falling: float = 0.0
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(effect.label for effect in self.effects)
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """What tells this set from another, numbers apart."""
+        return key_of(self.effects)
+
+
+def cost_of(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
+    """Cost per measured value; `HOPELESS` where the rig cannot be (a buckled beam, say)."""
+    residual = finite_residual(rig, effects, data)
+    return HOPELESS if residual is None else float(residual @ residual) / residual.size
+
+
+def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray | None:
+    """The residual (n_values,) of a rig with effects, or None where it cannot be or its motion runs away."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        try:
+            residual = data.residual(apply_all(rig, effects))
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        return residual if residual @ residual < HOPELESS else None
+
+
+class _Problem:
+    """The residual as a function of the free coordinates of all parameters of all effects."""
+
+    def __init__(self, rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()):
+        self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
+        self.coarse = data.stepped(min(SLOPE_SUBSTEPS, data.substeps))
+        self.parameters: list[tuple[int, Parameter]] = []
+        base = rig
+        for i, effect in enumerate(self.effects):
+            self.parameters += [(i, p) for p in effect.parameters(base)]
+        self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
+        floor = [
+            1e-2 if p.logarithmic or p.name == "at" else 1e-3 * abs(z) + 1e-9
+            for (_, p), z in zip(self.parameters, self.start, strict=True)
+        ]
+        self.steps = np.array(floor)
+        self.low = np.array([p.to_free(p.low) for _, p in self.parameters])
+        self.high = np.array([p.to_free(p.high) for _, p in self.parameters])
+        # a believed value is one more measurement: of itself, by its own standard deviation
+        self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
+        self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
+        self.centre = np.array([self.parameters[j][1].to_free(1.0) for j in self.believed])
+
+    @cached_property
+    def is_coarsened(self) -> bool:
+        """Whether slopes are taken by coarser steps of time than residuals."""
+        return self.data.substeps > SLOPE_SUBSTEPS and is_stepped(apply_all(self.rig, (*self.effects, *self.held)))
+
+    def at(self, free: np.ndarray) -> tuple[Effect, ...]:
+        values = [dict(effect.values) for effect in self.effects]
+        for (i, parameter), z in zip(self.parameters, free, strict=True):
+            values[i][parameter.name] = parameter.from_free(z)
+        return tuple(replace(e, values=v) for e, v in zip(self.effects, values, strict=True))
+
+    def residual(self, free: np.ndarray, *, coarsely: bool = False) -> np.ndarray | None:
+        data = self.coarse if coarsely else self.data
+        residual = finite_residual(self.rig, (*self.at(free), *self.held), data)
+        if residual is None or not self.believed:
+            return residual
+        return np.r_[residual, (free[self.believed] - self.centre) / self.prior_std]
+
+    def near(self, free: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The residual that slopes start from, and whether it is by coarser steps of time, as it is for a stepped rig.
+
+        Slopes need not be as exact as residuals.
+        """
+        on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
+        return (residual, False) if on_coarse is None else (on_coarse, True)
+
+    def jacobian(self, free: np.ndarray, residual: np.ndarray, coarsely: bool) -> np.ndarray:
+        """Differences from the residual that `near` gives."""
+        columns = []
+        for j, (_, parameter) in enumerate(self.parameters):
+            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name == "at" else self.steps[j]
+            moved = free.copy()
+            moved[j] += step
+            if self.high[j] < moved[j]:
+                moved[j] = free[j] - step
+            beside = self.residual(moved, coarsely=coarsely)
+            if beside is None:
+                moved[j] = 2.0 * free[j] - moved[j]
+                beside = self.residual(moved, coarsely=coarsely)
+            columns.append(np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j]))
+        return np.array(columns).reshape(-1, residual.size).T
+
+
+def slopes(rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()) -> np.ndarray:
+    """How the residual moves with each number of effects, in its free coordinate: (n_values, n_numbers).
+
+    Raises:
+        ValueError: the rig cannot be simulated with these effects.
+    """
+    problem = _Problem(rig, effects, data, held)
+    residual = problem.residual(problem.start)
+    if residual is None:
+        raise ValueError("the rig cannot be simulated with these effects")
+    return problem.jacobian(problem.start, *problem.near(problem.start, residual))[: data.n_values]
+
+
+def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray:
+    """The slopes along the numbers of believed effects, each in units of its belief."""
+    return slopes(rig, effects, data) * _Problem(rig, effects, data).prior_std
+
+
+def fit(
+    rig: Rig,
+    effects: Sequence[Effect],
+    data: FitData,
+    *,
+    held: Sequence[Effect] = (),
+    iterations: int = 25,
+    tolerance: float = 1e-5,
+) -> Fit:
+    """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
+
+    Args:
+        rig: nominal.
+        effects: with start values.
+        data: fit records.
+        held: effects that are there too, and stay as they are.
+        iterations: at most.
+        tolerance: relative decrease of the cost at which to stop.
+    """
+    problem = _Problem(rig, effects, data, held)
+    free = problem.start.copy()
+    residual = problem.residual(free)
+    if residual is None:
+        shape = (len(data.records), data.noise.size)
+        return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), free.size, "no rig at the start")
+    cost = residual @ residual
+    damping, status, falling = 1e-3, "most iterations done", 0.0
+    normal = np.zeros((free.size, free.size))
+    for _ in range(iterations if free.size else 0):
+        nearly, coarsely = problem.near(free, residual)
+        jacobian = problem.jacobian(free, nearly, coarsely)
+        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
+        improved: np.ndarray | None = None
+        for _ in range(7):
+            damped = normal + damping * np.diag(diagonal)
+            straight, moving = _straight(problem, free, gradient, damped)
+            promised = -(2.0 * gradient + normal @ straight) @ straight
+            if promised < PROMISED * tolerance * cost:
+                break
+            bend = _bend(problem, free, nearly, coarsely, jacobian, damped, straight, moving)
+            step = _bounded(problem, free, straight + bend)
+            trial = problem.residual(free + step)
+            if trial is not None and trial @ trial < cost:
+                improved = trial
+                break
+            damping *= 6.0
+        if improved is None:
+            status, falling = "no step lowers the cost", 0.0
+            break
+        falling = 1.0 - (improved @ improved) / cost
+        free, residual, cost = free + step, improved, improved @ improved
+        damping = max(damping / 8.0, 1e-9)
+        if falling < tolerance:
+            status, falling = "settled", 0.0
+            break
+    return _result(problem, free, residual, normal, status, falling)
+
+
+def _straight(problem: _Problem, free, gradient, damped) -> tuple[np.ndarray, np.ndarray]:
+    """The damped step, and which numbers it moves: one at a bound that it would pass stays, the others do without."""
+    moving = np.ones(free.size, bool)
+    step = np.zeros(free.size)
+    for _ in range(free.size):
+        among = np.ix_(moving, moving)
+        step[moving] = -np.linalg.solve(damped[among], gradient[moving])
+        leaving = moving & (((free <= problem.low) & (step < 0)) | ((free >= problem.high) & (step > 0)))
+        if not leaving.any():
+            break
+        moving &= ~leaving
+        step[leaving] = 0.0
+    return step, moving
+
+
+def _bounded(problem: _Problem, free, step) -> np.ndarray:
+    """The step, no longer than is sensible, and inside the bounds."""
+    reach = _reach(problem)
+    step = np.clip(step, -reach, reach)
+    return np.clip(free + step, problem.low, problem.high) - free
+
+
+def _bend(problem: _Problem, free, residual, coarsely, jacobian, damped, step, moving) -> np.ndarray:
+    """What the step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
+
+    Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.
+    """
+    turn = np.zeros_like(step)
+    if moving.sum() < 2:
+        return turn
+    beside = problem.residual(free + BENT * step, coarsely=coarsely)
+    if beside is None:
+        return turn
+    curvature = 2.0 / BENT * ((beside - residual) / BENT - jacobian @ step)
+    turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], jacobian[:, moving].T @ curvature)
+    with np.errstate(over="ignore"):
+        small = 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step)
+    return turn if small else np.zeros_like(step)
+
+
+def _reach(problem: _Problem) -> np.ndarray:
+    """Longest step of each free coordinate: a factor e, a tenth of the length, or its own size."""
+    return np.array(
+        [
+            1.0 if p.logarithmic else 10.0 if p.name == "at" else 3.0 * abs(z) + 10.0
+            for (_, p), z in zip(problem.parameters, problem.start, strict=True)
+        ]
+    )
+
+
+def _result(
+    problem: _Problem, free: np.ndarray, residual: np.ndarray, normal: np.ndarray, status: str, falling: float
+) -> Fit:
+    residual = residual[: problem.data.n_values]
+    cost = float(residual @ residual) / residual.size
+    deviations = np.zeros(free.size)
+    if free.size and np.trace(normal) > 0:
+        scaled = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        inverse = np.linalg.pinv(normal / np.outer(scaled, scaled), rcond=1e-12)
+        deviations = np.sqrt(np.maximum(np.diag(inverse), 0.0)) / scaled * np.sqrt(max(cost, 1.0))
+    effects = problem.at(free)
+    spread: list[dict[str, float]] = [{} for _ in effects]
+    for (i, parameter), deviation in zip(problem.parameters, deviations, strict=True):
+        value = effects[i].values[parameter.name]
+        spread[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    return Fit(
+        effects=tuple(replace(e, deviations=s) for e, s in zip(effects, spread, strict=True)),
+        cost=cost,
+        cost_by_channel=problem.data.by_channel(residual),
+        n_parameters=free.size,
+        status=status,
+        falling=falling,
+    )

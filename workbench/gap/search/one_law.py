@@ -1,0 +1,54 @@
+"""Whether one force at a point, of a law that the catalogue does not hold, explains the records as effects do."""
+
+from dataclasses import replace
+
+from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.search.finish import ranked
+from workbench.gap.search.fit import Fit, cost_of
+from workbench.gap.search.outcome import Decision
+from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
+from workbench.gap.search.search import RIVAL, Search
+
+TRIED = 2
+
+
+def one_law(search: Search, evidence: Evidence) -> Fit | None:
+    """The force that explains the records alone, or None.
+
+    Two effects side by side bend to many a law between them, so it is sought before any two are believed.
+    """
+    search.report("one force of another law", 0.35)
+    beyond = replace(search, catalogue=BEYOND)
+    hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < HOPEFUL]
+    fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
+    return next((f for f in fits if search.explains(f)), None)
+
+
+def unless_another(search: Search, decision: Decision, evidence: Evidence) -> Decision:
+    """The decision for one law of the catalogue at a point, or for another law where the records are sure of that one.
+
+    Args:
+        evidence: of the nominal rig.
+    """
+    best = decision.best
+    if decision.outcome != "explained" or len(best.effects) != 1:
+        return decision
+    (effect,) = best.effects
+    if not effect.kind.nonlinear or "at" not in effect.values:
+        return decision
+    search.report("one force of another law", 0.9)
+    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.values["at"])
+    as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
+    hopeful = [f for f in one_more(beyond, (), there) if f.cost < as_near]
+    fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
+    sure = (f for f in fits if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
+    law = next(sure, None)
+    return decision if law is None else weighed_against(law, search, decision)
+
+
+def weighed_against(law: Fit, search: Search, decision: Decision) -> Decision:
+    """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
+    told = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
+    best, rivals = ranked(search, [law, *told])
+    return Decision("unknown" if best is law else "explained", best, rivals=rivals)

@@ -1,0 +1,232 @@
+"""Pairs of effects, sought at once and one after the other, until one explains the records."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import chain, zip_longest
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.search.beside_random import NEAR, decide_with_random
+from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
+from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.outcome import Decision, unexplained
+from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more, pairs_at_once
+from workbench.gap.search.screening import Weighed
+from workbench.gap.search.search import Search, apart, in_one_valley, spread_over_kinds
+
+FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
+SINGLES = 8  # that are fitted to whole records before they are gone through
+FIRSTS = 4  # single effects that a second one is looked for beside
+FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
+ASTRAY = 1e4  # times the gap's power
+MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
+NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
+SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
+VERY_NEAR = 0.2 * NEAR  # what is tried in simpler forms, and from other places before beside other single effects
+EXCHANGES = 2  # rounds of keeping either half of the best pair ahead
+TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
+TOLD = 4  # sets, best first, that may be named or be rivals
+
+
+@dataclass(eq=False)
+class Pairs:
+    """What a search for pairs has found so far; filled in as it goes.
+
+    Attributes:
+        search: what it works on.
+        ahead: pairs fitted one sample ahead, best first.
+        followed: those of them that were fitted to whole records too.
+        found: pairs fitted to whole records, best first.
+        ended: those taken to their ends, before and after.
+        given: single effects that a second one was looked for beside.
+        missed: near misses of which each half was kept and the other sought anew.
+        moved: those tried from other places.
+    """
+
+    search: Search
+    ahead: list[Fit] = field(default_factory=list)
+    followed: list[Fit] = field(default_factory=list)
+    found: list[Fit] = field(default_factory=list)
+    ended: list[Fit] = field(default_factory=list)
+    given: list[Effect] = field(default_factory=list)
+    missed: list[Fit] = field(default_factory=list)
+    moved: list[Fit] = field(default_factory=list)
+
+    def at_once(self, weighed: Weighed) -> bool:
+        """Whether one of the pairs that are likeliest at first sight explains the records.
+
+        Args:
+            weighed: what may be there, with nothing given.
+        """
+        self.search.report("all pairs at once", 0.4)
+        return self._explained_by(pairs_at_once(self.search, weighed))
+
+    def by_exchange(self) -> bool:
+        """Whether a pair with either half of the best one sample ahead explains the records.
+
+        A strong effect is found beside whatever stands in for the other; what it leaves tells the other's place.
+        """
+        for _ in range(EXCHANGES):
+            if not self.ahead:
+                return False
+            best = self.ahead[0]
+            if self._beside_any(_weightiest_first(self.search, best)):
+                return True
+            if self.ahead[0].cost > NEARER * best.cost:
+                break
+        return self._from_elsewhere(VERY_NEAR)
+
+    def beside(self, effect: Effect, evidence: Evidence | None = None) -> bool:
+        """Whether a pair with this effect explains the records.
+
+        Args:
+            evidence: of the rig with the effect, where it is at hand.
+        """
+        self.search.report(f"{effect.kind.words} and another", 0.55 + 0.05 * min(len(self.given), 8))
+        self.given.append(effect)
+        evidence = evidence or _evidence(self.search, effect)
+        return self._explained_by(one_more(self.search, (effect,), evidence))
+
+    def one_by_one(self, start: Fit, ahead: Sequence[Fit]) -> Decision:
+        """The best few single effects, each with a second one or a random disturbance, until a pair explains.
+
+        In a near miss the right half has nearly its right numbers, better ones than it had alone: as soon as there is
+        one, the other half is looked for anew beside either.
+
+        Args:
+            start: what is there with no effect.
+            ahead: every kind's best fit alone, to predictions one sample ahead.
+        """
+        for first in _firsts(self.search, ahead, on_whole_records(self.search, ahead, SINGLES)):
+            (effect,) = first.effects
+            if any(_alike(effect, half, self.search) for pair in self.missed for half in pair.effects):
+                continue
+            evidence = _evidence(self.search, effect)
+            if evidence.rig is not self.search.rig:
+                on_all = fit(self.search.rig, first.effects, self.search.data, iterations=0)
+                beside = decide_with_random(self.search, on_all, evidence)
+                if beside is not None:
+                    return beside
+            if any(_alike(effect, other, self.search) for other in self.given):
+                continue
+            if self.beside(effect, evidence):
+                break
+            if not self.missed and self._near() and (self._by_halves() or self._from_elsewhere()):
+                break
+        else:
+            if not self.found:
+                self._add(on_whole_records(self.search, self.ahead, 1))
+            if self.found:
+                self._from_elsewhere()
+        return self.decision(start)
+
+    def decision(self, start: Fit) -> Decision:
+        """What the pairs say.
+
+        Args:
+            start: what is there with no effect.
+        """
+        likeliest = best_of_each(self.found or [start])[:TOLD]
+        explaining = [f for f in likeliest if self.search.explains(f)]
+        if explaining:
+            plain = plainest(self.search, explaining)
+            best, rivals = ranked(self.search, self.search.side_by_side(simplest, plain))
+            return Decision("explained", best, rivals=rivals)
+        best, rivals = ranked(self.search, likeliest)
+        return unexplained(start, best, rivals)
+
+    def _near(self) -> bool:
+        return bool(self.found) and self.search.near(self.found[0], NEAR)
+
+    def _explained_by(self, ahead: Sequence[Fit]) -> bool:
+        self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
+        length = self.search.rig.modes.length
+        hopeful = [f for f in ahead if f.cost < HOPEFUL]
+        fresh = [f for f in hopeful if not any(in_one_valley(f, other, length) for other in self.followed)]
+        most = MORE if self.found else FINALISTS
+        self.followed += fresh[:most]
+        self._add(on_whole_records(self.search, fresh, most))
+        near = [pair for pair in self.found[:TRIED_FURTHER] if not _done(pair, self.ended)]
+        taken = _to_their_ends(self.search, near)
+        self.ended += [*near, *taken]
+        self._add(taken)
+        return any(self.search.explains(pair) for pair in taken)
+
+    def _by_halves(self) -> bool:
+        """Whether a pair with either half of the best on whole records explains them."""
+        self.missed.append(self.found[0])
+        return self._beside_any(self.found[0].effects[::-1])
+
+    def _beside_any(self, halves: Sequence[Effect]) -> bool:
+        """Whether a pair with one of these effects explains the records; those given before are not tried again."""
+        return any(self.beside(h) for h in halves if not any(_unmoved(h, other) for other in self.given))
+
+    def _from_elsewhere(self, share: float = NEAR) -> bool:
+        """Whether one of the best pairs explains the records with other places, or leads to one that does."""
+        search = self.search
+        likeliest = best_of_each(self.found)[:TRIED_FURTHER]
+        fresh = [f for f in likeliest if search.near(f, share) and not _done(f, self.moved)]
+        elsewhere = search.side_by_side(relocated, fresh)
+        self.moved += [*fresh, *elsewhere]
+        self._add(elsewhere)
+        if any(search.explains(pair) for pair in elsewhere):
+            return True
+        nearer = all(self.found[0].cost - 1.0 < NEARER * (missed.cost - 1.0) for missed in self.missed)
+        return self._near() and nearer and self._by_halves()
+
+    def _add(self, pairs: Sequence[Fit]) -> None:
+        self.found = sorted((*pairs, *self.found), key=lambda f: f.cost)
+
+
+def _firsts(search: Search, *rankings: Sequence[Fit]) -> list[Fit]:
+    """The single effects that a second one is looked for beside: the best of either ranking by turns."""
+    hopeful = ([f for f in spread_over_kinds(fits, 2) if f.cost < FAR * fits[0].cost] for fits in rankings)
+    firsts: list[Fit] = []
+    for first in filter(None, chain.from_iterable(zip_longest(*hopeful))):
+        if not any(_alike(first.effects[0], other.effects[0], search) for other in firsts):
+            firsts.append(first)
+    return firsts[:FIRSTS]
+
+
+def _evidence(search: Search, effect: Effect) -> Evidence:
+    """Of the rig with the effect; without it where the motion of whole records would run away with it alone."""
+    astray = cost_of(search.rig, (effect,), search.data) > ASTRAY * search.nominal.mean()
+    rig = search.rig if astray else apply_all(search.rig, (effect,))
+    return search.evidence_of(rig)
+
+
+def _weightiest_first(search: Search, pair: Fit) -> list[Effect]:
+    """The effects of a pair, first the one that most is left without."""
+
+    def left_without(effect: Effect) -> float:
+        return cost_of(search.rig, (*(e for e in pair.effects if e is not effect), *search.held), search.ahead)
+
+    return sorted(pair.effects, key=left_without, reverse=True)
+
+
+def _alike(one: Effect, other: Effect, search: Search) -> bool:
+    """Whether two effects are the same but for their numbers."""
+    if one.label != other.label:
+        return False
+    return "at" not in one.values or not apart(one, other, search.rig.modes.length)
+
+
+def _unmoved(one: Effect, other: Effect) -> bool:
+    """Whether two effects are the same, with nearly the same numbers."""
+    return one.label == other.label and all(np.isclose(one.values[n], other.values[n], rtol=MOVED) for n in one.values)
+
+
+def _done(pair: Fit, ended: Sequence[Fit]) -> bool:
+    """Whether the same set was taken to its end before, from hardly another place."""
+    return any(pair.key == other.key and other.cost - 1.0 < SAME * (pair.cost - 1.0) for other in ended)
+
+
+def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
+    """The pairs, and where none explains the records yet, in simpler forms."""
+    ended = search.side_by_side(finished, pairs)
+    if any(search.explains(pair) for pair in ended):
+        return ended
+    near = [pair for pair in ended if search.near(pair, VERY_NEAR)]
+    return [*search.side_by_side(simplified, near), *(pair for pair in ended if pair not in near)]

@@ -1,0 +1,139 @@
+"""The likeliest sets of effects, fitted to predictions one sample ahead and then to whole records."""
+
+from collections.abc import Sequence
+
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.limiting_cases import contained
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.innovations import LOOSE
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.screening import Weighed
+from workbench.gap.search.search import FURTHER, RIVAL, WORTHWHILE, Search, in_one_valley, promise
+from workbench.rig.simulate import is_stepped
+
+FINE = 8  # substeps of a sample
+TARGETS_A_KIND = 3  # of single effects that are tried
+TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
+FAR_BEHIND = 10.0  # times the least promise: what is not fitted to its end
+HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
+LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
+AT_HAND = 10.0  # times the noise: so near, whole records tell the way
+CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
+AT_FIRST = 5  # iterations on whole records, before it is seen which sets go on
+RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
+
+
+def one_more(
+    search: Search, given: tuple[Effect, ...], evidence: Evidence, weighed: Weighed | None = None
+) -> list[Fit]:
+    """The likeliest fits, one sample ahead, of the given effects with one more, best first.
+
+    Args:
+        evidence: of the rig with the given effects.
+        weighed: what may be there beside them, where it is at hand.
+    """
+    weighed = Weighed.of(search, given, evidence) if weighed is None else weighed
+    chosen: list[Effect] = []
+    for effect in weighed.likeliest():
+        if sum(effect.kind is other.kind for other in chosen) < TARGETS_A_KIND:
+            chosen.append(effect)
+    return fitted_ahead(search, [(*given, effect) for effect in chosen])
+
+
+def pairs_at_once(search: Search, weighed: Weighed) -> list[Fit]:
+    """The likeliest fits, one sample ahead, of any two effects, best first.
+
+    Args:
+        weighed: with nothing given.
+    """
+    return fitted_ahead(search, weighed.likeliest_pairs(TRIED))
+
+
+def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
+    """Fits of sets to predictions one sample ahead, best first: all to the most telling record, fewer to another too.
+
+    Args:
+        sets: the likeliest first.
+    """
+
+    def ahead(effects: tuple[Effect, ...], data: FitData, iterations: int) -> Fit:
+        return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
+
+    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[:TRIED])
+    likely = sorted(tried, key=promise)[:LIKELY]
+    fits = distinct_valleys(
+        search, sorted(search.workers.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
+    )
+    falling = [f for f in fits[:LIKELIEST] if f.falling and promise(f) < FAR_BEHIND * promise(fits[0])]
+    longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8), falling)
+    return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
+
+
+def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits without those that came to where a better one of the same set came."""
+    distinct: list[Fit] = []
+    for candidate in fits:
+        if not any(in_one_valley(candidate, other, search.rig.modes.length) for other in distinct):
+            distinct.append(candidate)
+    return distinct
+
+
+def on_whole_records(
+    search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf"), at_first: int = AT_FIRST
+) -> list[Fit]:
+    """The best of fits ahead, fitted to whole records, best first.
+
+    Args:
+        ahead: best first.
+        most: at most so many, and none that is far behind.
+        to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
+        at_first: iterations before that is asked.
+    """
+    close = [f for f in ahead[:most] if f.cost < CLOSE * ahead[0].cost]
+    simpler = contained(close[0].effects, search.rig) if close else set()
+    first = [f for f in close if f is close[0] or f.key in simpler]
+    fits = search.workers.map(lambda f: followed(search, f.effects, at_first), first)
+    rest = [f for f in close if f not in first]
+    if any(search.explains(f) for f in fits):
+        rest = [f for f in rest if f.cost < ahead[0].cost + RIVAL]
+    others = _none_that_contains(search, fits, rest)
+    fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, at_first), others)), key=promise)
+    fits = _none_that_contains(search, fits, fits)
+    to_cost = min([to_cost, *(f.cost + RIVAL for f in fits if search.explains(f))])
+    running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
+    running = [f for f in running if promise(f, FURTHER) < to_cost]
+    longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
+    return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
+
+
+def _none_that_contains(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
+    """The others but those that come, at bounds of their numbers, to a fit that leaves nothing worth an effect."""
+    enough = {f.key for f in fits if f.cost < 1.0 + WORTHWHILE and search.explains(f)}
+    return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
+
+
+def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
+    """The set fitted to predictions one sample ahead, which go smoothly with its numbers, then to whole records.
+
+    Where a stiff law lets motions run apart, half a percent of a place is too far for whole records to tell the way;
+    where a thousandth of a percent is, the rig is let go by degrees.
+
+    Args:
+        iterations: on whole records, at most.
+    """
+    rig = apply_all(search.rig, effects)
+    if is_stepped(rig) and not search.held and search.data.whitener is None:
+        for loose in LETTING_GO:
+            data = search.data.following(rig, loose).stepped(FINE)
+            held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
+            effects = held.effects
+            if held.cost > HOPEFUL or cost_of(search.rig, effects, search.data.stepped(FINE)) < AT_HAND:
+                break
+    return whole(search, effects, iterations)
+
+
+def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
+    """The set fitted to whole records."""
+    data = search.data.stepped(FINE)
+    return fit(search.rig, effects, data, held=search.held, iterations=iterations)

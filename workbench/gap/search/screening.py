@@ -1,0 +1,180 @@
+"""What each start of each effect moves the errors of predictions one sample ahead by, and what sets can come to."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.workers import shared_array
+from workbench.gap.search.fit import finite_residual, slopes
+from workbench.gap.search.search import ELSEWHERE, Search, apart
+from workbench.rig.rig import Rig
+
+WEAKER, STRONGER = 0.03, 30.0  # than at its start: what an effect may turn out to be
+RUNAWAY = 1e10  # mean square, in noise units, of errors that tell nothing
+NOTHING = 1e-300  # square of a move that given effects make up for whole
+MOST_VALUES = 20_000  # of the errors that are weighed
+
+
+@dataclass(frozen=True, eq=False)
+class Weighed:
+    """Starts of every kind and target, and what each moves the errors by on the most telling record.
+
+    An effect acts on a motion that the records hold in place, so errors of predictions one sample ahead are nearly
+    linear in its strength, stiff as it may be. With r the errors and m_i what start i moves them by, |r + a m_i|² and
+    |r + a m_i + b m_j|² at their least tell what one effect or two can come to, from the products of each with each.
+
+    Attributes:
+        starts: those of one kind and target after those of another.
+        moves: (n_starts, n_values); what the numbers of effects given before can make up for is taken away.
+        left: (n_values,) the errors, likewise.
+        least, most: (n_starts,) bounds of a strength, in units of the start's.
+        length: of the structure, m.
+    """
+
+    starts: tuple[Effect, ...]
+    moves: np.ndarray
+    left: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    length: float
+
+    @classmethod
+    def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Weighed":
+        """Weigh what may be there beside the given effects.
+
+        Args:
+            evidence: of the rig with the given effects.
+        """
+        data = search.first_ahead
+        before = finite_residual(search.rig, (*given, *search.held), data)
+        if before is None:
+            return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.length)
+        thin = slice(None, None, max(1, before.size // MOST_VALUES))
+
+        tasks = _starts(search, given, evidence)
+        starts = [start for task in tasks for start in task]
+        bounds = [_bounds(task) for task in tasks for _ in task]
+        left = before[thin]
+        moves = shared_array(len(starts), left.size)  # the one large array
+
+        def tells(i: int) -> bool:
+            moved = finite_residual(search.rig, (*given, starts[i], *search.held), data)
+            if moved is None:
+                return False
+            moves[i] = (moved - before)[thin]
+            return bool(0 < moves[i] @ moves[i] < RUNAWAY * left.size)
+
+        for i in {start.kind: i for i, start in enumerate(starts) if start.kind not in CATALOGUE}.values():
+            tells(i)  # a law of the user's own is compiled here, before processes part that would each compile it
+        telling = [i for i, tell in enumerate(search.workers.map(tells, range(len(starts)))) if tell]
+        for row, i in enumerate(telling):  # those that tell nothing are closed up in place
+            moves[row] = moves[i]
+        moves = moves[: len(telling)]
+        if given and telling:
+            basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[thin])
+            left = left - basis @ (basis.T @ left)
+            for row in moves:
+                row -= basis @ (basis.T @ row)
+        least, most = np.array([bounds[i] for i in telling]).reshape(-1, 2).T
+        return cls(tuple(starts[i] for i in telling), moves, left, least, most, search.rig.modes.length)
+
+    def likeliest(self) -> list[Effect]:
+        """The best start of every kind and target, and the best elsewhere, in the order of what they can come to."""
+        own, along = np.einsum("ij,ij->i", self.moves, self.moves).clip(NOTHING), self.moves @ self.left
+        a = (-along / own).clip(self.least, self.most)
+        # of places that are one and the same, the first comes first
+        costs = np.round(a * (2.0 * along + a * own) / max(self.left @ self.left, 1e-300), 9)
+        chosen: list[Effect] = []
+        for i in np.argsort(costs, kind="stable"):
+            start = self.starts[i]
+            alike = [other for other in chosen if other.label == start.label]
+            if not alike or (len(alike) == 1 and apart(start, alike[0], self.length) and "at" in start.values):
+                chosen.append(start)
+        return chosen
+
+    def likeliest_pairs(self, most: int) -> list[tuple[Effect, Effect]]:
+        """The best starts of every two kinds and targets, and the best elsewhere, likewise."""
+        if len(self.starts) < 2:
+            return []
+        costs = self._of_pairs()
+        labels = [start.label for start in self.starts]
+        begins = [i for i, label in enumerate(labels) if i == 0 or label != labels[i - 1]]
+        blocks = [slice(*ends) for ends in pairwise((*begins, len(labels)))]
+        at = np.array([start.values.get("at", 0.0) for start in self.starts])
+        beside = np.abs(np.subtract.outer(at, at)) <= ELSEWHERE * self.length
+        for one in blocks:
+            for other in blocks:
+                if one.start > other.start or _repeats(self.starts[one.start], self.starts[other.start]):
+                    costs[one, other] = np.inf
+            # the same twice at one place is the same, twice as strong
+            costs[one, one][beside[one, one]] = np.inf
+        best = np.minimum.reduceat(np.minimum.reduceat(costs, begins, axis=0), begins, axis=1)
+        found = []
+        for p, q in zip(*np.unravel_index(np.argsort(best, axis=None)[:most], best.shape), strict=True):
+            block = costs[blocks[p], blocks[q]]
+            for _ in range(2):
+                i, j = np.unravel_index(np.argmin(block), block.shape)
+                if np.isfinite(block[i, j]):
+                    i, j = begins[p] + i, begins[q] + j
+                    found.append((costs[i, j], (self.starts[i], self.starts[j])))
+                    block = np.where(beside[i, blocks[p]][:, None] & beside[j, blocks[q]], np.inf, block)
+        return [pair for _, pair in sorted(found, key=lambda entry: entry[0])[:most]]
+
+    def _of_pairs(self) -> np.ndarray:
+        """min |left + a m_i + b m_j|² - |left|² over a and b within their bounds: (n_starts, n_starts)."""
+        products, along = self.moves @ self.moves.T, self.moves @ self.left
+        i, j = along[:, None], along
+        own_j = np.diag(products).clip(NOTHING)
+        own_i = own_j[:, None]
+        least, most = self.least[:, None], self.most[:, None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a = (j * products - i * own_j) / (own_i * own_j - products**2)
+        a = np.nan_to_num(a, nan=1.0).clip(least, most)
+        b = (-(j + a * products) / own_j).clip(self.least, self.most)
+        a = (-(i + b * products) / own_i).clip(least, most)
+        return a * (2.0 * i + a * own_i) + b * (2.0 * j + b * own_j) + 2.0 * a * b * products
+
+
+def _bounds(starts: list[Effect]) -> tuple[float, float]:
+    """Of the strength of one kind and target, in units of a start's."""
+    if not starts[0].values:
+        return 1.0, 1.0
+    # a lone start is of an effect that is linear in its number, and may be of either sign
+    return (WEAKER if len(starts) > 1 else -STRONGER), STRONGER
+
+
+def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[list[Effect]]:
+    """Where to start every kind and target that may be there beside the given effects: one list a kind and target."""
+    rig = apply_all(search.rig, given)
+    left = search.data.by_channel(search.data.residual(apply_all(rig, search.held)))
+    starts = [
+        [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
+        for kind in search.catalogue
+        if kind is not RANDOM_DISTURBANCE and kind.name not in ("sensor_quantisation", "sensor_clipping")
+        for target in _worthwhile(kind, rig, left)
+    ]
+    return [task for task in starts if task and not any(_repeats(task[0], effect) for effect in given)]
+
+
+def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple:
+    """Targets of a kind; a fault of one sensor is only looked for where that sensor disagrees."""
+    targets = kind.targets(rig)
+    if kind.path != "sensor":
+        return targets
+    by_sensor = left.max(axis=0)
+    names = [s.name for s in rig.sensors]
+    worst = {names[j] for j in np.argsort(-by_sensor)[:3]}
+    return tuple(t for t in targets if t == ALL or t in worst or by_sensor[names.index(t)] > 0.2 * by_sensor.max())
+
+
+def _repeats(one: Effect, other: Effect) -> bool:
+    """Whether two effects are the same figure of the same thing, which twice says nothing new."""
+    kind = one.kind
+    if other.kind is not kind or not (kind.path in ("actuator", "sensor") or "at" not in other.values):
+        return False
+    return one.target == other.target or ALL in (one.target, other.target) or kind.name == "truncated_modes"

@@ -1,0 +1,172 @@
+"""What every step of a search for effects works on, and what it may call an explanation."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
+from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import ForceFilter
+from workbench.gap.prediction.workers import Workers
+from workbench.gap.search.fit import HOPELESS, Fit, sensitivity
+from workbench.rig.rig import Rig
+
+SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
+INTEGRATION_SHARE = 2e-6  # of the gap's power: errors of stepping
+SURE = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
+WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect model
+ELSEWHERE = 0.1  # of the length: nearer, two places are in one valley of the cost at first
+SAME_PLACE = 0.02  # of the length: nearer, fits go on to the same end
+RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
+FURTHER = 100  # iterations like the last: a cost that they leave too high comes no lower in time
+COARSE = 2.0  # times the noise: below, rounding errors are all but white and of no signal
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """What every step of a search works on.
+
+    Attributes:
+        rig: nominal, with what shows in the readings themselves.
+        data: all records to fit.
+        quick: the two most telling of them.
+        first: the most telling one.
+        catalogue: kinds of effects to try.
+        report: told (what, share done).
+        workers: processes that share the work.
+        nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
+        held: effects that every candidate stands beside, as they are.
+    """
+
+    rig: Rig
+    data: FitData
+    quick: FitData
+    first: FitData
+    catalogue: tuple[Kind, ...]
+    report: Callable[[str, float], None]
+    workers: Workers
+    nominal: np.ndarray
+    held: tuple[Effect, ...] = ()
+
+    def explains(self, candidate: Fit) -> bool:
+        """Whether what is left is noise, in every record, up to the error of integration.
+
+        Two effects of a kind beside one another stand for one law that the catalogue does not hold.
+        """
+        if self._doubled(candidate.effects):
+            return False
+        left = candidate.cost_by_channel.mean(axis=1)
+        per_record = self.data.counted[0].outputs.size
+        slack = SLACK + 5.0 * np.sqrt(2.0 / per_record) + INTEGRATION_SHARE * self.nominal.mean(axis=1)
+        return bool((left < 1.0 + slack).all() and left.mean() < self.enough)
+
+    @property
+    def enough(self) -> float:
+        """The cost of a set that explains the records, at most."""
+        return float(1.0 + SLACK + INTEGRATION_SHARE * self.nominal.mean())
+
+    def _doubled(self, effects: Sequence[Effect]) -> bool:
+        point = [effect for effect in effects if effect.kind.nonlinear and "at" in effect.values]
+        near = (
+            not apart(one, other, self.rig.modes.length)
+            for one, other in combinations(point, 2)
+            if one.kind is other.kind
+        )
+        return any(near)
+
+    def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
+        """Whether the gain in likelihood pays for `extra` more numbers."""
+        n = self.data.n_values
+        return n * (than - candidate.cost) > SURE + extra * np.log(n)
+
+    def worthwhile(self, candidate: Fit, than: float) -> bool:
+        """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
+        return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > WORTHWHILE
+
+    def near(self, candidate: Fit, share: float) -> bool:
+        """Whether at most this share of the gap's power is left."""
+        return candidate.cost - 1.0 < share * (self.nominal.mean() - 1.0)
+
+    def through(self, whitener: ForceFilter, follower: Follower) -> "Search":
+        """The same search beside a random force."""
+        data, quick, first = (data.through(whitener, follower) for data in (self.data, self.quick, self.first))
+        return replace(self, data=data, quick=quick, first=first)
+
+    def evidence_of(self, rig: Rig) -> Evidence:
+        """What the records say of a missing force beside what a rig has."""
+        return Evidence.of(rig, self.data, FEWER_PLACES, self.workers)
+
+    def hearing(self) -> "Search":
+        """The same search without sensors that clip or round coarsely: what they do not show would pass for a force."""
+        kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < COARSE * s.noise_std]
+        if not kept or len(kept) == len(self.rig.sensors):
+            return self
+        sensors = tuple(self.rig.sensors[j] for j in kept)
+        names = tuple(sensor.name for sensor in sensors)
+        data, quick, first = (data.of_outputs(names) for data in (self.data, self.quick, self.first))
+        rig = replace(self.rig, sensors=sensors)
+        return replace(self, rig=rig, data=data, quick=quick, first=first, nominal=self.nominal[:, kept])
+
+    def beside(self, figures: Effect) -> "Search":
+        """The same search beside believed figures, which give way to every candidate to first order."""
+        data = self.data.giving_way(sensitivity(self.rig, (figures,), self.data))
+        return replace(self, data=data, held=(figures,))
+
+    @cached_property
+    def ahead(self) -> FitData:
+        """The two most telling records, by predictions one sample ahead."""
+        return self._ahead(self.quick)
+
+    @cached_property
+    def first_ahead(self) -> FitData:
+        """The most telling record, likewise."""
+        return self._ahead(self.first)
+
+    def _ahead(self, data: FitData) -> FitData:
+        data = data.following(self.rig)
+        return data.giving_way(sensitivity(self.rig, self.held, data)) if self.held else data
+
+    def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
+        """`function(search, candidate)` of each, in their order."""
+        return self.workers.map(lambda candidate: function(self, candidate), candidates)
+
+
+def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
+    """The fits in their order, at most so many whose last effect is of one kind, none twice."""
+    chosen: list[Fit] = []
+    counts: dict[str, int] = {}
+    keys = set()
+    for candidate in fits:
+        name = candidate.effects[-1].kind.name
+        if candidate.cost < HOPELESS and counts.get(name, 0) < most and candidate.key not in keys:
+            chosen.append(candidate)
+            keys.add(candidate.key)
+            counts[name] = counts.get(name, 0) + 1
+    return chosen
+
+
+def apart(one: Effect, other: Effect, length: float) -> bool:
+    """Whether two effects stand far enough apart to be in different valleys; those of no place always do."""
+    return "at" not in one.values or abs(one.values["at"] - other.values["at"]) > ELSEWHERE * length
+
+
+def in_one_valley(one: Fit, other: Fit, length: float) -> bool:
+    """Whether two fits are of one set, with places so near that they go on to the same end."""
+
+    def places(candidate: Fit) -> list[tuple[str, float]]:
+        return sorted((effect.label, effect.values.get("at", 0.0)) for effect in candidate.effects)
+
+    if one.key != other.key:
+        return False
+    both = zip(places(one), places(other), strict=True)
+    return all(abs(here - there) < SAME_PLACE * length for (_, here), (_, there) in both)
+
+
+def promise(candidate: Fit, iterations: int = 1) -> float:
+    """The cost that one more iteration like the last would come to, or so many more."""
+    return candidate.cost * (1.0 - candidate.falling) ** iterations

@@ -1,1 +1,0 @@
-"""The truth of a blind trial, by another numerical route than the diagnosis."""

@@ -1,0 +1,132 @@
+"""Do frequency and damping depend on amplitude? The modes of one stretch of a decay after another.
+
+Stretches double in length as the motion dies away. In each, the modes still there are refined by themselves; in a
+linear structure all stretches agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from workbench.identification.free_decay.coloured_noise import in_its_noise
+from workbench.identification.free_decay.refinement import Refined, refine
+from workbench.records.record import Record
+from workbench.structure.modes import frozen
+
+STRETCHES = 4
+# Amplitude that a mode must have in a stretch, and cycles, for its frequency there to mean something.
+LEAST_EVIDENCE, LEAST_CYCLES = 100.0, 3.0
+# Relative standard error of a frequency up to which a stretch tells of it.
+LEAST_SURE = 0.01
+SURE = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class AmplitudeDependence:
+    """Each mode by amplitude; nan where a stretch does not tell of it.
+
+    Attributes:
+        record: (n_stretches,) which record each is of, from 0.
+        start: (n_stretches,) of each, s.
+        amplitude: (n_stretches, n_modes) root mean square over a stretch of the mode's envelope, largest output.
+        omega: (n_stretches, n_modes) rad/s.
+        omega_std: (n_stretches, n_modes) standard errors.
+        zeta: (n_stretches, n_modes) damping ratios.
+        zeta_std: (n_stretches, n_modes) standard errors.
+        probability: (2, n_modes) of frequencies, and of damping ratios, so far apart in a linear structure; 1 where
+            fewer than two stretches tell.
+    """
+
+    record: np.ndarray
+    start: np.ndarray
+    amplitude: np.ndarray
+    omega: np.ndarray
+    omega_std: np.ndarray
+    zeta: np.ndarray
+    zeta_std: np.ndarray
+    probability: np.ndarray
+
+    @property
+    def depends(self) -> np.ndarray:
+        """Modes (n_modes,) that depend on amplitude: chance under one in a thousand over all that was compared."""
+        return np.any(self.probability < SURE / self.probability.size, axis=0)
+
+
+def amplitude_dependence(
+    records: Record | Sequence[Record], refined: Refined, *, stretches: int = STRETCHES
+) -> AmplitudeDependence:
+    """Frequency and damping of each mode of free decays, stretch by stretch.
+
+    Args:
+        records: the free decays that `refined` was found in.
+        refined: their modes.
+        stretches: how many of each record, each twice as long as the one before.
+
+    Raises:
+        ValueError: fewer than two stretches.
+    """
+    if stretches < 2:
+        raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
+    records = [records] if isinstance(records, Record) else records
+    each = zip(records, refined.amplitudes, refined.noise, strict=True)
+    told = [_stretches(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
+    start = np.concatenate([each[0] for each in told])
+    amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in told]))
+    alike = np.stack([_alike(omega, omega_std), _alike(zeta, zeta_std)])
+    which = np.repeat(np.arange(len(records)), stretches)
+    return AmplitudeDependence(
+        frozen(which, int), frozen(start), amplitude, omega, omega_std, zeta, zeta_std, frozen(alike)
+    )
+
+
+def _stretches(
+    record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Starts (n_stretches,), and (5, n_stretches, n_modes) of amplitude, ω and its error, ζ and its error."""
+    modes = refined.modes
+    edges = np.round((2.0 ** np.arange(stretches + 1) - 1) / (2.0**stretches - 1) * record.n_samples).astype(int)
+    figures = np.full((5, stretches, modes.n_modes), np.nan)
+    for w, (first, last) in enumerate(zip(edges, edges[1:], strict=False)):
+        span, decay = (last - first) * record.sample_time, -modes.poles.real
+        begun = size * np.exp(-decay * first * record.sample_time)
+        # Mean over the stretch of the squared envelope.
+        mean = begun**2 * _mean_of_decay(2.0 * decay * span)
+        evidence = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
+        there = np.flatnonzero(evidence > LEAST_EVIDENCE)
+        if there.size == 0 or last - first < 4 * (there.size + 1):
+            continue
+        try:
+            stretch = _samples(record, first, last)
+            found = in_its_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
+        except np.linalg.LinAlgError:
+            continue
+        if not found.converged:
+            continue
+        sure = found.omega_std < LEAST_SURE * found.modes.omega
+        sure &= found.modes.frequencies_hz * span > LEAST_CYCLES
+        there = there[sure]
+        told = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
+        figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))
+        figures[1:, w, there] = np.stack(told)[:, sure]
+    return record.start_time + record.sample_time * edges[:-1], figures
+
+
+def _samples(record: Record, first: int, last: int) -> Record:
+    return record.between(record.time[first], record.time[last - 1])
+
+
+def _mean_of_decay(x: np.ndarray) -> np.ndarray:
+    """(1 - e^-x) / x, 1 at 0."""
+    near = np.abs(x) < 1e-9
+    return np.where(near, 1.0, -np.expm1(-x) / np.where(near, 1.0, x))
+
+
+def _alike(values: np.ndarray, std: np.ndarray) -> np.ndarray:
+    """Probability of values so far apart, (n_modes,), if each column is one number and its errors."""
+    weights = np.where(np.isfinite(values), 1.0 / std**2, 0.0)
+    known = np.where(np.isfinite(values), values, 0.0)
+    mean = (weights * known).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-300)
+    free = np.isfinite(values).sum(axis=0) - 1
+    return np.where(free > 0, chi2.sf((weights * (known - mean) ** 2).sum(axis=0), np.maximum(free, 1)), 1.0)

@@ -1,0 +1,109 @@
+"""One mode whose frequency and damping go with its amplitude: the other account of a beat that one sensor sees.
+
+Its envelope r and phase θ follow a backbone, smooth and one for each amplitude (Nayfeh & Mook 1979, 2.3),
+
+    r' = -σ(r) r,   θ' = ω(r),   -σ + iω = Σ_k λ_k r^p_k,      y = Re A exp(Σ_k λ_k ∫ r^p_k dt),   r(0) = 1
+
+with powers p of 0, 1, 2 (stiffness and damping that rise or fall), 0, ½, 1 (joints that slip) or -1, 0, 1 (friction):
+eight numbers with A, as many as two linear modes have, so that the likelier account is the truer.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import least_squares
+
+from workbench.identification.signal.projection import project
+from workbench.records.record import Record
+
+POWERS = ((0.0, 1.0, 2.0), (0.0, 0.5, 1.0), (0.0, -1.0, 1.0))
+# Of the envelope in time; nepers from which on the backbone stays as it is, and to which it is followed.
+STEPS, FADED, DIED = 150, 7.0, 60.0
+MOST_TRIES = 40
+SLIGHTLY = 1e-5
+# A swing may not grow beyond this; what one that does is said to leave, over the record.
+LARGEST, BEYOND = 1e100, 10.0
+
+
+def left_by_backbone(
+    record: Record, pair: np.ndarray, others: np.ndarray, *, offset: bool, enough: float = 0.0
+) -> float:
+    """Least sum of squares that one mode on a backbone leaves of a record of one output, in place of two linear ones.
+
+    Args:
+        record: free decay.
+        pair: (2,) poles of the two, rad/s.
+        others: (n_others,) of linear modes beside them, which are held.
+        offset: whether the output may also hold a constant.
+        enough: what need not be gone below.
+    """
+    amplitudes = project(record, np.append(pair, others), offset).complex_amplitudes[0, :2]
+    least = np.inf
+    for powers in POWERS:
+        for left in _Backbone(record, np.array(powers), others, offset).fits(pair, amplitudes):
+            least = min(least, left)
+            if least <= enough:
+                return least
+    return least
+
+
+class _Backbone:
+    """The fit of one law of powers; what is linear in the record drops out."""
+
+    def __init__(self, record: Record, powers: np.ndarray, others: np.ndarray, offset: bool) -> None:
+        self.time, self.powers = record.sample_time * np.arange(record.n_samples), powers
+        swings = np.exp(np.outer(self.time, others))
+        columns = np.hstack([swings.real, swings.imag, np.ones((self.time.size, int(offset)))])
+        self.beside = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
+        self.y = self._apart(record.outputs[0])
+
+    def fits(self, pair: np.ndarray, amplitudes: np.ndarray) -> Iterator[float]:
+        """What is left, from what the two look like, z: their own z'/z by |z|; and from the stronger of them."""
+        each = amplitudes * np.exp(np.outer(self.time, pair))
+        z, slope = each.sum(axis=1), (each * pair).sum(axis=1)
+        size = np.abs(z) / max(abs(z[0]), 1e-3 * np.abs(z).max())
+        by_power = np.maximum(size, np.exp(-FADED))[:, None] ** self.powers
+        alike = np.linalg.lstsq(z[:, None] * by_power, slope, rcond=None)[0]
+        left, slopes = (lambda p, k=k: self._fitted(p)[k] for k in (0, 1))
+        for start in (alike, np.array([pair[np.argmax(np.abs(amplitudes))], 0.0, 0.0])):
+            at = np.r_[start.real, start.imag]
+            yield 2.0 * float(least_squares(left, at, slopes, x_scale="jac", max_nfev=MOST_TRIES).cost)
+
+    def _fitted(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is left (n,) and its slopes by Re λ and Im λ (n, 6), A projected out (Kaufman 1975)."""
+        real, turn = unknowns[:3], 1j * unknowns[3:]
+        step = SLIGHTLY * max(abs(real[0]), 1e-3 / self.time[-1])
+        held, *moved = self._held(np.vstack([real, real + step * np.eye(3)]))
+        with np.errstate(over="ignore", invalid="ignore"):
+            swing = np.exp(held @ (real + turn))
+            by_real = [(np.exp(h @ (r + turn)) - swing) / step for h, r in zip(moved, real + step * np.eye(3))]
+        if not (np.abs(by_real) < LARGEST).all():
+            return BEYOND * np.abs(self.y), np.zeros((self.y.size, 6))
+        q, r = np.linalg.qr(self._apart(np.column_stack([swing.real, swing.imag])))
+        seen = q.T @ self.y
+        a, b = np.linalg.lstsq(r, seen, rcond=1e-12)[0]
+        slopes = np.column_stack([*by_real, 1j * swing[:, None] * held])
+        slopes = self._apart(slopes.real * a + slopes.imag * b)
+        return self.y - q @ seen, -(slopes - q @ (q.T @ slopes))
+
+    def _apart(self, columns: np.ndarray) -> np.ndarray:
+        return columns - self.beside @ (self.beside.T @ columns)
+
+    def _held(self, real: np.ndarray) -> list[np.ndarray]:
+        """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
+        t = np.linspace(0.0, self.time[-1], STEPS + 1)
+        h, u, rates = t[1], np.zeros((STEPS + 1, len(real))), np.zeros((STEPS + 1, len(real)))
+
+        def rate(u):
+            return -(real * np.exp(-np.outer(np.clip(u, -1.0, FADED), self.powers))).sum(axis=1)
+
+        for k in range(STEPS):
+            rates[k] = a = rate(u[k])
+            b = rate(u[k] + 0.5 * h * a)
+            c = rate(u[k] + 0.5 * h * b)
+            u[k + 1] = np.clip(u[k] + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(u[k] + h * c)), -1.0, DIED)
+        rates[-1] = rate(u[-1])
+        powers = np.exp(-np.clip(u, -1.0, FADED)[:, :, None] * self.powers)
+        slopes = -self.powers * powers * np.where(u < FADED, rates, 0.0)[:, :, None]
+        return list(CubicHermiteSpline(t, powers, slopes).antiderivative()(self.time).swapaxes(0, 1))

@@ -1,0 +1,247 @@
+"""Records driven by known inputs, as a `modal_fit.Drive`: what each pole answers, and the noise it answers in.
+
+Each input u_i drives each pole, z' = λ z + Σ_i l_i u_i. Between samples the input is held, or runs straight from one to
+the next, so that z is known exactly at the samples:
+
+    z_k+1 = e^{λΔt} z_k + c_0 u_k + c_1 u_k+1
+    held: c_0 = Δt φ_1, c_1 = 0;    straight: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
+
+with φ_1(x) = (e^x - 1)/x, φ_2(x) = (e^x - 1 - x)/x² at x = λΔt. The state at the first sample is one more drive, a blow
+before it. Noise that is not white is weighed line by line of the cosine transform, which all columns then go through.
+"""
+
+from collections.abc import Sequence
+from math import factorial
+
+import numpy as np
+from scipy.fft import next_fast_len
+from scipy.signal import lfilter
+
+from workbench.identification.free_decay.coloured_noise import heard_along, noise_near
+from workbench.identification.free_decay.identified import MOST_DAMPED
+from workbench.identification.input_output.fit_errors import covariance
+from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves
+from workbench.identification.input_output.noise_spectrum import course, lines_of, samples_of
+from workbench.identification.signal.noise_levels import variances
+from workbench.records.record import Record
+
+# φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
+TERMS = 40
+SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
+BESIDE = 50
+PEAKS_A_RATE = 12
+
+
+class KnownInputs:
+    """Rows are the samples, one record after another, or, with `sizes`, the lines of each record over their noise.
+
+    Args:
+        records: with the same inputs and outputs at one rate.
+        at_rest, straight, feedthrough: as in `identify_driven`.
+        sizes: relative noise of each line, one (n_samples, n_outputs) a record, of unit rms over all.
+    """
+
+    def __init__(
+        self,
+        records: Sequence[Record],
+        *,
+        at_rest: bool,
+        straight: bool,
+        feedthrough: bool,
+        sizes: Sequence[np.ndarray] | None = None,
+    ) -> None:
+        self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
+        self.dt = records[0].sample_time
+        lengths = [record.n_samples for record in records]
+        ends = np.cumsum([0, *lengths])
+        self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
+        self.sizes = sizes
+        self.by_line = sizes is not None and any(np.ptp(size, axis=0).any() for size in sizes)
+        self.weights = None if sizes is None else 1.0 / np.vstack(sizes)
+        self.values = self._rows(np.vstack([record.outputs.T for record in records]))
+        if self.weights is not None:
+            self.values = self.values * self.weights
+        constant = np.zeros((ends[-1], len(records)))
+        for k, rows in enumerate(self.rows):
+            constant[rows, k] = 1.0
+        direct = np.vstack([record.inputs.T for record in records])
+        self.n_inputs = direct.shape[1]
+        self.n_drives = self.n_inputs + (0 if at_rest else len(records))
+        self.feedthrough = feedthrough and not _flat(direct)
+        self.fixed = self._rows(np.hstack([direct, constant]) if self.feedthrough else constant)
+        self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
+        self.highest = np.pi / self.dt
+        self.size = next_fast_len(2 * max(lengths))
+        span = max(lengths) * self.dt
+        fastest = max(0.1 * np.pi / self.dt, 2.0 / span)
+        self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
+        self.cells = self.rates.size * max(lengths)
+
+    def weighing(self, sizes: Sequence[np.ndarray] | None) -> "KnownInputs":
+        """The same records with lines that count by their noise; with None, samples that count alike."""
+        how = {"at_rest": self.at_rest, "straight": self.straight, "feedthrough": self.may_feel}
+        return KnownInputs(self.records, **how, sizes=sizes)
+
+    def noise(self, fit: Fit) -> np.ndarray:
+        """Standard deviation of what is left of each output in each record, (n_records, n_outputs)."""
+        loud = np.array([np.sqrt((size**2).mean(axis=0)) for size in self.sizes]) if self.sizes is not None else 1.0
+        return np.sqrt(variances(*self._squares(fit))) * loud
+
+    def course(self, fit: Fit) -> list[np.ndarray] | None:
+        """How the noise runs along the lines of each record, as `noise_course` reads it off what a fit leaves."""
+        raw = fit.residual if self.weights is None else fit.residual / self.weights
+        left = [self._samples(raw[rows]) for rows in self.rows]
+        taken = self._taken(fit)
+        shares = [taken[rows] for rows in self.rows]
+        return course(left, [record.outputs.T for record in self.records], shares, fit.poles.size, self._free(fit))
+
+    def _taken(self, fit: Fit) -> np.ndarray:
+        """Share of the noise of each line that the fit has taken, its leverage, (n_rows, n_outputs)."""
+        phi, t = columns(self, fit.poles, fit.loads)
+        if not self.by_line:
+            phi, t = (np.vstack([lines_of(matrix[rows]) for rows in self.rows]) for matrix in (phi, t))
+        free, found = free_parameters(fit), []
+        bound = covariance(fit) if free.size else np.zeros((0, 0))
+        moved = np.concatenate([moves(fit, part)[:, free] for part in fit.parts], axis=2)
+        weights = np.ones((1, fit.noise.size)) if self.weights is None else self.weights
+        for weight, std, each in zip(weights.T[:, :, None], fit.noise, moved.transpose(2, 0, 1)):
+            q = np.linalg.qr(weight * phi / np.maximum(np.linalg.norm(weight * phi, axis=0), 1e-300))[0]
+            searched = (weight * t) @ each
+            searched -= q @ (q.T @ searched)
+            found.append((q**2).sum(axis=1) + ((searched @ bound) * searched).sum(axis=1) / std**2)
+        return np.array(found).T
+
+    def cost(self, fit: Fit) -> float:
+        """Twice the negative logarithm of the likelihood of modes and noise, up to a constant."""
+        log_sizes = 0.0 if self.weights is None else -2.0 * float(np.log(self.weights).sum())
+        return log_sizes + len(fit.residual) * float(np.log((fit.residual**2).sum(axis=0)).sum())
+
+    def heard(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Noise over its mean that each mode, (n_outputs, n_modes), and each fixed column, (n_fixed, n_outputs), hears:
+        of each record as much as the mode swings in it."""
+        std = np.sqrt(variances(*self._squares(fit)))
+        swings = [self._swing(pole, load) for pole, load in zip(fit.poles, fit.loads)]
+        near, beside, energy, power = [], [], [], []
+        for k, rows in enumerate(self.rows):
+            left = self._samples(fit.residual[rows] / std[k])
+            near.append(noise_near(fit.poles, left, self.dt))
+            weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
+            seen = [self._samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
+            along = [heard_along(fixed, rest, fit.poles.size) for fixed, rest in zip(seen, left.T[:, :, None])]
+            beside.append(np.hstack(along))
+            squares = np.broadcast_to(weights**2, left.shape).T
+            energy.append(np.column_stack([squares @ (x[rows] ** 2 + y[rows] ** 2) for x, y in swings]))
+            power.append((squares @ self.fixed[rows] ** 2).T)
+        return np.average(near, axis=0, weights=energy), np.average(beside, axis=0, weights=np.array(power) + 1e-300)
+
+    def _swing(self, pole: complex, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        real, imaginary = self.answers(pole)
+        return real @ load.real - imaginary @ load.imag, real @ load.imag + imaginary @ load.real
+
+    def _squares(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """Squares of what is left, lines counted as they are, and their degrees of freedom."""
+        squares = np.array([(fit.residual[rows] ** 2).sum(axis=0) for rows in self.rows])
+        return np.maximum(squares, 1e-28 * squares.max() + 1e-300), self._free(fit)
+
+    def _free(self, fit: Fit) -> np.ndarray:
+        length = np.array([rows.stop - rows.start for rows in self.rows])
+        lost = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
+        return np.maximum(length * (1.0 - lost / length.sum()), 1.0)
+
+    def _rows(self, samples: np.ndarray) -> np.ndarray:
+        """Columns of samples as the fit sees them."""
+        return np.vstack([lines_of(samples[rows]) for rows in self.rows]) if self.by_line else samples
+
+    def _samples(self, rows: np.ndarray) -> np.ndarray:
+        """Rows of one record as samples."""
+        return samples_of(rows) if self.by_line else rows
+
+    def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+        x = np.zeros((self.values.shape[0], self.n_drives), complex)
+        for k, (record, rows) in enumerate(zip(self.records, self.rows)):
+            x[rows, : self.n_inputs] = self._driven(record, pole)[0].T
+            if not self.at_rest:
+                x[rows, self.n_inputs + k] = np.exp(pole * self.dt * np.arange(record.n_samples))
+        return self._rows(x.real), self._rows(x.imag)
+
+    def slopes(self, pole: complex, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = np.zeros(self.values.shape[0], complex)
+        mu = np.exp(pole * self.dt)
+        for k, (record, rows) in enumerate(zip(self.records, self.rows)):
+            x, by_coefficients = self._driven(record, pole)
+            load = loads[: self.n_inputs]
+            later = self.dt * mu * (load @ x)[:-1] + (load @ by_coefficients)[1:]
+            found[rows] = lfilter([1.0], [1.0, -mu], np.r_[0.0, later])
+            if not self.at_rest:
+                time = self.dt * np.arange(record.n_samples)
+                found[rows] += loads[self.n_inputs + k] * time * np.exp(pole * time)
+        return self._rows(found.real[:, None])[:, 0], self._rows(found.imag[:, None])[:, 0]
+
+    def _driven(self, record: Record, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+        """z of each input from rest, and what its sources change with λ, (n_inputs, n_samples) each."""
+        (now, after), (now_slope, after_slope) = _sources(pole, self.dt, self.straight)
+        u = record.inputs.astype(complex)
+        rest = -after * u[:, :1]
+        x = lfilter([after, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=rest)[0]
+        before = np.hstack([np.zeros((u.shape[0], 1)), u[:, :-1]])
+        return x, now_slope * before + after_slope * u
+
+    def candidates(self, residual: np.ndarray) -> np.ndarray:
+        """Poles whose answer to the inputs agrees best with the residual.
+
+        Σ_k y_k x_k(λ) = Σ_τ R_yu(τ) e^{λ τ}, so that one transform of the correlations, weighted by a decay, compares
+        all frequencies at that rate of decay; the initial state is a blow before the first sample.
+        """
+        size, omega = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt)
+        lags = np.arange(size // 2)
+        crossed, own = [], []
+        for record, rows in zip(self.records, self.rows):
+            weights = np.ones((1, residual.shape[1])) if self.weights is None else self.weights[rows]
+            y = np.fft.rfft(self._samples(weights * residual[rows]).T, size)
+            lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
+            counted = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
+            drives = [*record.inputs] if self.at_rest else [*record.inputs, np.eye(1, record.n_samples)[0]]
+            for u in filter(np.any, drives):
+                spectrum = np.fft.rfft(u, size)
+                crossed.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
+                own.append(np.fft.irfft(counted * np.abs(spectrum) ** 2, size)[:, : size // 2])
+        found, strength = [], []
+        for rate in self.rates:
+            decay = np.exp(-rate * self.dt * lags)
+            lowest = omega > max(0.5 * self.resolution, rate / MOST_DAMPED)
+            score = np.zeros(omega.size)
+            # The answer's own power: the spectrum of the input seen through the pole.
+            for r, power in zip(crossed, own):
+                agreed = np.abs(np.fft.rfft(r * decay, size)) ** 2
+                whole = 2.0 * np.fft.rfft(power * decay, size).real - power[:, :1]
+                least = 1e-12 * power[:, :1]
+                score += (agreed / np.maximum(whole / (1.0 - np.exp(-2.0 * rate * self.dt)), least)).sum(axis=0)
+            score[~lowest] = 0.0
+            peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
+            best = peaks[np.argsort(score[peaks])[-PEAKS_A_RATE:]]
+            found.append(-rate + 1j * omega[best])
+            strength.append(score[best])
+        order = np.argsort(np.concatenate(strength))[::-1]
+        return np.concatenate(found)[order[: 3 * PEAKS_A_RATE]]
+
+    def colour(self, residual: np.ndarray, pole: complex) -> float:
+        longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
+        power = (np.abs(np.fft.rfft(self._samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
+        at = round(pole.imag / self.resolution) - 1
+        beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
+        return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0
+
+
+def _flat(inputs: np.ndarray) -> bool:
+    """Whether an input is a constant, which the offset of each output holds already."""
+    return bool((np.ptp(inputs, axis=0) == 0).any())
+
+
+def _sources(pole: complex, dt: float, straight: bool):
+    """c_0, c_1 and their derivatives by λ."""
+    x = pole * dt
+    powers = x ** np.arange(TERMS)
+    (phi1, phi1_slope), (phi2, phi2_slope) = ((s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES)
+    if not straight:
+        return (dt * phi1, 0.0), (dt**2 * phi1_slope, 0.0)
+    return (dt * (phi1 - phi2), dt * phi2), (dt**2 * (phi1_slope - phi2_slope), dt**2 * phi2_slope)

@@ -1,0 +1,130 @@
+"""Lines of measured transfer functions, as a fit of modes sees them: a `modal_fit.Drive`."""
+
+import numpy as np
+from scipy.stats import chi2
+
+from workbench.identification.free_decay.identified import MOST_DAMPED
+from workbench.identification.input_output.modal_fit import Fit
+from workbench.identification.input_output.model_order import bases_of, weights_of
+
+MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
+# Widths beside a mode, and the chance that even noise is taken for uneven.
+DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
+
+
+class Lines:
+    """Rows are real, then imaginary parts, reference by reference."""
+
+    def __init__(
+        self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, guessed=False
+    ) -> None:
+        self.guessed = guessed
+        self.omega, (_, self.refs, self.lines) = omega, h.shape
+        self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
+        self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
+        s = 1j * omega / omega[-1]
+        self.fixed = self._stacked(np.array([self._of(i, s**p) for i in range(self.refs) for p in powers]))
+        self.resolution = float(np.diff(omega).min())
+        # A pole may leave the band: one close beyond it is no constant there. It counts among what is left out.
+        self.highest = 2.0 * float(omega[-1])
+        span = omega[-1] - omega[0]
+        self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), RATES)
+        self.cells = RATES * self.lines
+
+    def _stacked(self, values: np.ndarray) -> np.ndarray:
+        rows = values.reshape(values.shape[0], -1).T
+        return np.vstack([rows.real, rows.imag])
+
+    def _of(self, reference: int, values: np.ndarray) -> np.ndarray:
+        found = np.zeros((self.refs, self.lines), complex)
+        found[reference] = values
+        return found
+
+    def unstacked(self, rows: np.ndarray) -> np.ndarray:
+        real, imaginary = np.split(rows, 2)
+        return (real + 1j * imaginary).T.reshape(-1, self.refs, self.lines)
+
+    def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+        s = 1j * self.omega
+        above, below = 1.0 / (s - pole), 1.0 / (s - pole.conjugate())
+        pair = (0.5 * (above + below), -0.5j * (above - below))
+        real, imaginary = (self._stacked(np.array([self._of(i, x) for i in range(self.refs)])) for x in pair)
+        return real, imaginary
+
+    def slopes(self, pole: complex, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        s = 1j * self.omega
+        above = loads[:, None] / (s - pole) ** 2
+        below = loads.conj()[:, None] / (s - pole.conjugate()) ** 2
+        pair = (0.5 * (above + below), -0.5j * (above - below))
+        real, imaginary = (self._stacked(x[None])[:, 0] for x in pair)
+        return real, imaginary
+
+    def candidates(self, residual: np.ndarray) -> np.ndarray:
+        left = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.lines)
+        weight = 1.0 if self.weights is None else (np.abs(self.unstacked(self.weights)) ** 2).mean(axis=(0, 1)) / 2.0
+        power = (np.abs(left) ** 2).sum(axis=0)
+        at = np.sort(np.argsort(power)[-MOST_CANDIDATES:])
+        found, strength = [], []
+        for rate in self.rates:
+            x = 1.0 / (1j * (self.omega - self.omega[at, None]) + rate)
+            score = (np.abs(left @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
+            score[rate > MOST_DAMPED * self.omega[at]] = 0.0
+            best = np.argsort(score)[-PEAKS_A_RATE:]
+            found.append(-rate + 1j * self.omega[at[best]])
+            strength.append(score[best])
+        order = np.argsort(np.concatenate(strength))[::-1]
+        beyond = np.r_[0.6 * self.omega[0], 0.9 * self.omega[0], np.array([1.05, 1.2, 1.5]) * self.omega[-1]]
+        return np.r_[np.concatenate(found)[order[: 3 * PEAKS_A_RATE]], (-0.01 + 1j) * beyond]
+
+    def fitted(self, fit: Fit) -> np.ndarray:
+        """The model at the lines, (n_outputs, n_references, n_frequencies)."""
+        return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
+
+    def left(self, fit: Fit) -> np.ndarray:
+        """What the model leaves at the lines, (n_outputs, n_references, n_frequencies)."""
+        return self.unstacked(fit.residual / (1.0 if self.weights is None else self.weights))
+
+    def misfit(self, fit: Fit) -> np.ndarray:
+        """Rms of what is left of each output, (n_outputs,), in units of the noise where that was told."""
+        if not self.guessed:
+            return fit.noise
+        raw = fit.residual / self.weights
+        return fit.noise * np.sqrt((raw**2).sum(axis=0) / (fit.residual**2).sum(axis=0))
+
+    def louder_near(self, fit: Fit) -> np.ndarray:
+        """What is left about each mode as the mode hears it, in power, over the mean of all lines, (n_modes,).
+
+        It is heard by swings a few widths beside the mode, each output as much as it shows the mode. 1 where that may
+        be noise alike at all lines.
+        """
+        residual, noise = fit.residual / fit.noise, fit.noise
+        found = np.ones(fit.poles.size)
+        if self.weights is not None and not self.guessed:
+            return found
+        bases, weights = bases_of(self, fit), weights_of(self)
+        for r, pole in enumerate(fit.poles):
+            shown = (np.abs(fit.amplitudes[:, r]) / noise) ** 2
+            width = max(abs(pole.real), 0.5 * self.resolution)
+            heard = []
+            for beside in pole.imag + width * DETUNED:
+                if self.omega[0] < beside < self.omega[-1]:
+                    columns = np.hstack(self.answers(-width + 1j * beside))
+                    power = []
+                    for basis, weight, rest in zip(bases, weights, np.split(residual, len(bases), axis=1), strict=True):
+                        # of the rest the amplitudes have taken the noise
+                        x = weight * columns - basis @ (basis.T @ (weight * columns))
+                        power.append((x.T @ rest) ** 2 / (x**2).sum(axis=0)[:, None])
+                    heard.append(np.hstack(power))
+            if not heard:
+                continue
+            power = np.mean(heard, axis=(0, 1)) @ shown / shown.sum()
+            degrees = np.size(heard) / shown.size * shown.sum() ** 2 / (shown**2).sum()
+            found[r] = power if power > chi2.isf(LOUDER, degrees) / degrees else 1.0
+        return found
+
+    def colour(self, residual: np.ndarray, pole: complex) -> float:
+        power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))
+        at = int(np.argmin(np.abs(self.omega - pole.imag)))
+        beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
+        # The median of a power of two degrees of freedom and more is at most its mean.
+        return max(1.0, float(np.median(beside) / power.mean()))

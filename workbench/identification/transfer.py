@@ -1,0 +1,285 @@
+"""Modes from measured transfer functions, between whatever lines they were measured.
+
+    H_ji(s) = Σ_r [c_jr l_ri / (s - λ_r) + conjugate] + s^k (D_ji + E_ji / s²)      at s = iω
+
+for outputs that are the k-th time derivative of a displacement: D is what the modes above the band still give, E the
+modes below it. Each mode is one shape and one participation of each reference, however many were struck or shaken.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.linalg import block_diag
+
+from workbench.identification.free_decay.ibrahim import normalised_shapes
+from workbench.identification.free_decay.identified import FALSE_ALARM
+from workbench.identification.input_output.fit_errors import errors, pole_covariance
+from workbench.identification.input_output.line_noise import noise_with_size
+from workbench.identification.input_output.modal_fit import Fit, projected, settled
+from workbench.identification.input_output.mode_clusters import NARROW, parts_of
+from workbench.identification.input_output.model_order import Told, evidence_of, tell
+from workbench.identification.input_output.spectral_lines import Lines
+from workbench.identification.signal.standard_errors import StandardErrors
+from workbench.identification.signal.synthesis import TIME_DERIVATIVE, time_derivatives
+from workbench.records.record import Channel
+from workbench.structure.modes import SampledModes, frozen
+
+# Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
+MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
+# A mode whose frequency is known no better than this is none to report.
+UNSURE = 0.01
+# Modes by which the noise of the lines is first told, how often it is told, and how far off it may be (rms of log).
+STRONGEST, REWEIGHTED, ALIKE = 4, 2, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class TransferModes(StandardErrors):
+    """Modes of transfer functions.
+
+    Attributes:
+        modes: shapes of displacement, largest entry 1.
+        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
+        shape_std: (n_outputs, n_modes) standard error of the real part of each shape.
+        participation: (n_modes, n_references) complex l_r, for c_r the shape as the outputs measure it.
+        misfit: (n_outputs,) rms of what is left: in units of the stated noise (1 where it is all there is), or, where
+            none was stated, of real and imaginary part each, in the unit of the output.
+        evidence: (n_modes,) χ² of each mode in what is left.
+        converged: whether the search ended because the step was small.
+        parts_hz: of each mode what was told beside it and is part of it (`gathering`), Hz: points measured one after
+            another disagree there, or the mode depends on amplitude.
+        full_hz: bands (lowest, highest line) in which the search stopped at the most modes it might take: what it left
+            there is no noise, and what it found is not all, or is no modes but points that disagree.
+        fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
+        frequencies_hz: (n_frequencies,) those lines.
+    """
+
+    modes: SampledModes
+    covariance: np.ndarray
+    shape_std: np.ndarray = field(repr=False)
+    participation: np.ndarray = field(repr=False)
+    misfit: np.ndarray
+    evidence: np.ndarray
+    converged: bool
+    parts_hz: tuple[tuple[float, ...], ...]
+    full_hz: tuple[tuple[float, float], ...]
+    fitted: np.ndarray = field(repr=False)
+    frequencies_hz: np.ndarray = field(repr=False)
+
+
+def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
+    """Standard error of real and imaginary part of transfer functions, |H| ((1 - γ²) / (2 γ² n))^½.
+
+    Args:
+        transfer: complex, of any shape.
+        coherence: γ², of the same shape, in (0, 1].
+        averages: n, independent averages behind both.
+
+    Raises:
+        ValueError: a coherence that is none, fewer than two averages.
+
+    Source: Bendat & Piersol, Random Data, 4th ed., section 9.1.
+    """
+    h, squared = np.asarray(transfer), np.asarray(coherence, float)
+    if squared.shape != h.shape or not ((squared > 0) & (squared <= 1)).all() or averages < 2:
+        raise ValueError(
+            f"coherence must have the shape {h.shape} of the transfer functions, lie in (0, 1], and rest on two"
+            f" averages or more; got shape {squared.shape}, {averages} averages"
+        )
+    return np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages))
+
+
+def identify_transfer(
+    transfer: ArrayLike,
+    frequencies_hz: ArrayLike,
+    *,
+    channels: tuple[Channel, ...],
+    band_hz: tuple[float, float] | None = None,
+    noise_std: ArrayLike | None = None,
+    most_modes: int = 40,
+    false_alarm: float = FALSE_ALARM,
+) -> TransferModes:
+    """The modes that measured transfer functions show, as many as there are, each with its standard error.
+
+    More than 1500 lines are fitted a band after another, each of which looks beyond its edges.
+
+    Args:
+        transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
+            input; of receptance, mobility or accelerance by the quantity of each channel.
+        frequencies_hz: (n_frequencies,) increasing, at any spacing.
+        channels: one an output; where no quantity is told, the modes beyond the band may look like any motion.
+        band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
+        noise_std: standard error of real and imaginary part, of the shape of `transfer`: from repeated measurements,
+            or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, or to go with
+            its size in part where neighbouring lines differ so (`line_noise`), and standard errors grow with what is
+            left about each mode where that is louder than elsewhere.
+        most_modes: of a band, where to stop at the latest.
+        false_alarm: chance that noise alone is taken for a mode.
+
+    Raises:
+        ValueError: shapes that do not fit, values that are no numbers, a band with too few lines, no mode.
+    """
+    h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
+    n_bands, each_own = (1, 3) if f.size <= MOST_LINES else (-(-f.size // BAND), LINES_A_MODE)
+    found, share = [], f.size / n_bands
+    for k in range(n_bands):
+        first, last = round(k * share), round((k + 1) * share)
+        inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
+        edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
+        told = _told(
+            h[..., inside],
+            2.0 * np.pi * f[inside],
+            _residual_powers(channels),
+            None if noise is None else noise[..., inside],
+            most_modes=min(most_modes, f[inside].size // each_own),
+            false_alarm=false_alarm / n_bands,
+        )
+        found.append(_modes_of(*told, channels, edges, f[first:last]))
+    whole = _together(found, channels) if n_bands > 1 else found[0]
+    if whole.modes.n_modes == 0:
+        raise ValueError(
+            f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
+            " averages"
+        )
+    return whole
+
+
+def _told(h, omega, powers, noise, **how) -> tuple[Lines, Told]:
+    """The modes of a band; where no noise is told, its course along the lines by what the strongest modes leave."""
+    lines = Lines(h, omega, powers, noise)
+    if noise is not None:
+        return lines, tell(lines, **how)
+    told = tell(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
+    before: np.ndarray | None = None
+    for _ in range(REWEIGHTED):
+        guessed = noise_with_size(lines.left(told.fit), lines.fitted(told.fit))
+        if guessed is None or (before is not None and _much_as(guessed, before)):
+            break
+        before = guessed
+        lines = Lines(h, omega, powers, guessed, guessed=True)
+        told = tell(lines, **how)
+    return (lines, told) if lines.guessed else (lines, tell(lines, **how))
+
+
+def _much_as(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether noise runs along the lines of each output as another does, but for its size."""
+    return bool(np.log(one / other).std(axis=(1, 2)).max() < ALIKE)
+
+
+def _modes_of(lines: Lines, told: Told, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
+    """The modes of a band between its edges; the fit at the lines shown."""
+    fit, parts_hz = _gathered(lines, told, channels)
+    damped_hz = fit.poles.imag / (2.0 * np.pi)
+    heard = np.tile(lines.louder_near(fit), (len(channels), 1))
+    covariance = pole_covariance(fit, heard)
+    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < UNSURE * np.abs(fit.poles)
+    within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
+    inside = np.flatnonzero(within & sure & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
+    n = inside.size
+    derivative = time_derivatives(channels)[:, None]
+    poles, loads = fit.poles[inside], fit.loads[inside]
+    seen = fit.amplitudes[:, inside] / poles**derivative
+    largest, each = np.abs(seen).argmax(axis=0), np.arange(n)
+
+    def relative(poles, loads, amplitudes):
+        seen = amplitudes[:, inside] / poles[inside] ** derivative
+        return (seen / seen[largest, each]).real.ravel()
+
+    std = np.zeros((len(channels), n))
+    if n:
+        std = np.sqrt(np.diag(errors(fit, relative, heard))).reshape(len(channels), n)
+        std[largest, each] = 0.0
+    both = np.r_[inside, fit.poles.size + inside]
+    shapes = normalised_shapes(seen) if n else seen
+    at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
+    return TransferModes(
+        modes=SampledModes(np.abs(poles), -poles.real / np.abs(poles), shapes, _places(channels)),
+        covariance=frozen(covariance[np.ix_(both, both)]),
+        shape_std=frozen(std),
+        participation=frozen(loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
+        misfit=frozen(lines.misfit(fit)),
+        evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
+        converged=fit.converged,
+        parts_hz=tuple(parts_hz[r] for r in inside),
+        full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if told.full else (),
+        fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
+        frequencies_hz=frozen(shown_hz),
+    )
+
+
+def _gathered(lines: Lines, told: Told, channels) -> tuple[Fit, list[tuple[float, ...]]]:
+    """The fit with one mode for every crowd of parts, and the frequencies of those of each mode, Hz."""
+    fit = told.fit
+    shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
+    seen = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, _places(channels))
+    parts = parts_of(fit.poles, seen.phase_collinearity, told.evidence)
+    kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
+    parts_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
+    if not parts:
+        return fit, parts_hz
+    middle = fit.poles.copy()
+    for r, others in parts.items():
+        crowd = [r, *(k for k in others if np.abs(fit.poles.real[k]) < NARROW * np.abs(fit.poles.real[r]))]
+        middle[r] = np.average(fit.poles[crowd], weights=told.evidence[crowd])
+    return settled(lines, projected(lines, middle[kept], fit.loads[kept])), parts_hz
+
+
+def _together(found: Sequence[TransferModes], channels) -> TransferModes:
+    """The modes of all bands, each fitted in its own."""
+    each = [band.modes for band in found]
+    n = [modes.n_modes for modes in each]
+    covariance = block_diag(*(band.covariance for band in found))
+    first = np.concatenate([np.arange(k) + 2 * sum(n[:i]) for i, k in enumerate(n)]).astype(int)
+    both = np.r_[first, first + np.repeat(n, n)]
+    omega, zeta = (np.concatenate([getattr(modes, name) for modes in each]) for name in ("omega", "zeta"))
+    shapes = np.hstack([modes.shapes for modes in each])
+    share = np.array([band.frequencies_hz.size for band in found]) / sum(band.frequencies_hz.size for band in found)
+    return TransferModes(
+        modes=SampledModes(omega, zeta, shapes, _places(channels)),
+        covariance=frozen(covariance[np.ix_(both, both)]),
+        shape_std=frozen(np.hstack([band.shape_std for band in found])),
+        participation=frozen(np.vstack([band.participation for band in found]), complex),
+        misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
+        evidence=frozen(np.concatenate([band.evidence for band in found])),
+        converged=all(band.converged for band in found),
+        parts_hz=tuple(parts for band in found for parts in band.parts_hz),
+        full_hz=tuple(full for band in found for full in band.full_hz),
+        fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
+        frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
+    )
+
+
+def _residual_powers(channels) -> list[int]:
+    """Of s, with what modes above and below the band leave in it."""
+    told = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in TIME_DERIVATIVE}
+    above = told or {0, 2}
+    return sorted({int(power) for k in above for power in (k, k - 2)})
+
+
+def _places(channels) -> np.ndarray:
+    return np.array([np.nan if channel.at is None else channel.at for channel in channels])
+
+
+def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
+    h, f = np.asarray(transfer, complex), np.asarray(frequencies_hz, float)
+    h = h[:, None] if h.ndim == 2 else h
+    if h.ndim != 3 or h.shape[0] != len(channels) or h.shape[1] == 0 or f.shape != h.shape[2:]:
+        raise ValueError(
+            f"transfer functions must have shape ({len(channels)} outputs, [n_references,] {f.size} frequencies); got"
+            f" {np.shape(transfer)}. Is frequency the last axis?"
+        )
+    if not np.isfinite(f).all() or (np.diff(f) <= 0).any():
+        raise ValueError("transfer functions need finite frequencies that increase; sort them, each once")
+    noise = None if noise_std is None else np.asarray(noise_std, float).reshape(np.shape(transfer)).reshape(h.shape)
+    if noise is not None and not ((noise > 0) & np.isfinite(noise)).all():
+        raise ValueError("noise_std must be positive and finite at every line; give lines without noise a floor")
+    low, high = (0.0, np.inf) if band_hz is None else band_hz
+    keep = (f >= low) & (f <= high) & (f > 0)
+    if keep.sum() < 12:
+        raise ValueError(f"{int(keep.sum())} lines lie between {low:g} and {high:g} Hz; a fit needs 12 or more")
+    bad = np.argwhere(~np.isfinite(h[:, :, keep]))
+    if len(bad):
+        j, _, line = bad[0]
+        raise ValueError(f"output {channels[j].name!r} is no number at {f[keep][line]:g} Hz; leave that line out")
+    return h[:, :, keep], f[keep], None if noise is None else noise[:, :, keep]

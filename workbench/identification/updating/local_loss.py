@@ -1,0 +1,232 @@
+"""Is stiffness lost over a part of the structure, and where?
+
+Two explanations of the same modes compete: mass and stiffness that vary smoothly, in as many terms as it takes, and
+the same with a share δ of the stiffness lost between two places. Each is fitted to the measured frequencies and shapes
+in units of their standard errors. A loss is reported where it lowers
+
+    χ² + n_terms ln n_data
+
+below that of the smooth explanation by more than noise would lower χ² anywhere along the structure, but for the chance
+of a false alarm. No measurement of the undamaged structure is needed.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.stats import chi2 as chi2_distribution
+
+from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.updating.distributions import Basis
+from workbench.identification.updating.fitted_structure import FittedStructure
+from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
+from workbench.identification.updating.structure_fit import MOST_TERMS, choose, with_spare_terms
+from workbench.identification.updating.structure_problem import Problem
+from workbench.identification.updating.structure_task import Task
+from workbench.structure.member import Bar, Beam
+
+FALSE_ALARM = 0.01
+N_PLACES = 60
+TYPICAL_WIDTH = 0.1  # of the length
+WIDTHS = (0.05, 0.1, 0.2, 0.4)  # of the length: a search finds a loss from half and from twice its width, not from any
+MOST_STARTS, MOST_LOOKS = 2, 4  # of each width; after the first
+FIRST_TERMS, FEWER_TERMS = 3, 2
+N_DRAWS = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class LossFound:
+    """What the modes say of a local loss of stiffness.
+
+    Attributes:
+        smooth: the best explanation without one, or, where no number of terms comes near, that of most terms.
+        lossy: the best with one, believed or not.
+        evidence: what the loss lowers χ² + n_terms ln n_data by; in units of χ² / freedom where `lossy` does not
+            explain the modes either.
+        limit: what noise lowers it by with the chance of a false alarm.
+    """
+
+    smooth: FittedStructure
+    lossy: FittedStructure
+    evidence: float
+    limit: float
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a loss."""
+        return bool(self.evidence > self.limit)
+
+    @property
+    def loss(self) -> LocalLoss | None:
+        """Share, centre and width; None where there is none."""
+        return self.lossy.loss if self.found else None
+
+    @property
+    def best(self) -> FittedStructure:
+        """The explanation to take."""
+        return self.lossy if self.found else self.smooth
+
+    def interval(self, level: float = 0.95) -> np.ndarray:
+        """Confidence intervals of share, centre and width, (3, 2); what of a loss passes an end does not count."""
+        likely, length = self.lossy.parameters[-3:], self.lossy.structure.length
+        share, centre, width = (
+            np.random.default_rng(0)
+            .multivariate_normal(likely, self.lossy.covariance[-3:, -3:], N_DRAWS, method="eigh")
+            .T
+        )
+        begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
+        tail = 0.5 * (1.0 - level)
+        return np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T
+
+
+def find_loss(
+    measured: Refined,
+    nominal: Bar | Beam,
+    *,
+    basis: Callable[[int], Basis] | None = None,
+    mass_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
+    false_alarm: float = FALSE_ALARM,
+    **known: Any,
+) -> LossFound:
+    """Whether and where stiffness is lost over a part of the structure, from its modes alone.
+
+    Args:
+        measured, nominal, basis, mass_terms, stiffness_terms: as `choose_structure`.
+        false_alarm: chance that an undamaged structure is reported.
+        known: `known_mass`, `known_stiffness`, priors and `numbers` of `fit_structure`.
+
+    Raises:
+        ValueError: as `fit_structure`.
+    """
+    task = Task.of(measured, nominal, **known)
+    basis = basis or partial(Basis.legendre, length=nominal.length)
+    terms = sorted(mass_terms), sorted(stiffness_terms)
+    if not (terms[0] and terms[1]):
+        raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
+    first = _from_anywhere(Problem.of(task, *(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
+    lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
+    fewer = 0
+    for _ in range(MOST_LOOKS):
+        if lossy.explains or fewer >= max(lossy.n_terms):
+            break
+        at_least = (max(n - fewer, few[0]) for n, few in zip(lossy.n_terms, terms, strict=True))
+        again = _from_anywhere(Problem.of(task, *(basis(n) for n in at_least)), lossy)
+        if again.criterion < lossy.criterion - 1.0:
+            lossy, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
+        else:
+            fewer += FEWER_TERMS  # many terms imitate a loss so well that few starts lead to it
+    # three parameters, sought over as many places as stand apart
+    limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
+    smooth = _smooth(task, basis, terms, lossy, limit)
+    evidence = smooth.criterion - lossy.criterion + _price(task)
+    # modes that not even a loss explains err by more than their standard errors, and count for less
+    return LossFound(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
+
+
+def _price(task: Task) -> float:
+    """What the three parameters of a loss add to the criterion."""
+    return 3.0 * float(np.log(task.n_data))
+
+
+def _smooth(task: Task, basis, terms, lossy: FittedStructure, limit: float) -> FittedStructure:
+    """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
+
+    def alike(*n_terms: int) -> FittedStructure:
+        return Problem.of(task, *(basis(n) for n in n_terms)).fit(lossy)
+
+    same = alike(*lossy.n_terms)
+    if same.chi2 - lossy.chi2 <= limit:
+        return with_spare_terms(same, task, basis)
+    most = alike(terms[0][-1], terms[1][-1])
+    if most.chi2 - lossy.criterion + _price(task) > limit:
+        return most
+    return choose(task, basis, terms[0], terms[1], lambda problem, near: problem.fit(near))
+
+
+def _near_the_last(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The most likely structure with a loss near the one found before."""
+    assert near is not None, "a search along the structure comes first"
+    return problem.fit(near, near.loss)
+
+
+def _near_either(other: FittedStructure, problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The likelier of two searches, for a loss of few terms may end beside that of many."""
+    return _likeliest(problem, [(start, start.loss) for start in (near, other) if start is not None])
+
+
+def _from_anywhere(problem: Problem, near: FittedStructure | None) -> FittedStructure:
+    """The most likely structure with a loss, from the likeliest places and from what was found before."""
+    starts = [(whole, loss) for whole in _without_loss(problem) for loss in _likely_losses(problem, whole)]
+    return _likeliest(problem, starts if near is None else [*starts, (near, near.loss)])
+
+
+def _without_loss(problem: Problem) -> list[FittedStructure]:
+    """Where to look from: the nominal structure, and the most likely, which may have bent itself to imitate a loss."""
+    found = []
+    for whole in (problem.nominal, problem.fit):
+        try:
+            found.append(whole())
+        except ValueError:
+            continue
+    return found
+
+
+def _likeliest(problem: Problem, starts: Sequence[tuple[FittedStructure, LocalLoss | None]]) -> FittedStructure:
+    """The most likely of what searches from several starts find; one that ends at no structure is passed over."""
+    found, reason = [], "no structure of so many terms was found to look for a loss in; use fewer terms"
+    for near, loss in starts:
+        try:
+            found.append(problem.fit(near, loss))
+        except ValueError as error:
+            reason = str(error)
+    if not found:
+        raise ValueError(reason)
+    return min(found, key=lambda fit: fit.chi2)
+
+
+def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
+    """Those that would lower χ² most, of each width the local peaks of `scan`; none where none would."""
+    length = problem.task.nominal.length
+    places, all_gains = scan(problem, whole)
+    likely = []
+    for width, gain in zip(WIDTHS, all_gains, strict=True):
+        peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
+        best = sorted(peaks, key=lambda i: -gain[i])[:MOST_STARTS]
+        likely += [LocalLoss(0.1, float(places[i]), width * length) for i in best]
+    return likely
+
+
+def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
+    """Places along the structure (n_places,) and what a small loss of each of `WIDTHS` there would lower χ² by, to
+    first order, (n_widths, n_places)."""
+    task, series = problem.task, problem.series
+    length = task.nominal.length
+    places = (np.arange(N_PLACES) + 0.5) / N_PLACES * length
+    d, e = np.split(smooth.parameters, [smooth.n_terms[0]])
+
+    def with_losses(x: np.ndarray) -> np.ndarray:
+        own = series.stiffness.functions(x)
+        near = np.maximum(1.0 - np.abs(x[:, None] - places) * N_PLACES / length, 0.0)
+        return np.hstack([own, -(1.0 + own @ e)[:, None] * near])
+
+    breaks = tuple(np.linspace(0.0, length, 11))
+    wider = Basis(with_losses, e.size + N_PLACES, (*series.stiffness.breaks, *breaks))
+    particular, free = problem.stiffness_held
+    held = np.r_[particular, np.zeros(N_PLACES)], block_diag(free, np.eye(N_PLACES))
+    trial = replace(
+        problem, series=SeriesStructure(task.nominal, series.mass, wider, series.positions), stiffness_held=held
+    )
+    missed, slopes = trial.misses(np.r_[problem.free_of(d, e), np.zeros(N_PLACES)])
+    # what the smooth series cannot make good
+    own = np.linalg.qr(slopes[:, :-N_PLACES])[0]
+    narrow = slopes[:, -N_PLACES:] - own @ (own.T @ slopes[:, -N_PLACES:])
+    apart = np.abs(places[:, None] - places) / length
+    gains = []
+    for width in WIDTHS:
+        losses = narrow @ (apart < 0.5 * width)
+        gains.append(np.maximum(-losses.T @ missed, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
+    return places, np.array(gains)

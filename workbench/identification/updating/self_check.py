@@ -1,0 +1,144 @@
+"""The check of section 4.3: does the structure that was identified have the modes it was identified from?"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from workbench.identification.updating.distributions import Basis, Distributions, mass_and_stiffness
+from workbench.structure.member import Bar, Beam
+from workbench.structure.modes import Modes, mac
+from workbench.structure.supports import End
+
+N_POINTS = 101
+
+
+@dataclass(frozen=True, eq=False)
+class SelfCheck:
+    """The eigensolution of an identified structure beside the one that was measured.
+
+    Attributes:
+        frequency_errors: (n_modes,) relative, identified structure against measurement; infinite where it has none.
+        mac: (n_modes,) agreement of each shape.
+        refusal: why the identified distributions are no structure; empty if they are.
+    """
+
+    frequency_errors: np.ndarray
+    mac: np.ndarray
+    refusal: str = ""
+
+    @property
+    def worst(self) -> float:
+        """Largest relative frequency error, the figure by which identifications are compared."""
+        return float(np.abs(self.frequency_errors).max())
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """A structure identified with the number of terms that passed the self-check best."""
+
+    distributions: Distributions
+    n_terms: tuple[int, int]
+    check: SelfCheck
+    tried: tuple[tuple[int, int, float], ...] = field(default=())
+
+
+def structure_of(found: Distributions, *, kind: str, length: float, left: str | End, right: str | End) -> Bar | Beam:
+    """The `Bar` or `Beam` that identified distributions describe.
+
+    Raises:
+        ValueError: a distribution that is not positive everywhere.
+    """
+    where: dict[str, Any] = {"length": length, "left": left, "right": right, "mass_per_length": found.mass.profile}
+    if kind == "bar":
+        return Bar(axial_stiffness=found.stiffness.profile, **where)
+    return Beam(bending_stiffness=found.stiffness.profile, **where)
+
+
+def self_check(
+    found: Distributions, measured: Modes, *, kind: str, left: str | End, right: str | End, first_mode: int = 0
+) -> SelfCheck:
+    """Solve the eigenproblem of what was identified and compare it with what was measured.
+
+    Args:
+        found: mass and stiffness.
+        measured: the modes that they were found from, consecutive.
+        kind: "bar" or "beam".
+        left, right: its ends.
+        first_mode: index of the first measured mode among all modes of the structure; 2 leaves out the rigid-body
+            modes of a free-free beam.
+    """
+    n = measured.n_modes
+    try:
+        structure = structure_of(found, kind=kind, length=measured.length, left=left, right=right)
+        again = structure.modes(first_mode + n, tolerance=1e-6).select(slice(first_mode, None))
+    except ValueError as error:
+        return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
+    x = np.linspace(0.0, measured.length, N_POINTS)
+    agreement = np.diag(mac(again.phi(x), measured.phi(x)))
+    return SelfCheck(again.omega / measured.omega - 1.0, agreement)
+
+
+def choose_terms(
+    measured: Modes,
+    *,
+    kind: str,
+    left: str | End,
+    right: str | End,
+    known_mass,
+    terms: Iterable[int] = range(1, 7),
+    basis=Basis.polynomial,
+    first_mode: int = 0,
+    **priors,
+) -> Identified:
+    """Identify with each pair of numbers of terms and keep the one whose own modes agree best with the measured.
+
+    A pair with more terms must halve the worst frequency error of every smaller one to be preferred, and none is
+    sought beyond the error of the measured frequencies: unneeded terms only fit the noise.
+
+    Args:
+        measured: as `mass_and_stiffness`.
+        kind, left, right, first_mode: as `self_check`.
+        known_mass: ((x, kg/m), ...).
+        terms: numbers of terms to try, for mass and stiffness alike.
+        basis: number of terms -> `Basis`.
+        priors: `prior_mass`, `prior_stiffness` of `mass_and_stiffness`.
+
+    Raises:
+        ValueError: no pair of numbers gives a structure; the last reason is told.
+    """
+    ends: dict[str, Any] = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
+    best, tried, reason = None, [], "no number of terms was given"
+    enough = _frequency_error(measured)
+    pairs = sorted(((a, b) for a in terms for b in terms), key=lambda pair: (sum(pair), pair))
+    for n_mass, n_stiffness in pairs:
+        try:
+            found = mass_and_stiffness(
+                measured,
+                kind=kind,
+                mass_basis=basis(n_mass),
+                stiffness_basis=basis(n_stiffness),
+                known_mass=known_mass,
+                **priors,
+            )
+        except ValueError as error:
+            reason = str(error)
+            continue
+        check = self_check(found, measured, **ends)
+        reason = check.refusal or reason
+        tried.append((n_mass, n_stiffness, check.worst))
+        if np.isfinite(check.worst) and (
+            best is None or (enough < best[1].worst and check.worst < 0.5 * best[1].worst)
+        ):
+            best = (found, check, (n_mass, n_stiffness))
+    if best is None:
+        raise ValueError(f"no number of terms gives a structure: {reason}")
+    return Identified(best[0], best[2], best[1], tuple(tried))
+
+
+def _frequency_error(measured: Modes) -> float:
+    """Largest relative standard error of the measured frequencies; round-off where they were computed."""
+    if measured.covariance is None:
+        return 1e-9
+    return float((np.sqrt(np.diag(measured.covariance)[: measured.n_modes]) / measured.omega).max())

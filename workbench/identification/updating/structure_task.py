@@ -1,0 +1,144 @@
+"""What was measured of a structure and what is known of it beforehand, in units of standard errors."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from workbench.identification.free_decay.ibrahim import normalised_shapes
+from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.updating.distributions import Basis
+from workbench.identification.updating.sensitivity import SeriesStructure
+from workbench.structure.member import Bar, Beam
+from workbench.structure.modes import mac
+
+# No theory of bars and beams is better than this, however clean the record.
+TRUSTED = 1e-8
+SAME_MODE = 0.6  # least MAC with the mode of the nominal structure that a measured one is taken for
+
+
+@dataclass(frozen=True)
+class GaussianPrior:
+    """How far a distribution is believed to stray from its nominal one: relative, and over what length it varies.
+
+    Attributes:
+        std: standard deviation of k / k_0 - 1 (or m / m_0 - 1) at any place.
+        correlation: length over which two places stray alike, m: exp(-Δx² / (2 correlation²)).
+    """
+
+    std: float
+    correlation: float
+
+    def __post_init__(self) -> None:
+        if not (self.std > 0 and self.correlation > 0):
+            raise ValueError(
+                f"a prior needs a positive standard deviation and correlation length; got {self.std} and"
+                f" {self.correlation}. What is known exactly is nominal and takes no term"
+            )
+
+    def root(self, basis: Basis, length: float) -> np.ndarray:
+        """R with |R c|² the prior's χ² of coefficients c."""
+        x = (np.arange(200) + 0.5) / 200 * length
+        onto = np.linalg.pinv(basis.functions(x))
+        kernel = self.std**2 * np.exp(-0.5 * ((x[:, None] - x) / self.correlation) ** 2)
+        values, vectors = np.linalg.eigh(onto @ kernel @ onto.T)
+        return (vectors / np.sqrt(np.maximum(values, 1e-8 * values.max()))).T
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What was measured, in units of its standard errors, and what is known beforehand."""
+
+    measured: Refined
+    nominal: Bar | Beam
+    known_mass: np.ndarray  # (n_known, 2)
+    known_stiffness: np.ndarray
+    mass_prior: GaussianPrior | None
+    stiffness_prior: GaussianPrior | None
+    which: np.ndarray  # elastic modes, from 0
+    reference: np.ndarray  # (n_modes,) the sensor where each shape is 1
+    shapes: np.ndarray  # (n_sensors, n_modes) real
+    unit_omega: np.ndarray  # differences of ω to standard errors, (n_modes, n_modes)
+    unit_shapes: tuple[np.ndarray, ...]  # the same for the shape of each mode at all sensors but its reference
+
+    @classmethod
+    def of(
+        cls,
+        measured: Refined,
+        nominal: Bar | Beam,
+        known_mass=(),
+        known_stiffness=(),
+        mass_prior: GaussianPrior | None = None,
+        stiffness_prior: GaussianPrior | None = None,
+        numbers: Sequence[int] | None = None,
+    ) -> "Task":
+        modes = measured.modes
+        if not np.isfinite(modes.positions).all():
+            lost = int(np.argmax(~np.isfinite(modes.positions)))
+            raise ValueError(f"sensor {lost} has no place; give its channel `at`")
+        n, m = modes.n_modes, modes.positions.size
+        if m < 2:
+            raise ValueError("one sensor tells no shape; use two or more")
+        # The entry that a shape is measured by has no error of its own.
+        reference = np.argmin(measured.shape_std, axis=0)
+        shapes = (modes.shapes / modes.shapes[reference, np.arange(n)]).real
+        spread = measured.covariance[:n, :n] + np.diag((TRUSTED * modes.omega) ** 2)
+        units = []
+        for r in range(n):
+            others = np.arange(m) != reference[r]
+            units.append(_unit(measured.shape_covariance[r][np.ix_(others, others)] + TRUSTED**2 * np.eye(m - 1)))
+        known = [np.array(pairs, float).reshape(-1, 2) for pairs in (known_mass, known_stiffness)]
+        for name, pairs in zip(("mass", "stiffness"), known, strict=True):
+            outside = (pairs[:, 0] < 0) | (pairs[:, 0] > nominal.length) | ~(pairs[:, 1] > 0)
+            if outside.any():
+                x, value = pairs[outside][0]
+                raise ValueError(
+                    f"known {name} {value:g} at x = {x:g}: it must be positive and lie within 0 to {nominal.length:g}"
+                )
+        which = _paired(measured, nominal) if numbers is None else np.asarray(numbers, int) - 1
+        if which.shape != (n,) or (which < 0).any() or np.unique(which).size < n:
+            raise ValueError(f"numbers must name {n} different modes from 1 on; got {numbers}")
+        return cls(
+            measured=measured,
+            nominal=nominal,
+            known_mass=known[0],
+            known_stiffness=known[1],
+            mass_prior=mass_prior,
+            stiffness_prior=stiffness_prior,
+            which=which,
+            reference=reference,
+            shapes=shapes,
+            unit_omega=_unit(spread),
+            unit_shapes=tuple(units),
+        )
+
+    @property
+    def n_data(self) -> int:
+        """Frequencies, and shapes but for their scale."""
+        return self.shapes.size
+
+
+def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
+    """Which elastic mode of the nominal structure each measured one is, from 0, by their shapes."""
+    modes = measured.modes
+    nothing = Basis.polynomial(0)
+    n = modes.n_modes + 4
+    solved = SeriesStructure(nominal, nothing, nothing, modes.positions).solve(np.zeros(0), np.zeros(0), n_modes=n)
+    assert solved is not None, "a nominal structure has positive mass and stiffness"
+    shapes = solved.at_sensors[:, solved.n_rigid : solved.n_rigid + n]
+    agreement = mac(normalised_shapes(modes.shapes).real, shapes)
+    which = linear_sum_assignment(-agreement)[1]
+    least = int(np.argmin(agreement[np.arange(modes.n_modes), which]))
+    if agreement[least, which[least]] < SAME_MODE:
+        raise ValueError(
+            f"measured mode {least + 1} at {modes.frequencies_hz[least]:.4g} Hz looks like no mode of the nominal"
+            f" structure (best MAC {agreement[least].max():.2f}); leave it out, mend the nominal ends, or give numbers"
+        )
+    return which
+
+
+def _unit(covariance: np.ndarray) -> np.ndarray:
+    """W with W^T W the inverse of a covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T

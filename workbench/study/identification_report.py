@@ -1,0 +1,282 @@
+"""Modes found in what was measured, told in lines, a table and JSON: what `workbench identify` says."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.identification.ambient import AmbientModes, identify_ambient
+from workbench.identification.driven import Driven, identify_driven
+from workbench.identification.free_decay.proportional import ProportionalFit
+from workbench.identification.ring_down import RingDown, ring_down
+from workbench.identification.signal.data_quality import check_fit
+from workbench.identification.transfer import TransferModes, identify_transfer
+from workbench.records.record import Channel, Record
+from workbench.records.transfer_functions import TransferFunctions
+from workbench.structure.modes import SampledModes
+
+TURN = 2.0 * math.pi
+HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
+UNLIKELY, MOST_MODES = 0.01, 40
+BROAD = 0.1  # damping ratio
+MAINS_HZ, SURE = (50.0, 60.0), 3.0
+AGREED = 0.8  # phase collinearity below which points do not swing together
+
+
+@dataclass(frozen=True)
+class ModesTold:
+    """What is to be said.
+
+    Attributes:
+        heading: of what.
+        rows: one a mode, under `HEADINGS`; figures to the second digit of their standard errors.
+        lines: all else.
+        content: for JSON.
+    """
+
+    heading: str
+    rows: tuple[tuple[str, ...], ...]
+    lines: tuple[str, ...]
+    content: dict
+
+
+def told_of(
+    measured: Sequence[Record | TransferFunctions],
+    *,
+    start: float | None = None,
+    n_modes: int | None = None,
+    ambient: bool = False,
+    band_hz: tuple[float, float] | None = None,
+) -> ModesTold:
+    """The modes of transfer functions, or of records: driven where inputs move, by unknown forces with `ambient`, else
+    free decays.
+
+    Args:
+        measured: records of the same sensors at one rate; or transfer functions, alone.
+        start: read from then on, s.
+        n_modes: as many as are to be found; in driven records and transfer functions, at most.
+        ambient: whether unknown broadband forces drive the record all along.
+        band_hz: lowest and highest line to fit, of transfer functions.
+
+    Raises:
+        ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_transfer`; ambient records that are
+            two or have inputs; options that belong to the other kind.
+    """
+    transfer = [one for one in measured if isinstance(one, TransferFunctions)]
+    if transfer:
+        if len(measured) > 1:
+            raise ValueError(f"transfer functions are identified alone; got {len(measured)} files: give one")
+        if start is not None or ambient:
+            raise ValueError("transfer functions have no time: leave --start and --ambient out; --band-hz sets a band")
+        one, most = transfer[0], MOST_MODES if n_modes is None else n_modes
+        found = identify_transfer(
+            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, most_modes=most
+        )
+        return of_transfer(found, one)
+    if band_hz is not None:
+        raise ValueError("--band-hz is for transfer functions; a record has none: resample it, or take all its modes")
+    records = [one for one in measured if isinstance(one, Record)]
+    if not ambient and not any(record.inputs.any() for record in records):
+        return of_ring_down(ring_down(records, start=start, n_modes=n_modes))
+    if start is not None:
+        records = [record.between(start) for record in records]
+    for record in records:
+        check_fit(record)
+    if not ambient:
+        most = MOST_MODES if n_modes is None else n_modes
+        return of_driven(identify_driven(records, most_modes=most), records)
+    if len(records) > 1 or records[0].n_inputs:
+        raise ValueError(
+            f"ambient forces are unknown and act all along one record; got {len(records)} records with"
+            f" {records[0].n_inputs} inputs: give one record, no inputs"
+        )
+    return of_ambient(identify_ambient(records[0], n_modes=n_modes), records[0])
+
+
+def of_ring_down(told: RingDown) -> ModesTold:
+    """Free decays."""
+    found = told.refined
+    lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(told.remarks) if remark]
+    lines += [*told.notes, *_proportional(told.proportional)]
+    said, by_amplitude = _by_amplitude(told)
+    lines += said
+    if told.noise_modes.n_modes:
+        refused = ", ".join(f"{f:.4g}" for f in told.noise_modes.frequencies_hz)
+        lines.append(f"tried and refused, as noise or parts of a mode found: {refused} Hz")
+    if not found.converged:
+        lines.append("the refinement did not settle: ask for other --modes, or a later --start")
+    damping = told.proportional
+    content = {
+        **_content(told.records[0].output_channels, found),
+        "start": [record.start_time for record in told.records],
+        "remarks": told.remarks,
+        "depends_on_amplitude": by_amplitude,
+        "proportional_damping": None if damping is None else {
+            "g1": damping.damping.g1,
+            "g2": damping.damping.g2,
+            "standard_errors": damping.standard_errors,
+            "left_over": damping.left_over,
+            "probability": damping.probability,
+        },
+        "noise_modes_hz": told.noise_modes.frequencies_hz,
+        "noise_std": found.noise_std,
+        "notes": told.notes,
+        "converged": found.converged,
+    }  # fmt: skip
+    return _told(told.records, found, lines, content)
+
+
+def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
+    """Records with their inputs."""
+    lines = [] if found.converged else ["the search did not settle: ask for other --modes"]
+    a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
+    content = {
+        **_content(records[0].output_channels, found),
+        "inputs": found.state_space.input_labels,
+        "state_space": {"A": a, "B": b, "C": c, "D": d},
+        "noise_std": found.noise_std,
+        "converged": found.converged,
+    }
+    return _told(records, found, lines, content)
+
+
+def of_ambient(found: AmbientModes, record: Record) -> ModesTold:
+    """A record under unknown broadband forces."""
+    lines = ["modes and standard errors by the likelihood of the spectrum"]
+    return _told([record], found, lines, _content(record.output_channels, found))
+
+
+def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
+    """Transfer functions."""
+    lines = [] if found.converged else ["the search did not settle: ask for other --modes, or a narrower --band-hz"]
+    broad = np.flatnonzero(found.modes.zeta > BROAD)
+    if broad.size:
+        lines.append(
+            f"modes {', '.join(str(r + 1) for r in broad)}: too broad to ring; what no mode explains may look like that"
+        )
+    at, apart = found.modes.frequencies_hz, found.modes.phase_collinearity < AGREED
+    doubtful = np.zeros(at.size, bool)
+    for low, high in found.full_hz:
+        here = (at >= low) & (at <= high)
+        doubtful |= here & apart
+        lines.append(
+            f"between {low:.6g} and {high:.6g} Hz the search stopped at its limit of modes, what is left is no noise:"
+            f" of {here.sum()} modes there {(here & apart).sum()} are not told, their points do not swing together;"
+            " points measured one after another, or on a structure that changes, disagree like that: leave that band"
+            " out by --band-hz, or take more --modes"
+        )
+    for r, parts in enumerate(found.parts_hz):
+        if parts:
+            lines.append(
+                f"mode {r + 1} stands for a crowd, others at {', '.join(f'{f:.4g}' for f in parts)} Hz: points measured"
+                " one after another disagree there, or it depends on amplitude; modes closer than that are not told"
+            )
+    doubt = SURE * found.omega_std / TURN + float(np.diff(found.frequencies_hz).min())
+    hums = np.zeros(at.size, bool)
+    for mains in MAINS_HZ:
+        hum = apart & (at > 0.5 * mains) & (np.abs(at - mains * np.round(at / mains)) < np.minimum(doubt, 0.02 * mains))
+        lines += [f"mode {r + 1}: a multiple of {mains:g} Hz: mains hum?" for r in np.flatnonzero(hum)]
+        hums |= hum
+    uneasy = np.flatnonzero(apart & ~doubtful & ~hums)
+    if uneasy.size:
+        lines.append(
+            f"modes {', '.join(str(r + 1) for r in uneasy)}: their points do not swing together; either damping couples"
+            " close modes, or points measured one after another disagree and these are parts of fewer modes"
+        )
+    band = found.frequencies_hz
+    outputs, inputs = found.modes.positions.size, len(measured.references)
+    heading = f"transfer functions of {_counted(outputs, 'output')} and {_counted(inputs, 'input')}"
+    heading += f", {band.size} lines from {band[0]:.6g} to {band[-1]:.6g} Hz"
+    content = {
+        **_content(measured.output_channels, found),
+        "references": measured.references,
+        "participation_real": found.participation.real,
+        "participation_imag": found.participation.imag,
+        "misfit": found.misfit,
+        "doubtful": doubtful,
+        "parts_hz": found.parts_hz,
+        "full_hz": found.full_hz,
+        "converged": found.converged,
+    }
+    rows = [row for row, doubt in zip(_rows(found.modes, found.omega_std, found.zeta_std), doubtful) if not doubt]
+    return ModesTold(heading, tuple(rows), tuple(lines), content)
+
+
+def _told(records: Sequence[Record], found, lines: Sequence[str], content: dict) -> ModesTold:
+    first = records[0]
+    samples = sum(record.n_samples for record in records)
+    of = f" in {len(records)} records" if len(records) > 1 else ""
+    sensors = _counted(first.n_outputs, "sensor")
+    since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
+    heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
+    return ModesTold(heading, tuple(_rows(found.modes, found.omega_std, found.zeta_std)), tuple(lines), content)
+
+
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}{'s' * (number > 1)}"
+
+
+def _rows(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray):
+    straight = modes.phase_collinearity
+    for r in range(modes.n_modes):
+        frequency = _to_its_error(modes.frequencies_hz[r], omega_std[r] / TURN)
+        damping = _to_its_error(100 * modes.zeta[r], 100 * zeta_std[r])
+        yield str(r + 1), *frequency, *damping, f"{straight[r]:.4f}"
+
+
+def _content(channels: Sequence[Channel], found) -> dict:
+    modes = found.modes
+    return {
+        "sensors": [channel.name for channel in channels],
+        "positions": [channel.at for channel in channels],
+        "frequencies_hz": modes.frequencies_hz,
+        "frequencies_std_hz": found.omega_std / TURN,
+        "damping_ratios": modes.zeta,
+        "damping_std": found.zeta_std,
+        "shapes_real": modes.shapes.real,
+        "shapes_imag": modes.shapes.imag,
+        "phase_collinearity": modes.phase_collinearity,
+    }
+
+
+def _proportional(fit: ProportionalFit | None) -> list[str]:
+    if fit is None or fit.left_over.size < 3:
+        return []
+    if fit.probability < UNLIKELY:
+        worst = int(np.abs(fit.left_over).argmax())
+        return [
+            f"damping is not proportional: g1 and g2 miss it by up to {abs(fit.left_over[worst]):.2g} standard errors"
+        ]
+    (g1, g1_std), (g2, g2_std) = (
+        _to_its_error(value, error)
+        for value, error in zip((fit.damping.g1, fit.damping.g2), fit.standard_errors, strict=True)
+    )
+    return [f"damping may be proportional: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
+
+
+def _by_amplitude(told: RingDown) -> tuple[list[str], dict]:
+    """The modes that depend on amplitude, stretch by stretch."""
+    stretches, lines, content = told.by_amplitude, [], {}
+    for r in np.flatnonzero(stretches.depends):
+        seen = np.flatnonzero(np.isfinite(stretches.omega[:, r]))
+        at = [(stretches.amplitude[w, r], stretches.omega[w, r] / TURN, stretches.zeta[w, r]) for w in seen]
+        shown = "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for size, f, zeta in at)
+        lines.append(f"mode {r + 1} depends on amplitude: {shown}")
+        content[str(r + 1)] = {
+            "record": stretches.record[seen],
+            "amplitude": stretches.amplitude[seen, r],
+            "frequencies_hz": stretches.omega[seen, r] / TURN,
+            "frequencies_std_hz": stretches.omega_std[seen, r] / TURN,
+            "damping_ratios": stretches.zeta[seen, r],
+            "damping_std": stretches.zeta_std[seen, r],
+        }
+    return lines, content
+
+
+def _to_its_error(value: float, error: float) -> tuple[str, str]:
+    """A figure and its standard error, both to the second digit of the error."""
+    if not (math.isfinite(error) and error > 1e-9 * abs(value)):
+        return f"{value:.10g}", f"{error:.1g}"
+    digits = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"

@@ -1,0 +1,329 @@
+"""Draws of hidden effects, one a kind: the numbers of an effect, or a function of a strength near 1 that gives them."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from workbench.structure.member import Beam
+from workbench.structure.supports import HELD
+from workbench.trials.scene import Scene, Unsuitable
+
+Draw = Callable[[Scene, np.random.Generator], dict | Callable[[float], dict]]
+
+
+def _sign(rng: np.random.Generator) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def _factor(name: str, size: float) -> Draw:
+    def draw(scene, rng):
+        sign = _sign(rng)
+        return lambda s: {name: float(np.exp(sign * size * s))}
+
+    return draw
+
+
+def _stiff(scene: Scene) -> float:
+    """A stiffness that matters at a point, N/m: that of the first elastic mode."""
+    modes = scene.bench.rig.modes
+    first = int(np.argmax(modes.omega > 0))
+    shape = modes.phi(np.linspace(0.0, 1.0, 41) * modes.length)[:, first]
+    return float(modes.omega[first] ** 2 / np.max(shape**2))
+
+
+def _at_point(make: Callable[[Scene, float, float, float, np.random.Generator], Callable[[float], dict]]) -> Draw:
+    """Draws of an effect at a point, from its place and the rms of the displacement and velocity there."""
+
+    def draw(scene, rng):
+        at = scene.place(rng)
+        w, v = scene.motion_at(at)
+        law = make(scene, float(np.sqrt(np.mean(w**2))), float(np.sqrt(np.mean(v**2))), float(np.abs(w).max()), rng)
+        return lambda s: {"at": at, **law(s)}
+
+    return draw
+
+
+def _clearance(scene, w, v, peak, rng):
+    gap = float(rng.uniform(0.3, 0.8)) * 1.5 * w
+    return lambda s: {"stiffness": s * _stiff(scene), "gap": gap}
+
+
+def _friction(scene, w, v, peak, rng):
+    speed = float(rng.uniform(0.01, 0.05)) * v
+    return lambda s: {"force": 0.02 * s * scene.bench.level, "smoothing_speed": speed}
+
+
+def _bouc_wen(scene, w, v, peak, rng):
+    limit = float(rng.uniform(0.2, 0.8)) * w
+    return lambda s: {"stiffness": 0.1 * s * _stiff(scene), "yield_displacement": limit}
+
+
+def _magnet(scene, w, v, peak, rng):
+    reach = float(rng.uniform(0.5, 1.0)) * w
+    return lambda s: {"stiffness": 0.1 * s * _stiff(scene), "reach": reach}
+
+
+def _member_only(draw: Draw) -> Draw:
+    def only(scene, rng):
+        if scene.bench.rig.structure is None:
+            raise Unsuitable("plain modal data cannot show this")
+        return draw(scene, rng)
+
+    return only
+
+
+def _loss(scene, rng):
+    length = scene.bench.rig.modes.length
+    width = round(float(rng.uniform(0.05, 0.2)) * length, 4)
+    at = round(float(rng.uniform(0.5 * width + 0.02 * length, 0.9 * length - 0.5 * width)), 4)
+    return lambda s: {"at": at, "width": width, "loss": 1.0 - float(np.exp(-0.2 * s))}
+
+
+def _support(scene, rng):
+    member = scene.bench.rig.structure
+    if not isinstance(member, Beam):
+        raise Unsuitable("a rod has no rotation at its ends")
+    ends = [(0.0, member.left), (member.length, member.right)]
+    ends = [(at, end) for at, end in ends if end.translation == HELD]
+    at, end = ends[rng.integers(len(ends))]
+    typical = float(member.bending_stiffness(np.array([0.5 * member.length]))[0]) / member.length
+    if end.rotation == HELD:
+        return lambda s: {"at": at, "rotational_stiffness": 20.0 * typical / s}
+    return lambda s: {"at": at, "rotational_stiffness": 0.5 * typical * s}
+
+
+def _axial(scene, rng):
+    member = scene.bench.rig.structure
+    if not isinstance(member, Beam):
+        raise Unsuitable("a tension does not alter a rod")
+    typical = float(member.bending_stiffness(np.array([0.5 * member.length]))[0]) / member.length**2
+    sign = _sign(rng)
+    return lambda s: {"tension": sign * 0.2 * s * typical}
+
+
+def _beam_only(draw: Draw) -> Draw:
+    def only(scene, rng):
+        if not isinstance(scene.bench.rig.structure, Beam):
+            raise Unsuitable("only a beam shows this")
+        return draw(scene, rng)
+
+    return only
+
+
+def _stretching(scene, rng):
+    modes = scene.bench.rig.modes
+    member = scene.bench.rig.structure
+    if not (member.left.translation == HELD and member.right.translation == HELD):
+        raise Unsuitable("only ends held apart stretch the midplane")
+    grid = np.linspace(0.0, 1.0, 101) * modes.length
+    slopes = modes.phi(grid, 1) @ scene.moved[0].T
+    size = float(np.mean(slopes**2)) * modes.length
+    typical = float(member.bending_stiffness(np.array([0.5 * modes.length]))[0]) / modes.length**2
+    return lambda s: {"coefficient": s * typical / size}
+
+
+def _drag(scene, rng):
+    modes = scene.bench.rig.modes
+    grid = np.linspace(0.0, 1.0, 101) * modes.length
+    speed = float(np.sqrt(np.mean((modes.phi(grid) @ scene.moved[1].T) ** 2)))
+    damping = float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
+    mass = float(np.mean(scene.bench.rig.structure.mass_per_length(grid[1:-1])))
+    return lambda s: {"coefficient": 0.5 * s * mass * damping / speed}
+
+
+def _damper(scene, rng):
+    at = scene.place(rng)
+    modes = scene.bench.rig.modes
+    shape = float(np.abs(modes.phi(at)[0]).max())
+    damping = float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
+    return lambda s: {"at": at, "coefficient": s * damping / shape**2}
+
+
+def _mass(scene, rng):
+    at = scene.place(rng)
+    shape = float(np.abs(scene.bench.rig.modes.phi(at)[0]).max())
+    return lambda s: {"at": at, "mass": 0.01 * s / shape**2}
+
+
+def _drive(
+    name: str, make: Callable[[Scene, np.random.Generator], Callable[[float], float]], every: float = 0.6
+) -> Draw:
+    """Draws of an effect on all actuators, or with chance 1 - every on one of them."""
+
+    def draw(scene, rng):
+        which = "all" if rng.random() < every else str(rng.choice(scene.acting))
+        number = make(scene, rng)
+        return lambda s: {"input": which, name: number(s)}
+
+    return draw
+
+
+def _gain(scene, rng):
+    sign = _sign(rng)
+    return lambda s: float(np.exp(sign * 0.2 * s))
+
+
+def _limit(scene, rng):
+    peak = float(np.abs(scene.commands).max())
+    return lambda s: peak * float(np.exp(-0.5 * s))
+
+
+def _dead(scene, rng):
+    return lambda s: 0.1 * s * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
+
+
+def _time(scene, rng):
+    return lambda s: 0.5 * s * scene.bench.sample_time
+
+
+def _moved_actuator(scene, rng):
+    return _moved_port(scene, rng, "input", [a for a in scene.bench.rig.actuators if not a.direct])
+
+
+def _moved_sensor(scene, rng):
+    return _moved_port(scene, rng, "output", list(scene.bench.rig.sensors))
+
+
+def _moved_port(scene, rng, side, ports):
+    port, length = ports[rng.integers(len(ports))], scene.bench.rig.modes.length
+    known = getattr(scene.bench.rig.modes.shapes, "places", None)
+    if known is not None:
+        return {side: port.name, "at": float(rng.choice(known[known != port.at]))}
+    step = _sign(rng) * float(rng.uniform(0.03, 0.25)) * length
+    at = port.at + step if 0.02 * length < port.at + step < length else port.at - step
+    if not 0.02 * length < at < length:
+        raise Unsuitable("the port would leave the structure")
+    return {side: port.name, "at": round(at, 4)}
+
+
+def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Callable[[float], float]]) -> Draw:
+    def draw(scene, rng):
+        row = int(rng.integers(len(scene.bench.rig.sensors)))
+        number = make(scene, row, rng)
+        return lambda s: {"output": scene.bench.rig.sensors[row].name, name: number(s)}
+
+    return draw
+
+
+def _in_rms(size: float) -> Callable:
+    def make(scene, row, rng):
+        rms, sign = float(scene.outputs[row].std()), _sign(rng)
+        return lambda s: sign * size * s * rms
+
+    return make
+
+
+def _clip(scene, row, rng):
+    return lambda s: float(np.abs(scene.outputs[row]).max()) * float(np.exp(-0.4 * s))
+
+
+def _step(scene, rng):
+    row = int(rng.integers(len(scene.bench.rig.sensors)))
+    sensor = scene.bench.rig.sensors[row]
+    step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * scene.outputs[row].std()):.3g}")
+    if step < 2.0 * sensor.noise_std:
+        raise Unsuitable("the noise hides the steps")
+    return {"output": sensor.name, "step": step}
+
+
+def _sensor_lag(scene, rng):
+    which = "all" if rng.random() < 0.6 else str(rng.choice([s.name for s in scene.bench.rig.sensors]))
+    return lambda s: {"output": which, "time_constant": 0.5 * s * scene.bench.sample_time}
+
+
+def _tone(scene, rng):
+    at = scene.place(rng)
+    frequency, phase = float(rng.uniform(0.1, 1.0)) * scene.bench.band_hz, float(rng.uniform(-np.pi, np.pi))
+    return lambda s: {"at": at, "frequency": frequency, "amplitude": 0.05 * s * scene.bench.level, "phase": phase}
+
+
+def _noise(scene, rng):
+    at, corner = scene.place(rng), float(rng.uniform(0.6, 2.0)) * scene.bench.band_hz
+    return lambda s: {"at": at, "rms": 0.1 * s * scene.bench.level, "corner": corner}
+
+
+def _drift(scene, rng):
+    duration, sign = scene.commands.shape[1] * scene.bench.sample_time, _sign(rng)
+    return lambda s: {"rate": sign * min(0.02 * s, 0.5) / duration}
+
+
+def _truncation(scene, rng):
+    raise Unsuitable("truncation is drawn with the bench: the nominal model gives up modes")
+
+
+def _cross_talk(scene, rng):
+    first, second = rng.choice(scene.acting, 2, replace=False)
+    sign = _sign(rng)
+    return lambda s: {"input": str(first), "from": str(second), "share": sign * 0.2 * s}
+
+
+def _bent_command(scene, rng):
+    rms = float(np.sqrt(np.mean(scene.commands[0] ** 2)))
+    return lambda s: {"curvature": 0.2 * s / rms}
+
+
+def _bent_reading(scene, row, rng):
+    rms, sign = float(scene.outputs[row].std()), _sign(rng)
+    return lambda s: sign * 0.2 * s / rms
+
+
+def _hum(scene, rng):
+    row, frequency = int(rng.integers(len(scene.bench.rig.sensors))), float(rng.uniform(0.2, 2.0)) * scene.bench.band_hz
+    rms = float(scene.outputs[row].std())
+    return lambda s: {
+        "output": scene.bench.rig.sensors[row].name,
+        "frequency": frequency,
+        "amplitude": 0.3 * s * rms,
+    }
+
+
+def _spikes(scene, rng):
+    row, every = int(rng.integers(len(scene.bench.rig.sensors))), int(rng.integers(60, 300))
+    rms = float(scene.outputs[row].std())
+    return lambda s: {"output": scene.bench.rig.sensors[row].name, "every": every, "amplitude": 2.0 * s * rms}
+
+
+DRAWS: dict[str, Draw] = {
+    "modulus_error": _factor("factor", 0.02),
+    "point_mass": _mass,
+    "local_stiffness_loss": _member_only(_loss),
+    "support_rotation": _support,
+    "axial_load": _axial,
+    "ground_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.05 * s * _stiff(c)}),
+    "truncated_modes": _truncation,
+    "modal_damping": _factor("factor", 0.3),
+    "point_damper": _damper,
+    "air_drag": _member_only(_drag),
+    "cubic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.1 * s * _stiff(c) / w**2}),
+    "midplane_stretching": _beam_only(_stretching),
+    "clearance": _at_point(_clearance),
+    "one_sided_stop": _at_point(_clearance),
+    "coulomb_friction": _at_point(_friction),
+    "bouc_wen": _at_point(_bouc_wen),
+    "actuator_gain": _drive("gain", _gain, every=0.0),
+    "actuator_lag": _drive("time_constant", _time),
+    "actuator_delay": _drive("delay", _time),
+    "actuator_saturation": _drive("limit", _limit),
+    "actuator_dead_zone": _drive("width", _dead),
+    "actuator_misplacement": _moved_actuator,
+    "sensor_gain": _reading("gain", lambda c, row, r: (lambda sign: lambda s: float(np.exp(sign * 0.3 * s)))(_sign(r))),
+    "sensor_bias": _reading("bias", _in_rms(0.3)),
+    "sensor_drift": _reading("drift_over_record", _in_rms(0.5)),
+    "sensor_lag": _sensor_lag,
+    "sensor_misplacement": _moved_sensor,
+    "sensor_clipping": _reading("limit", _clip),
+    "sensor_quantisation": _step,
+    "periodic_disturbance": _tone,
+    "random_disturbance": _noise,
+    "stiffness_drift": _drift,
+    "quadratic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.1 * s * _stiff(c) / w}),
+    "quintic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.05 * s * _stiff(c) / w**4}),
+    "cubic_damper": _at_point(lambda c, w, v, p, r: lambda s: {"coefficient": 0.05 * s * _stiff(c) * w / v**3}),
+    "squeeze_film": _at_point(lambda c, w, v, p, r: lambda s: {"coefficient": 0.1 * s * _stiff(c) / (w * v)}),
+    "magnet": _at_point(_magnet),
+    "cross_talk": _cross_talk,
+    "bent_command": _bent_command,
+    "bent_reading": _reading("curvature", _bent_reading),
+    "hum": _hum,
+    "spikes": _spikes,
+}

@@ -1,0 +1,133 @@
+"""Hidden effects: from the words of a label to a changed plant."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.trials import motion
+from workbench.trials.plant import Plant, with_ports
+
+Hide = Callable[[Plant, dict], Plant]
+
+
+def _altered(plant: Plant, **changes) -> Plant:
+    return replace(plant, altered=replace(plant.altered, **changes))
+
+
+def _law(code: int, *names: str) -> Hide:
+    def hide(plant: Plant, e: dict) -> Plant:
+        return replace(plant, laws=(*plant.laws, (code, e["at"], tuple(e[name] for name in names))))
+
+    return hide
+
+
+def _actuator(**fields: str) -> Hide:
+    return lambda plant, e: with_ports(plant, "actuators", e["input"], **{f: e[name] for f, name in fields.items()})
+
+
+def _sensor(**fields: str) -> Hide:
+    return lambda plant, e: with_ports(plant, "sensors", e["output"], **{f: e[name] for f, name in fields.items()})
+
+
+def _support(plant: Plant, e: dict) -> Plant:
+    left, right = plant.altered.rotational_stiffness
+    ends = (e["rotational_stiffness"], right) if e["at"] == 0 else (left, e["rotational_stiffness"])
+    return _altered(plant, rotational_stiffness=ends)
+
+
+def _cross_talk(plant: Plant, e: dict) -> Plant:
+    names = [a.name for a in plant.actuators]
+    mix = np.eye(len(names))
+    mix[names.index(e["input"]), names.index(e["from"])] = e["share"]
+    return replace(plant, mix=mix)
+
+
+def _bent_command(plant: Plant, e: dict) -> Plant:
+    acting = np.array([not a.direct for a in plant.actuators], float)
+    return replace(plant, curvature=e["curvature"] * acting)
+
+
+def _reading(law: Callable[[np.ndarray, float, dict, int], None]) -> Hide:
+    def hide(plant: Plant, e: dict) -> Plant:
+        row = [s.name for s in plant.sensors].index(e["output"])
+
+        def read(y: np.ndarray, sample_time: float) -> np.ndarray:
+            y = y.copy()
+            law(y, sample_time, e, row)
+            return y
+
+        return replace(plant, reading_laws=(*plant.reading_laws, read))
+
+    return hide
+
+
+def _bent_reading(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
+    y[row] += e["curvature"] * y[row] ** 2
+
+
+def _hum(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
+    y[row] += e["amplitude"] * np.sin(2.0 * np.pi * e["frequency"] * sample_time * np.arange(y.shape[1]))
+
+
+def _spikes(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
+    y[row, e["every"] // 2 :: e["every"]] += e["amplitude"]
+
+
+HIDE: dict[str, Hide] = {
+    "modulus_error": lambda p, e: _altered(p, stiffness_factor=e["factor"]),
+    "point_mass": lambda p, e: _altered(p, masses=(*p.altered.masses, (e["at"], e["mass"]))),
+    "local_stiffness_loss": lambda p, e: _altered(p, losses=(*p.altered.losses, (e["at"], e["width"], e["loss"]))),
+    "support_rotation": _support,
+    "axial_load": lambda p, e: _altered(p, tension=e["tension"]),
+    "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (e["at"], e["stiffness"]))),
+    "truncated_modes": lambda p, e: replace(p, n_modes=e["needed"]),
+    "modal_damping": lambda p, e: replace(p, damping_factor=e["factor"]),
+    "point_damper": _law(motion.DAMPER, "coefficient"),
+    "air_drag": lambda p, e: replace(p, drag=e["coefficient"]),
+    "cubic_spring": _law(motion.CUBIC, "stiffness"),
+    "midplane_stretching": lambda p, e: replace(p, stretching=e["coefficient"]),
+    "clearance": _law(motion.CLEARANCE, "stiffness", "gap"),
+    "one_sided_stop": _law(motion.STOP, "stiffness", "gap"),
+    "coulomb_friction": _law(motion.FRICTION, "force", "smoothing_speed"),
+    "bouc_wen": _law(motion.BOUC_WEN, "stiffness", "yield_displacement"),
+    "actuator_gain": _actuator(gain="gain"),
+    "actuator_lag": _actuator(time_constant="time_constant"),
+    "actuator_delay": _actuator(delay="delay"),
+    "actuator_saturation": _actuator(limit="limit"),
+    "actuator_dead_zone": _actuator(dead_zone="width"),
+    "actuator_misplacement": _actuator(at="at"),
+    "sensor_gain": _sensor(gain="gain"),
+    "sensor_bias": _sensor(bias="bias"),
+    "sensor_drift": _sensor(drift="drift_over_record"),
+    "sensor_lag": _sensor(time_constant="time_constant"),
+    "sensor_misplacement": _sensor(at="at"),
+    "sensor_clipping": _sensor(limit="limit"),
+    "sensor_quantisation": _sensor(step="step"),
+    "periodic_disturbance": lambda p, e: replace(
+        p, tones=(*p.tones, (e["at"], e["amplitude"], e["frequency"], e["phase"]))
+    ),
+    "random_disturbance": lambda p, e: replace(p, noises=(*p.noises, (e["at"], e["rms"], e["corner"]))),
+    "stiffness_drift": lambda p, e: replace(p, stiffness_rate=e["rate"]),
+}
+
+# Kinds that no catalogue of the diagnosis holds: an honest verdict on them is "unknown".
+OUTSIDE: dict[str, Hide] = {
+    "quadratic_spring": _law(motion.QUADRATIC, "stiffness"),
+    "quintic_spring": _law(motion.QUINTIC, "stiffness"),
+    "cubic_damper": _law(motion.CUBIC_DAMPER, "coefficient"),
+    "squeeze_film": _law(motion.SQUEEZE, "coefficient"),
+    "magnet": _law(motion.MAGNET, "stiffness", "reach"),
+    "cross_talk": _cross_talk,
+    "bent_command": _bent_command,
+    "bent_reading": _reading(_bent_reading),
+    "hum": _reading(_hum),
+    "spikes": _reading(_spikes),
+}
+
+
+def hide(plant: Plant, effects: list[dict]) -> Plant:
+    """The plant with effects in it, given in the words of the case format (inputs and outputs by name)."""
+    for effect in effects:
+        plant = (HIDE | OUTSIDE)[effect["kind"]](plant, effect)
+    return plant

@@ -1,0 +1,76 @@
+"""Holding blind trials: make cases with sealed labels, diagnose them, score them."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from joblib import Parallel, delayed
+
+from workbench.cases.case import Case, read_case
+from workbench.gap.diagnose import diagnose
+from workbench.trials.make import write_trials
+from workbench.trials.scoring import Tally, score, tally
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Blind trials as they were held.
+
+    Attributes:
+        verdicts: by case, as JSON.
+        labels: by case.
+        scores: by case.
+        tally: of all scores.
+    """
+
+    verdicts: dict[str, dict]
+    labels: dict[str, dict]
+    scores: dict[str, dict]
+    tally: Tally
+
+
+def hold_trials(
+    n: int,
+    seed: int,
+    *,
+    like: Case | None = None,
+    kinds: Sequence[Sequence[str]] | None = None,
+    diagnose_case: Callable[[Path], dict] | None = None,
+    jobs: int = 1,
+    report: Callable[[str, float], None] = lambda text, share: None,
+) -> Trials:
+    """Make n blind cases, diagnose each, and only then open the labels and score.
+
+    The labels are read into memory and their file deleted before the first diagnosis; a diagnosis is handed a folder
+    that holds cases alone.
+
+    Args:
+        like: the user's own case, whose nominal rig, levels, band and noise are taken; None draws benches.
+        kinds: what the cases hide, one entry a case; None draws them.
+        diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
+        jobs: cases diagnosed at a time, each in a process of its own.
+        report: told (what, share done).
+    """
+    with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
+        sealed = Path(vault) / "labels.json"
+        write_trials(cases, sealed, n, seed, like=like, kinds=kinds, report=lambda t, s: report(f"making {t}", 0.1 * s))
+        labels = json.loads(sealed.read_text(encoding="utf-8"))
+        sealed.unlink()
+        verdicts, scores = {}, {}
+        folders = sorted(Path(cases).iterdir())
+        found = Parallel(n_jobs=jobs, return_as="generator")(delayed(diagnose_case or verdict_on)(f) for f in folders)
+        for i, (folder, verdict) in enumerate(zip(folders, found, strict=True)):
+            verdicts[folder.name] = verdict
+            report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
+        for folder in folders:
+            length = read_case(folder).rig.modes.length
+            scores[folder.name] = score(verdicts[folder.name], labels[folder.name], length=length)
+    return Trials(verdicts, labels, scores, tally(scores.values()))
+
+
+def verdict_on(folder: Path) -> dict:
+    """The verdict on a case folder, as JSON, by one thread."""
+    case = read_case(folder)
+    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1).to_json()

@@ -1,0 +1,238 @@
+"""Blind trials: cases with a hidden effect, made by another numerical route than the diagnosis, with sealed labels."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from workbench.cases.case import Case
+from workbench.cases.writing import write_case
+from workbench.records.record import Channel, Record
+from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
+from workbench.trials.chance import draw_effect
+from workbench.trials.draws import DRAWS
+from workbench.trials.hidden import HIDE, OUTSIDE, hide
+from workbench.trials.plant import Plant, RootedPlant
+from workbench.trials.scene import Scene, Unsuitable
+
+NONE, UNKNOWN = "none", "unknown"
+KINDS = tuple(HIDE)
+OUTSIDE_KINDS = tuple(OUTSIDE)
+MOST_BENCHES, MOST_DRAWS = 40, 8
+VISIBLE = 0.02
+SEEN = 0.03  # each effect of a pair must alter the response by this much beside the other
+
+# Pairs that do the same thing: no records of a case can hold them apart.
+TWINS = (
+    {"actuator_lag", "actuator_delay"},
+    {"sensor_lag", "actuator_lag"},
+    {"sensor_lag", "actuator_delay"},
+    {"modulus_error", "stiffness_drift"},
+)
+
+
+def make_trial(
+    seed: int, *, kinds: Sequence[str] = (), like: Case | None = None, name: str = "case"
+) -> tuple[Case, dict]:
+    """A case that hides effects of the given kinds, and its label in the words of the case format.
+
+    Args:
+        seed: the same seed makes the same case.
+        kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
+        like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
+        name: of the case.
+
+    Returns:
+        The case; {"title", "snr_db", "effects", "records": {name: {"gap", "noise_floor", "true_model"}}}.
+
+    Raises:
+        ValueError: an unknown kind, or kinds that the bench cannot show.
+    """
+    unknown = [kind for kind in kinds if kind not in DRAWS]
+    if unknown:
+        raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
+    rng = np.random.default_rng(seed)
+    reason = ""
+    for _ in range(MOST_BENCHES if like is None else MOST_DRAWS):
+        try:
+            bench = draw_bench(rng) if like is None else bench_of(like)
+            tests = experiments(bench, rng)
+            bench, effects = _draw_effects(bench, tests["mid"], kinds, rng)
+            return _case(bench, tests, effects, rng, name)
+        except Unsuitable as error:
+            reason = str(error)
+    raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
+
+
+def _draw_effects(
+    bench: Bench, commands: np.ndarray, kinds: Sequence[str], rng: np.random.Generator
+) -> tuple[Bench, list[dict]]:
+    effects = []
+    if "truncated_modes" in kinds:
+        bench, effect = _truncate(bench, rng)
+        effects.append(effect)
+    others = [kind for kind in kinds if kind != "truncated_modes"]
+    if others or effects:
+        scene = Scene.of(bench, commands)
+        effects += [draw_effect(kind, scene, rng) for kind in others]
+        _check_each_seen(scene, effects, rng)
+    return bench, effects
+
+
+def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict]:
+    """The nominal model gives up modes: the rig is left with few, the structure shows what it had."""
+    modes = bench.rig.modes
+    if bench.rig.structure is None or modes.n_modes < 6:
+        raise Unsuitable("truncation needs a beam or a rod with six modes or more")
+    kept = int(rng.integers(3, max(modes.n_modes - 4, 4)))
+    rig = replace(bench.rig, modes=modes.select(slice(kept)))
+    return replace(bench, rig=rig), {"kind": "truncated_modes", "kept": kept, "needed": modes.n_modes}
+
+
+def _check_each_seen(scene: Scene, effects: list[dict], rng: np.random.Generator) -> None:
+    nominal = Plant.of(scene.bench.rig)
+    for one in effects:
+        if one["kind"] == "sensor_quantisation":
+            continue
+        rest = [e for e in effects if e is not one]
+        gap = scene.gap(hide(nominal, effects), rng, reference=hide(nominal, rest))
+        if (len(effects) > 1 and gap < SEEN) or gap > 5.0:
+            raise Unsuitable(f"{one['kind']} beside the rest alters the response by {gap:.2g}")
+        if one["kind"] == "truncated_modes" and gap < 0.01:
+            raise Unsuitable(f"the modes left out alter the response by {gap:.2g} only")
+
+
+def _case(
+    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict], rng: np.random.Generator, name: str
+) -> tuple[Case, dict]:
+    nominal = Plant.of(bench.rig).rooted()
+    real = hide(Plant.of(bench.rig), effects).rooted()
+    fit: list[Record] = []
+    validation: list[Record] = []
+    figures = {}
+    for test, commands in tests.items():
+        moved, sent = tested(real, bench, test, commands, rng)
+        measured = real.readings(moved, bench.sample_time, rng)
+        if not np.isfinite(measured).all() or (np.ptp(measured, axis=1) == 0).any():
+            raise Unsuitable("the altered structure runs away, or a sensor is dead")
+        record = _record(bench, test, sent, measured)
+        (validation if test == "validate" else fit).append(record)
+        figures[test] = {
+            "gap": _gap(measured, _predicted(nominal, sent, bench)),
+            "noise_floor": _gap(np.array([[s.noise_std] for s in bench.rig.sensors]), 0.0, measured),
+            # without random forces the motion is what the exact model predicts
+            "true_model": _gap(
+                measured,
+                _predicted(real, sent, bench) if real.plant.noises else real.readings(moved, bench.sample_time),
+            ),
+        }
+    _check_visible(figures, effects)
+    told = [{"kind": UNKNOWN, "outside": e["kind"]} if e["kind"] in OUTSIDE else e for e in effects]
+    if any(e["kind"] == UNKNOWN for e in told):
+        told = [e for e in told if e["kind"] == UNKNOWN]
+    label = {"title": name, "snr_db": bench.snr_db, "effects": told or [{"kind": NONE}], "records": figures}
+    return Case(name, bench.rig, tuple(fit), tuple(validation)), label
+
+
+def _check_visible(figures: dict[str, dict], effects: list[dict]) -> None:
+    """Some record to fit must show the gap well above its noise, else nobody could name it."""
+    shown = [f["gap"] ** 2 - f["noise_floor"] ** 2 for test, f in figures.items() if test != "validate"]
+    ratio = max(f["gap"] / f["noise_floor"] for test, f in figures.items() if test != "validate")
+    rounded = any(e["kind"] == "sensor_quantisation" for e in effects)
+    if effects and not rounded and (max(shown) < VISIBLE**2 or ratio < 2.0):
+        raise Unsuitable(f"the largest gap of a record to fit is {np.sqrt(max(max(shown), 0.0)):.2g}")
+
+
+def _predicted(plant: RootedPlant, sent: np.ndarray, bench: Bench) -> np.ndarray:
+    return plant.readings(plant.move(sent, bench.sample_time)[0], bench.sample_time)
+
+
+def _gap(measured: np.ndarray, predicted: np.ndarray | float, scaled_by: np.ndarray | None = None) -> float:
+    scale = (measured if scaled_by is None else scaled_by).std(axis=1, keepdims=True)
+    return float(np.sqrt(np.mean(((measured - predicted) / scale) ** 2)))
+
+
+def _record(bench: Bench, name: str, inputs: np.ndarray, outputs: np.ndarray) -> Record:
+    return Record(
+        sample_time=bench.sample_time,
+        outputs=outputs,
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in bench.rig.sensors),
+        inputs=inputs,
+        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in bench.rig.actuators),
+        name=name,
+    )
+
+
+def draw_kinds(n: int, seed: int, *, like: Case | None = None) -> list[tuple[str, ...]]:
+    """Kinds for n trials: of every 60, 40 of one effect, 10 pairs, 5 of none and 5 from outside the vocabulary."""
+    rng = np.random.default_rng(seed)
+    pool = list(KINDS) if like is None else [k for k in KINDS if k != "truncated_modes"]
+    singles = [(str(kind),) for _ in range(n // len(pool) + 1) for kind in rng.permutation(pool)]
+    drawn: list[tuple[str, ...]] = []
+    for i in range(n):
+        turn = (i * 7 + 3) % 60  # spreads the families over the list, whatever n is
+        if turn < 5:
+            drawn.append(())
+        elif turn < 10:
+            drawn.append((str(rng.choice(OUTSIDE_KINDS)),))
+        elif turn < 20:
+            drawn.append(_draw_pair(pool, rng))
+        else:
+            drawn.append(singles.pop(0))
+    return drawn
+
+
+def _draw_pair(pool: list[str], rng: np.random.Generator) -> tuple[str, str]:
+    while True:
+        first, second = (str(kind) for kind in rng.choice(pool, 2, replace=False))
+        if {first, second} not in TWINS and "truncated_modes" not in (first, second):
+            return first, second
+
+
+def write_trials(
+    folder: str | Path,
+    labels: str | Path,
+    n: int,
+    seed: int,
+    *,
+    like: Case | None = None,
+    kinds: Sequence[Sequence[str]] | None = None,
+    report: Callable[[str, float], None] = lambda text, share: None,
+) -> None:
+    """Write n cases as folders, and their labels as one JSON file elsewhere.
+
+    Args:
+        like: a case whose rig and records all are like; None draws a bench a case. Kinds that a bench cannot show
+            give way to others.
+        kinds: what each case hides; None draws them, see `draw_kinds`.
+        report: told (what, share done).
+
+    Raises:
+        ValueError: labels that would lie in the folder that the diagnosis reads.
+    """
+    folder, labels = Path(folder), Path(labels)
+    if labels.resolve().is_relative_to(folder.resolve()):
+        raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
+    told = {}
+    for i, hidden in enumerate(draw_kinds(n, seed, like=like) if kinds is None else kinds):
+        name = f"case-{i + 1:03d}"
+        case, told[name] = _first_possible(seed, i, tuple(hidden), like, name)
+        write_case(case, folder / name)
+        report(name, (i + 1) / n)
+    labels.parent.mkdir(parents=True, exist_ok=True)
+    labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def _first_possible(seed: int, i: int, kinds: tuple[str, ...], like: Case | None, name: str) -> tuple[Case, dict]:
+    """The trial, or with kinds that this rig cannot show, one of kinds that it can."""
+    rng = np.random.default_rng([seed, i])
+    for _ in range(100):
+        try:
+            return make_trial(int(rng.integers(2**31)), kinds=kinds, like=like, name=name)
+        except ValueError:
+            kinds = tuple(
+                str(k) for k in rng.choice([k for k in KINDS if k != "truncated_modes"], len(kinds), replace=False)
+            )
+    raise ValueError("this bench shows none of the effects; are its sensors and levels right?")

@@ -1,0 +1,225 @@
+"""The real structure of a blind trial: a nominal rig, and everything in which it differs."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from scipy.special import ndtr
+
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.trials import motion
+from workbench.trials.finite_elements import Alterations, ElementModes, element_modes, modal_modes
+
+FINEST = 0.05  # radians of the highest mode in one step
+DRAG_POINTS = 48
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """A real structure.
+
+    Attributes:
+        nominal: the rig it is taken for.
+        actuators, sensors: as they really are, in the nominal order.
+        n_modes: how many modes it shows.
+        altered: what its member has that the nominal one has not.
+        damping_factor: of every damping ratio.
+        laws: (code, at, parameters) of forces at points, codes of `motion`.
+        drag, stretching, stiffness_rate: N s²/m³, N/m, 1/s.
+        tones: (at, amplitude, frequency in Hz, phase) of unmeasured forces.
+        noises: (at, rms, corner in Hz) of unmeasured random forces.
+        mix: (n_inputs, n_inputs) what each actuator gets of every command; None for the identity.
+        curvature: (n_inputs,) of u + curvature u |u|; None for none.
+        reading_laws: readings (n_outputs, n_samples), sample time -> readings, before gain and bias.
+    """
+
+    nominal: Rig
+    actuators: tuple
+    sensors: tuple[Sensor, ...]
+    n_modes: int
+    altered: Alterations = field(default_factory=Alterations)
+    damping_factor: float = 1.0
+    laws: tuple[tuple[int, float, tuple[float, ...]], ...] = ()
+    drag: float = 0.0
+    stretching: float = 0.0
+    stiffness_rate: float = 0.0
+    tones: tuple[tuple[float, float, float, float], ...] = ()
+    noises: tuple[tuple[float, float, float], ...] = ()
+    mix: np.ndarray | None = None
+    curvature: np.ndarray | None = None
+    reading_laws: tuple[Callable[[np.ndarray, float], np.ndarray], ...] = ()
+
+    @classmethod
+    def of(cls, nominal: Rig) -> "Plant":
+        """The real structure that is just what it is taken for."""
+        return cls(nominal, nominal.actuators, nominal.sensors, nominal.modes.n_modes)
+
+    def rooted(self) -> "RootedPlant":
+        """The plant with its modes solved."""
+        gauss, weights = np.polynomial.legendre.leggauss(DRAG_POINTS)
+        length = self.nominal.modes.length
+        field_places = 0.5 * length * (gauss + 1.0) if self.drag else np.zeros(0)
+        groups: list[list[float] | np.ndarray] = [
+            [a.at for a in self.actuators],
+            [s.at for s in self.sensors],
+            [at for _, at, _ in self.laws],
+            [tone[0] for tone in self.tones],
+            [noise[0] for noise in self.noises],
+            field_places,
+        ]
+        places = np.array([x for group in groups for x in group], float)
+        if self.nominal.structure is None:
+            modes = modal_modes(self.nominal.modes, places, altered=self.altered)
+        else:
+            modes = element_modes(self.nominal.structure, places, self.n_modes, altered=self.altered)
+        shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
+        inputs, sensors, laws, tones, noises, field = shapes
+        drag = np.c_[field, 0.5 * length * weights[: len(field_places)]]
+        return RootedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
+
+
+@dataclass(frozen=True, eq=False)
+class RootedPlant:
+    """A plant with its modes; shapes are (n_places, n_modes), `field` carries the weights of a quadrature too."""
+
+    plant: Plant
+    modes: ElementModes
+    at_actuators: np.ndarray
+    at_sensors: np.ndarray
+    at_laws: np.ndarray
+    at_tones: np.ndarray
+    at_noises: np.ndarray
+    field: np.ndarray
+
+    def move(
+        self,
+        commands: np.ndarray,
+        sample_time: float,
+        *,
+        feedback: float = 0.0,
+        rng: np.random.Generator | None = None,
+        finest: float = FINEST,
+    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """Modal displacement, velocity and acceleration (n_samples, n_modes), and the commands that were sent.
+
+        Args:
+            commands: (n_inputs, n_samples); with feedback, what is added to it.
+            sample_time: s.
+            feedback: command taken away per velocity at each actuator, N s/m.
+            rng: of the random forces; None leaves them out.
+            finest: radians of the highest mode in one step.
+        """
+        plant, modes = self.plant, self.modes
+        n, zeta = plant.n_modes, _damping_ratios(plant)
+        m = len(plant.actuators)
+        drives = np.array([[a.gain, a.dead_zone, a.limit, a.delay] for a in plant.actuators])
+        curvature = np.zeros(m) if plant.curvature is None else plant.curvature
+        mix = np.eye(m) if plant.mix is None else plant.mix
+        ends = np.unique(np.round([*((a.delay / sample_time) % 1.0 for a in plant.actuators), 1.0], 12))
+        edges = ends[ends > 0]
+        turns = max(modes.omega[-1] * sample_time / finest, 8.0)
+        steps = np.ceil(turns * np.diff(np.r_[0.0, edges])).astype(np.int64)
+        laws = np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in plant.laws]).reshape(-1, 4)
+        tones = np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in plant.tones]).reshape(-1, 3)
+        held = np.zeros((commands.shape[1], n))
+        if rng is not None:
+            for (_, rms, corner), shape in zip(plant.noises, self.at_noises, strict=True):
+                held += np.outer(rms * coloured_noise(rng, commands.shape[1], sample_time, corner), shape)
+        acting = np.array([not a.direct for a in plant.actuators], float)
+        sent = np.ascontiguousarray(commands, float).copy()
+        damping = 2.0 * zeta * modes.omega
+        system = (
+            (modes.omega**2, damping, modes.gram, float(plant.stretching), float(plant.stiffness_rate)),
+            (np.array([a.time_constant for a in plant.actuators]), np.ascontiguousarray(self.at_actuators)),
+            (tones, np.ascontiguousarray(self.at_tones)),
+            (laws, np.ascontiguousarray(self.at_laws)),
+            (float(plant.drag), np.ascontiguousarray(self.field)),
+        )
+        moved = motion.integrate(
+            system,
+            (mix, np.c_[drives, curvature]),
+            sent,
+            feedback * acting[:, None] * self.at_actuators,
+            held,
+            float(sample_time),
+            edges,
+            steps,
+        )
+        return moved, sent
+
+    def truth(self, moved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
+        """What perfect sensors would read, (n_outputs, n_samples)."""
+        order = [MEASURED[s.quantity][1] for s in self.plant.sensors]
+        return np.array([moved[k] @ shape for k, shape in zip(order, self.at_sensors, strict=True)])
+
+    def readings(
+        self,
+        moved: tuple[np.ndarray, np.ndarray, np.ndarray],
+        sample_time: float,
+        rng: np.random.Generator | None = None,
+    ) -> np.ndarray:
+        """What the sensors read, (n_outputs, n_samples); without `rng` the mean of what rounding makes of noise."""
+        y = self.truth(moved)
+        for law in self.plant.reading_laws:
+            y = law(y, sample_time)
+        rows = []
+        for sensor, row in zip(self.plant.sensors, y, strict=True):
+            row = _lag(row, sensor.time_constant, sample_time)
+            row = sensor.gain * row + sensor.bias + sensor.drift * np.arange(row.size) / (row.size - 1)
+            if rng is not None:
+                row = row + sensor.noise_std * rng.standard_normal(row.size)
+            row = np.clip(row, -sensor.limit, sensor.limit)
+            if sensor.step > 0:
+                mean = rng is None and sensor.noise_std > 0
+                rounded = sensor.step * np.round(row / sensor.step)
+                row = _mean_rounded(row, sensor.step, sensor.noise_std) if mean else rounded
+            rows.append(row)
+        return np.array(rows)
+
+
+def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float, corner_hz: float) -> np.ndarray:
+    """Gaussian noise of unit rms, white up to a corner frequency and fading steeply above it."""
+    spectrum = np.fft.rfft(rng.standard_normal(2 * n_samples))
+    frequency = np.fft.rfftfreq(2 * n_samples, sample_time)
+    noise = np.fft.irfft(spectrum / np.sqrt(1.0 + (frequency / corner_hz) ** 8), 2 * n_samples)[:n_samples]
+    return noise / np.sqrt(np.mean(noise**2))
+
+
+def _damping_ratios(plant: Plant) -> np.ndarray:
+    """The nominal ratios, mode by mode; modes beyond the nominal ones take the last."""
+    zeta = plant.nominal.modes.zeta
+    padded = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
+    return plant.damping_factor * padded
+
+
+def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
+    """First-order lag of a signal that is linear between samples, settled at its first value, step by step."""
+    if time_constant == 0:
+        return y
+    fade, out = np.exp(-sample_time / time_constant), y.copy()
+    for k in range(1, y.size):
+        slope = (y[k] - y[k - 1]) / sample_time
+        behind = out[k - 1] - y[k - 1] + slope * time_constant
+        out[k] = y[k] - slope * time_constant + behind * fade
+    return out
+
+
+def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:
+    """The mean of round((y + noise) / step) step: every half step that noise carries a reading across counts one."""
+    nearest = np.round(y / step)
+    reach = np.arange(int(np.ceil(8.0 * noise_std / step)) + 1)[:, None] + 0.5
+    above = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
+    below = ndtr(((nearest - reach) * step - y) / noise_std).sum(axis=0)
+    return step * (nearest + above - below)
+
+
+def with_ports(plant: Plant, side: str, name: str, **changes) -> Plant:
+    """The plant with one actuator or sensor changed, or all of them (never a hammer) for the name "all"."""
+
+    def meant(port) -> bool:
+        return port.name == name or (name == "all" and not getattr(port, "direct", False))
+
+    ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))
+    return replace(plant, **{side: ports})
