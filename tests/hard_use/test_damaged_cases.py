@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from workbench.cases.case import Case, CaseError, read_case
 from workbench.cases.writing import write_case
-from workbench.cli import app
+from workbench.cli.app import app
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor

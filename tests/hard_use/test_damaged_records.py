@@ -8,7 +8,7 @@ import pytest
 from scipy.io import savemat
 from typer.testing import CliRunner
 
-from workbench.cli import app
+from workbench.cli.app import app
 from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_record, write_record
 from workbench.records.record import Channel, Record

@@ -5,7 +5,7 @@ import os
 import pytest
 from typer.testing import CliRunner
 
-from workbench.cli import app
+from workbench.cli.app import app
 from workbench.study.whole_file import write_whole
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 from typer.testing import CliRunner
 
-from workbench.cli import app
+from workbench.cli.app import app
 from workbench.identification.signal.synthesis import free_decay, struck
 from workbench.records.files import write_record
 from workbench.records.record import Channel, Record
@@ -152,7 +152,7 @@ def test_design_offers_what_can_be_had(rig, tmp_path):
     assert [law["law"] for law in told["laws"]] == ["coupled LQR", "coupled poles"]
     poles = np.array(told["laws"][1]["poles_real"]) + 1j * np.array(told["laws"][1]["poles_imag"])
     assert ((np.abs(-poles.real / np.abs(poles) - 0.1) < 1e-6) & (poles.imag > 0)).sum() == 5
-    assert all(0 <= design["survived"] <= 1 for design in told["through_sensors"])
+    assert all(0 <= design["robustness"] <= 1 for design in told["through_sensors"])
 
 
 def test_place_does_better_than_even_places(rig, tmp_path):
@@ -293,6 +293,12 @@ def test_every_command_explains_itself_with_an_example():
     for name in ("study", "identify", "design", "place", "diagnose", "trial", "report", "bench"):
         result = run(name, "--help")
         assert result.exit_code == 0 and "Example: workbench" in result.output
+
+
+def test_help_shows_what_stands_in_brackets_and_how_many_values_an_option_takes():
+    shown = " ".join(run("design", "--help").output.replace("│", " ").split())
+    assert "[structure], [[input]] and [[output]]" in shown
+    assert "LOW HIGH" in run("identify", "--help").output
 
 
 def test_identify_cuts_a_record_to_its_decay_and_says_what_it_did(tmp_path):

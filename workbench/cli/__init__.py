@@ -1,0 +1,5 @@
+"""The `workbench` command, one file a command."""
+
+from workbench.cli.app import main
+
+__all__ = ["main"]

@@ -1,0 +1,49 @@
+"""The `workbench` command: its options, and the commands it has."""
+
+from typing import Annotated
+
+import typer
+
+from workbench.cli.bench import bench
+from workbench.cli.design import design
+from workbench.cli.diagnose import diagnose
+from workbench.cli.identify import identify
+from workbench.cli.place import place
+from workbench.cli.report import report
+from workbench.cli.study import study
+from workbench.cli.trial import trial
+
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},
+    help="Modal identification, vibration control and diagnosis of the gap between simulation and test, for flexible"
+    " structures.",
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from workbench.study.versions import versions
+
+        for name, version in versions().items():
+            typer.echo(f"{name:<16} {version}")
+        raise typer.Exit()
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show versions and exit.")
+    ] = False,
+) -> None:
+    """Options of the command itself."""
+
+
+for command in (study, identify, design, place, diagnose, trial, report, bench):
+    app.command()(command)
+
+
+def main() -> None:
+    """Entry point of the command."""
+    app()

@@ -1,0 +1,136 @@
+"""`workbench design`: control laws side by side."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, read_structure_rig
+from workbench.cli.terminal import JsonPath, console, guarded, say, write_json
+
+if TYPE_CHECKING:
+    from workbench.design.spillover.explain import Explanation
+
+PERIODS = 20  # of the first mode, over which the work is counted unless a time is given
+
+
+@guarded
+def design(
+    rig: RigPath,
+    control: Annotated[
+        int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
+    ] = None,
+    weight: Weight = 1.0,
+    damping: Annotated[
+        float | None, typer.Option(help="Also design by pole assignment, with this damping ratio.")
+    ] = None,
+    errors: Annotated[
+        float | None, typer.Option(help="Robustness to a hundred models perturbed by this share; 0.05 is 5 %.")
+    ] = None,
+    impulse_at: ImpulseAt = None,
+    final_time: Annotated[
+        float | None, typer.Option(help=f"Time until which work is counted, s; {PERIODS} periods of mode 1.")
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Compare IMSC with coupled control: cost, effort, spillover, and stability on the full plant.
+
+    With more modes than actuators only coupled control is possible.
+
+    Example: workbench design case.toml --control 3 --weight 20 --damping 0.2 --errors 0.05
+    """
+    import numpy as np
+
+    from workbench.design.estimation.closed_loop import impulse_state
+    from workbench.design.spillover.comparison import compare, laws_of, through_sensors
+    from workbench.design.spillover.robustness import survival_of, wrong_by
+    from workbench.study.whole_file import check_target
+
+    check_target(json_path)
+    found = read_structure_rig(rig)
+    actuators = [a for a in found.actuators if not a.direct]
+    n = len(actuators) if control is None else control
+    modes, at = found.modes, impulse_place(found, impulse_at)
+    state = impulse_state(modes, at)
+    state[modes.n_modes + n :] = 0.0
+    perturbed = None if errors is None else wrong_by(modes, errors)
+    laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
+    end = final_time or PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0]
+    rows = compare(modes, laws, state, weight=weight, final_time=end)
+    table = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "largest W_r", "loop", box=None, pad_edge=False)
+    for row in rows:
+        numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
+        most = "" if row.most_fed is None else f"mode {row.most_fed + 1}"
+        stable = "stable" if row.poles.real.max() < 0 else _undamped(row.poles.real.max())
+        table.add_row(row.law.name, *(f"{value:.5g}" for value in numbers), most, stable)
+    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at x = {at:g} m, R = {weight:g}", bold=True)
+    for why in refused:
+        say(f"  {why}")
+    console.print(table)
+    mass = None if found.structure is None else found.structure.mass_per_length
+    tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
+    say("with displacement and velocity sensors at the places of the outputs:", bold=True)
+    heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
+    sensed = Table(
+        *heads, *([] if errors is None else [f"stable with models {errors:.2g} off"]), box=None, pad_edge=False
+    )
+    written = []
+    for controller, explained, why in tried:
+        if controller is None or explained is None:
+            say(f"  {why}")
+            continue
+        share = None if perturbed is None else survival_of(perturbed, controller)
+        robust = [] if share is None else [f"{share:.0%}"]
+        margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
+        sensed.add_row(controller.name, margin, *_limit(explained), *robust)
+        written.append(
+            {
+                "design": controller.name,
+                "margin": explained.margin,
+                "stable": explained.loop.stable,
+                "robustness": share,
+                "poles_real": explained.poles.real,
+                "poles_imag": explained.poles.imag,
+            }
+        )
+    console.print(sensed)
+    write_json(
+        json_path,
+        {
+            "impulse_at": at,
+            "weight": weight,
+            "final_time": end,
+            "controlled": list(range(n)),
+            "laws": [
+                {
+                    "law": row.law.name,
+                    "gain": row.law.gain,
+                    "cost": row.cost,
+                    "effort": row.effort,
+                    "peak_force": row.peak_force,
+                    "work": row.work.by_mode,
+                    "poles_real": row.poles.real,
+                    "poles_imag": row.poles.imag,
+                }
+                for row in rows
+            ],
+            "through_sensors": written,
+        },
+    )
+
+
+def _undamped(fastest: float) -> str:
+    """The words for a loop whose rightmost pole does not lie left of the axis, 1/s."""
+    return "unstable" if fastest > 0 else "undamped poles"
+
+
+def _limit(explained: "Explanation") -> tuple[str, str]:
+    """The residual mode that limits the stability margin, and the path by which it does."""
+    worst = explained.culprit or (explained.moved[0] if explained.moved else None)
+    if worst is None:
+        return "", ""
+    if not explained.loop.stable and explained.culprit is None:
+        return "none: unstable without any" if explained.reduced_margin <= 0 else "no single one", ""
+    grows = explained.loop.stable or worst.closed_pole.real > 0
+    pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"
+    return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.paths[0].sensor_at:g} to {worst.paths[0].actuator}"

@@ -1,0 +1,69 @@
+"""`workbench diagnose`: where simulation and test disagree, and why."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short
+
+SHOWN_RIVALS = 3
+
+
+@guarded
+def diagnose(
+    case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
+    json_path: JsonPath = None,
+    page: PagePath = None,
+    free_nominal: Annotated[
+        bool, typer.Option("--free-nominal", help="Re-estimate the nominal frequencies and damping with every effect.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(help="Processes that share the work; one a core unless given.")] = None,
+) -> None:
+    """Locate the gap between a simulation and a test, name the missing effect, and measure how far the gap closes.
+
+    Example: workbench diagnose cases/arm --json verdict.json
+    """
+    from workbench.cases.case import read_case
+    from workbench.gap.diagnose import diagnose as run
+    from workbench.gap.effects.structural import known_places
+    from workbench.study.verdict_page import verdict_page
+    from workbench.study.whole_file import check_target, write_whole
+
+    check_target(json_path)
+    found = read_case(case)
+    with progress_bar() as progress:
+        verdict = run(
+            found.rig,
+            found.fit,
+            validation=found.validation,
+            name=found.name,
+            free_nominal=free_nominal,
+            workers=workers,
+            report=reporter(progress, "reading"),
+        )
+    say(verdict.sentence, bold=True)
+    shown = verdict.to_json()
+    where = verdict.where
+    say(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on amplitude")
+    say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
+    if where.path in ("structure", "environment") and known_places(found.rig) is None:
+        if verdict.place_stands:
+            say(
+                f"  place      x = {where.at:.4g} ± {where.at_std:.1g} m, of the unmodelled point force, no law assumed"
+            )
+        elif where.place.holds is False:
+            say("  place      no single point force explains the gap")
+    after, floor = shown["gap"]["after"], shown["gap"]["floor"]
+    for name, before in shown["gap"]["before"].items():
+        say(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, noise floor {floor[name]:.4g}")
+    for label, probability in verdict.alternatives[:SHOWN_RIVALS]:
+        say(f"  rival      {label} ({probability:.2g})")
+    for note in verdict.notes:
+        say(f"  {note}")
+    if json_path is not None:
+        write_whole(json_path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
+        say(f"  verdict    {short(json_path)}")
+    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)
+    say(f"  page       {short(target)}")

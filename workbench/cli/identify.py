@@ -1,0 +1,62 @@
+"""`workbench identify`: the modes of measured records."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from workbench.cli.terminal import JsonPath, console, guarded, names_in, progress_bar, reporter, say, write_json
+
+
+@guarded
+def identify(
+    records: Annotated[
+        list[Path], typer.Argument(help="Files of the same sensors: .csv, .txt, .npz, .mat, .h5, .uff.")
+    ],
+    modes: Annotated[int | None, typer.Option(help="Number of modes; estimated unless given.")] = None,
+    sample_rate_hz: Annotated[
+        float | None, typer.Option(help="Sampling rate, where the file has no time axis.")
+    ] = None,
+    start: Annotated[
+        float | None, typer.Option(help="Time at which the free decay begins, s; detected unless given.")
+    ] = None,
+    inputs: Annotated[
+        str, typer.Option(metavar="NAME,NAME", help="Measured inputs: identify from inputs and outputs.")
+    ] = "",
+    ambient: Annotated[
+        bool, typer.Option("--ambient", help="Output-only: unknown broadband forces act throughout.")
+    ] = False,
+    outputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Outputs to use; all unless given.")] = "",
+    band_hz: Annotated[
+        tuple[float, float] | None,
+        typer.Option(metavar="LOW HIGH", help="Frequency band of transfer functions to fit."),
+    ] = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Identify modes from free decays, driven or ambient records, or transfer functions, with standard errors.
+
+    Example: workbench identify ringdown.csv --outputs a,b --json modes.json
+    """
+    from workbench.records.files import read_measured
+    from workbench.study.identification_report import HEADINGS, told_of
+    from workbench.study.whole_file import check_target
+
+    check_target(json_path)
+    with progress_bar() as progress:
+        report = reporter(progress, "reading")
+        read = [read_measured(path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs)) for path in records]
+        if outputs:
+            read = [measured.only(names_in(outputs)) for measured in read]
+        report("identifying modes", 0.1)
+        found = told_of(read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz)
+    table = Table(box=None, pad_edge=False)
+    for heading in HEADINGS:
+        table.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
+    for row in found.rows:
+        table.add_row(*row)
+    say(found.heading, bold=True)
+    console.print(table)
+    for line in found.lines:
+        say(f"  {line}")
+    write_json(json_path, {**found.content, "heading": found.heading, "lines": found.lines})

@@ -1,0 +1,124 @@
+"""What every command shares: the terminal it writes to, its progress, its exit codes."""
+
+import json
+import math
+import warnings
+from collections.abc import Callable, Mapping
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+FAILURE, BAD_INPUT = 1, 2
+WIDE = 150  # columns of a table that goes to a file or a pipe
+
+JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
+PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
+
+console = Console(soft_wrap=True, highlight=False)
+if not console.is_terminal:
+    console.width = WIDE
+errors = Console(stderr=True, soft_wrap=True, highlight=False)
+
+
+def guarded(command: Callable[..., None]) -> Callable[..., None]:
+    """The command with its exit codes: 2 for bad input, 1 for anything unforeseen, each with one line on stderr."""
+
+    @wraps(command)
+    def run(*args: Any, **kwargs: Any) -> None:
+        try:
+            with warnings.catch_warnings():
+                warnings.showwarning = _show_warning
+                command(*args, **kwargs)
+        except typer.Exit:
+            raise
+        except (ValueError, OSError, MemoryError) as error:
+            complain(str(error))
+            raise typer.Exit(BAD_INPUT) from None
+        except KeyboardInterrupt:
+            complain("interrupted")
+            raise typer.Exit(FAILURE) from None
+        except Exception as error:
+            complain(f"{type(error).__name__}: {error}")
+            raise typer.Exit(FAILURE) from None
+
+    return run
+
+
+def complain(fault: str) -> None:
+    """Print an error in one line."""
+    errors.print(f"workbench: {_one_line(fault)}", style="red", markup=False)
+
+
+def say(text: str, *, bold: bool = False) -> None:
+    """Print a line as it stands: nothing in it is markup."""
+    console.print(text, style="bold" if bold else None, markup=False)
+
+
+def _one_line(text: str) -> str:
+    """The text in one line, without the control characters by which a file name could steer the terminal."""
+    return "".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in " ".join(text.split()))
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    """Print a warning in one line; those of arithmetic are for developers, whose tests see them."""
+    if not issubclass(category, RuntimeWarning):
+        errors.print(f"workbench: {_one_line(str(message))}", style="yellow", markup=False)
+
+
+def progress_bar() -> Progress:
+    """A progress bar on stderr, shown only where that is a terminal."""
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        console=errors,
+        transient=True,
+        disable=not errors.is_terminal,
+    )
+
+
+def reporter(progress: Progress, first: str) -> Callable[[str, float], None]:
+    """A `report(what, share)` that moves a progress bar, never backwards."""
+    task = progress.add_task(first, total=1.0)
+    furthest = 0.0
+
+    def report(what: str, share: float) -> None:
+        nonlocal furthest
+        furthest = max(furthest, share)
+        progress.update(task, description=what, completed=furthest)
+
+    return report
+
+
+def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
+    """Write results as JSON where a path is given, and say so."""
+    from workbench.study.outcome import plain
+    from workbench.study.whole_file import write_whole
+
+    if path is not None:
+        write_whole(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+        say(f"  written to {short(path)}")
+
+
+def short(path: Path) -> str:
+    """The path as seen from the current folder, where it is below that."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
+def names_in(text: str) -> tuple[str, ...]:
+    """Names between commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def compact(value: float) -> str:
+    """A number in five digits; an infinite one in words."""
+    return "none" if math.isinf(value) else f"{value:.5g}"
