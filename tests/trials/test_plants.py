@@ -167,7 +167,7 @@ def test_laws_at_a_point_agree_with_an_adaptive_integrator(rig, commands, kind):
     moved, _ = rooted.move(commands, DT, finest=0.02)
     expected = _reference(rooted, lambda t, k: commands[:, k], extra)
     plain, _ = Plant.of(rig).rooted().move(commands, DT, finest=0.02)
-    for got, want, without in zip(moved, expected, plain, strict=True):
+    for got, want, without in zip(moved[:3], expected, plain[:3], strict=True):
         assert np.abs(want - without).max() > 0.02 * np.abs(want).max(), "the law must matter"
         np.testing.assert_allclose(got, want, atol=2e-5 * np.abs(want).max())
 
@@ -197,7 +197,7 @@ def test_what_acts_all_along_agrees_with_an_adaptive_integrator(rig, commands):
 
     moved, _ = rooted.move(commands, DT, finest=0.02)
     expected = _reference(rooted, lambda t, k: commands[:, k], extra)
-    for got, want in zip(moved, expected, strict=True):
+    for got, want in zip(moved[:3], expected, strict=True):
         np.testing.assert_allclose(got, want, atol=3e-5 * np.abs(want).max())
 
 
@@ -267,7 +267,7 @@ def test_the_mean_of_rounded_readings_is_their_mean(rig):
     many = np.mean([rooted.readings((ramp, ramp, ramp), DT, rng) for _ in range(4000)], axis=0)
     mean = rooted.readings((ramp, ramp, ramp), DT)
     np.testing.assert_allclose(mean, many, atol=6.0 * 0.05 / np.sqrt(12.0 * 4000))
-    assert np.abs(mean - rooted.truth((ramp, ramp, ramp))).max() > 0.005, "rounding must matter"
+    assert np.abs(mean - rooted.truth((ramp, ramp, ramp), DT)).max() > 0.005, "rounding must matter"
 
 
 def test_modes_beyond_the_nominal_ones_take_its_damping(rig):

@@ -16,7 +16,7 @@ MEASURED = {
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor at a point: lag, gain, bias and drift, noise, clipping, rounding, in that order.
+    """A sensor at a point: delay, lag, gain, bias and drift, noise, clipping, rounding, in that order.
 
     Attributes:
         name: of the output.
@@ -26,6 +26,7 @@ class Sensor:
         gain: reading per truth.
         bias: constant offset.
         drift: offset gained over a record, from 0 at its first sample.
+        delay: s.
         time_constant: of a first-order lag, s.
         limit: readings stop at ± this.
         step: readings are multiples of this; 0 for none.
@@ -38,6 +39,7 @@ class Sensor:
     gain: float = 1.0
     bias: float = 0.0
     drift: float = 0.0
+    delay: float = 0.0
     time_constant: float = 0.0
     limit: float = np.inf
     step: float = 0.0
@@ -45,7 +47,7 @@ class Sensor:
     def __post_init__(self) -> None:
         if self.quantity not in MEASURED:
             raise ValueError(f"sensor {self.name}: quantity is one of {', '.join(MEASURED)}; got {self.quantity!r}")
-        for quantity in ("noise_std", "time_constant", "step"):
+        for quantity in ("noise_std", "delay", "time_constant", "step"):
             if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
                 raise ValueError(f"sensor {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
         if not self.limit > 0:

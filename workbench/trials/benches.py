@@ -10,7 +10,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
-from workbench.trials.plant import Plant, RootedPlant, coloured_noise
+from workbench.trials.plant import ModalMotion, Plant, RootedPlant, coloured_noise
 
 SAMPLES = 2000
 LEVELS = {"low": 0.25, "high": 1.0, "mid": 0.625}
@@ -140,7 +140,7 @@ def experiments(bench: Bench, rng: np.random.Generator) -> dict[str, np.ndarray]
 
 def tested(
     plant: RootedPlant, bench: Bench, name: str, commands: np.ndarray, rng: np.random.Generator | None = None
-) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+) -> tuple[ModalMotion, np.ndarray]:
     """The motion of a plant in one of the experiments, and the commands that were sent."""
     feedback = (bench.feedback or 0.0) if name == "closed_loop" else 0.0
     return plant.move(commands, bench.sample_time, feedback=feedback, rng=rng)

@@ -27,6 +27,7 @@ class Alterations:
         springs: (at, stiffness) to ground, in m, N/m.
         rotational_stiffness: (left, right) in N m/rad, in place of the nominal one; None leaves it.
         tension: N, added to the nominal one.
+        stiffness_waves, mass_waves: (c_1, c_2, ...) of a smooth variation, 1 + Σ c_k cos(k π x / L) times nominal.
     """
 
     stiffness_factor: float = 1.0
@@ -35,6 +36,8 @@ class Alterations:
     springs: tuple[tuple[float, float], ...] = ()
     rotational_stiffness: tuple[float | None, float | None] = (None, None)
     tension: float = 0.0
+    stiffness_waves: tuple[float, ...] = ()
+    mass_waves: tuple[float, ...] = ()
 
 
 AS_NOMINAL = Alterations()
@@ -115,7 +118,8 @@ def modal_modes(nominal: Modes, places: np.ndarray, *, altered: Alterations = AS
     Raises:
         ValueError: alterations that only a member can have.
     """
-    if altered.losses or altered.tension or altered.rotational_stiffness != (None, None):
+    of_a_member = (altered.losses, altered.tension, altered.stiffness_waves, altered.mass_waves)
+    if any(of_a_member) or altered.rotational_stiffness != (None, None):
         raise ValueError("plain modal data know no local stiffness, tension or rotation; describe a beam or a rod")
     stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
     for matrix, parts in ((stiffness, altered.springs), (mass, altered.masses)):
@@ -145,7 +149,7 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations):
     profile = member.axial_stiffness if isinstance(member, Bar) else member.bending_stiffness
 
     def rigidity(x: np.ndarray) -> np.ndarray:
-        values = altered.stiffness_factor * profile(x)
+        values = altered.stiffness_factor * profile(x) * _waves(altered.stiffness_waves, x / member.length)
         for at, width, loss in altered.losses:
             values = values * np.where(np.abs(x - at) < width / 2, 1.0 - loss, 1.0)
         return values
@@ -164,7 +168,8 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations):
 
     @BilinearForm
     def inertia(u, v, w):
-        return member.mass_per_length(w.x[0]) * u * v
+        x = w.x[0]
+        return member.mass_per_length(x) * _waves(altered.mass_waves, x / member.length) * u * v
 
     @Functional
     def energy(w):
@@ -172,6 +177,11 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations):
 
     strain = (stretching if bar else bending).assemble(basis)
     return strain, inertia.assemble(basis).tolil(), slope.assemble(basis), energy
+
+
+def _waves(waves: tuple[float, ...], share: np.ndarray) -> np.ndarray:
+    """1 + Σ c_k cos(k π x / L), at shares x / L of the length."""
+    return sum((c * np.cos((k + 1) * np.pi * share) for k, c in enumerate(waves)), np.ones_like(share))
 
 
 def _hold_ends(stiffness, basis: Basis, member: Structure, altered: Alterations) -> list[int]:

@@ -75,14 +75,14 @@ def _spikes(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
 
 
 HIDE: dict[str, Hide] = {
-    "modulus_error": lambda p, e: _altered(p, stiffness_factor=e["factor"]),
+    "modulus_error": lambda p, e: _altered(p, stiffness_factor=p.altered.stiffness_factor * e["factor"]),
     "point_mass": lambda p, e: _altered(p, masses=(*p.altered.masses, (e["at"], e["mass"]))),
     "local_stiffness_loss": lambda p, e: _altered(p, losses=(*p.altered.losses, (e["at"], e["width"], e["loss"]))),
     "support_rotation": _support,
     "axial_load": lambda p, e: _altered(p, tension=e["tension"]),
     "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (e["at"], e["stiffness"]))),
     "truncated_modes": lambda p, e: replace(p, n_modes=e["needed"]),
-    "modal_damping": lambda p, e: replace(p, damping_factor=e["factor"]),
+    "modal_damping": lambda p, e: replace(p, damping_factor=p.damping_factor * e["factor"]),
     "point_damper": _law(motion.DAMPER, "coefficient"),
     "air_drag": lambda p, e: replace(p, drag=e["coefficient"]),
     "cubic_spring": _law(motion.CUBIC, "stiffness"),

@@ -11,7 +11,7 @@ from joblib import Parallel, delayed
 from workbench.cases.case import Case, read_case
 from workbench.gap.diagnose import diagnose
 from workbench.trials.make import write_trials
-from workbench.trials.scoring import Tally, score, tally
+from workbench.trials.scoring import Tally, score, score_dirty, tally
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +22,14 @@ class Trials:
         verdicts: by case, as JSON.
         labels: by case.
         scores: by case.
+        dirty_scores: by case, see `score_dirty`; empty without dirt.
         tally: of all scores.
     """
 
     verdicts: dict[str, dict]
     labels: dict[str, dict]
     scores: dict[str, dict]
+    dirty_scores: dict[str, dict]
     tally: Tally
 
 
@@ -37,6 +39,8 @@ def hold_trials(
     *,
     like: Case | None = None,
     kinds: Sequence[Sequence[str]] | None = None,
+    dirt: str | None = None,
+    size: float | None = None,
     diagnose_case: Callable[[Path], dict] | None = None,
     jobs: int = 1,
     report: Callable[[str, float], None] = lambda text, share: None,
@@ -49,16 +53,28 @@ def hold_trials(
     Args:
         like: the user's own case, whose nominal rig, levels, band and noise are taken; None draws benches.
         kinds: what the cases hide, one entry a case; None draws them.
+        dirt: class of the small errors beside it, or "all"; see `write_trials`.
+        size: of these errors; None for each of three in turn.
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
         jobs: cases diagnosed at a time, each in a process of its own.
         report: told (what, share done).
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
         sealed = Path(vault) / "labels.json"
-        write_trials(cases, sealed, n, seed, like=like, kinds=kinds, report=lambda t, s: report(f"making {t}", 0.1 * s))
+        write_trials(
+            cases,
+            sealed,
+            n,
+            seed,
+            like=like,
+            kinds=kinds,
+            dirt=dirt,
+            size=size,
+            report=lambda text, share: report(f"making {text}", 0.1 * share),
+        )
         labels = json.loads(sealed.read_text(encoding="utf-8"))
         sealed.unlink()
-        verdicts, scores = {}, {}
+        verdicts, scores, dirty = {}, {}, {}
         folders = sorted(Path(cases).iterdir())
         found = Parallel(n_jobs=jobs, return_as="generator")(delayed(diagnose_case or verdict_on)(f) for f in folders)
         for i, (folder, verdict) in enumerate(zip(folders, found, strict=True)):
@@ -66,8 +82,11 @@ def hold_trials(
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
             length = read_case(folder).rig.modes.length
-            scores[folder.name] = score(verdicts[folder.name], labels[folder.name], length=length)
-    return Trials(verdicts, labels, scores, tally(scores.values()))
+            verdict, label = verdicts[folder.name], labels[folder.name]
+            scores[folder.name] = score(verdict, label, length=length)
+            if dirt is not None:
+                dirty[folder.name] = score_dirty(verdict, label, length=length)
+    return Trials(verdicts, labels, scores, dirty, tally(scores.values()))
 
 
 def verdict_on(folder: Path) -> dict:

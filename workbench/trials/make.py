@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from workbench.cases.writing import write_case
 from workbench.records.record import Channel, Record
 from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
 from workbench.trials.chance import draw_effect
+from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
 from workbench.trials.draws import DRAWS
 from workbench.trials.hidden import HIDE, OUTSIDE, hide
 from workbench.trials.plant import Plant, RootedPlant
@@ -22,7 +24,8 @@ KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
 MOST_BENCHES, MOST_DRAWS = 40, 8
 VISIBLE = 0.02
-SEEN = 0.03  # each effect of a pair must alter the response by this much beside the other
+SEEN = 0.03  # each effect of several must alter the response by this much beside the others
+STRONG = 0.7  # of the gap that dirt makes: what an effect beside it must make at least
 
 # Pairs that do the same thing: no records of a case can hold them apart.
 TWINS = (
@@ -33,8 +36,22 @@ TWINS = (
 )
 
 
+class DirtyDraw(NamedTuple):
+    """What a dirty trial is made of: class and size of its dirt, kinds of its effects."""
+
+    dirt: str
+    size: float
+    kinds: tuple[str, ...]
+
+
 def make_trial(
-    seed: int, *, kinds: Sequence[str] = (), like: Case | None = None, name: str = "case"
+    seed: int,
+    *,
+    kinds: Sequence[str] = (),
+    like: Case | None = None,
+    name: str = "case",
+    dirt: str = CLEAN,
+    size: float = 1.0,
 ) -> tuple[Case, dict]:
     """A case that hides effects of the given kinds, and its label in the words of the case format.
 
@@ -43,13 +60,19 @@ def make_trial(
         kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
         like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
         name: of the case.
+        dirt: class of the small errors beside them, of `DIRT_CLASSES`.
+        size: of these errors, 1 for those of a careful laboratory.
 
     Returns:
-        The case; {"title", "snr_db", "effects", "records": {name: {"gap", "noise_floor", "true_model"}}}.
+        The case; {"title", "snr_db", "effects", "class", "size", "length", "budget", "records": {name: {"gap",
+        "noise_floor", "true_model"}}}: `true_model` is the gap that the exact model leaves, small errors and all;
+        the budget is of the validation records, as in the case format.
 
     Raises:
-        ValueError: an unknown kind, or kinds that the bench cannot show.
+        ValueError: an unknown kind or class, or kinds that the bench cannot show.
     """
+    if dirt not in DIRT_CLASSES:
+        raise ValueError(f"dirt {dirt!r} is none of {', '.join(DIRT_CLASSES)}")
     unknown = [kind for kind in kinds if kind not in DRAWS]
     if unknown:
         raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
@@ -60,7 +83,9 @@ def make_trial(
             bench = draw_bench(rng) if like is None else bench_of(like)
             tests = experiments(bench, rng)
             bench, effects = _draw_effects(bench, tests["mid"], kinds, rng)
-            return _case(bench, tests, effects, rng, name)
+            errors = draw_dirt(dirt, size, bench, rng) if dirt not in (CLEAN, TRIPLE) else Dirt()
+            case, label = _case(bench, tests, effects, errors, rng, name)
+            return case, {**label, "class": dirt, "size": size}
         except Unsuitable as error:
             reason = str(error)
     raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
@@ -105,10 +130,13 @@ def _check_each_seen(scene: Scene, effects: list[dict], rng: np.random.Generator
 
 
 def _case(
-    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict], rng: np.random.Generator, name: str
+    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict], dirt: Dirt, rng: np.random.Generator, name: str
 ) -> tuple[Case, dict]:
+    dirty = dirt.on(Plant.of(bench.rig), bench.sample_time)
     nominal = Plant.of(bench.rig).rooted()
-    real = hide(Plant.of(bench.rig), effects).rooted()
+    real = hide(dirty, effects).rooted()
+    if dirt != Dirt() and effects:
+        _check_strong(bench, tests, nominal, dirty.rooted(), real, rng)
     fit: list[Record] = []
     validation: list[Record] = []
     figures = {}
@@ -117,11 +145,11 @@ def _case(
         measured = real.readings(moved, bench.sample_time, rng)
         if not np.isfinite(measured).all() or (np.ptp(measured, axis=1) == 0).any():
             raise Unsuitable("the altered structure runs away, or a sensor is dead")
-        record = _record(bench, test, sent, measured)
+        record = _record(bench, test, _logged(sent, real.plant.logging_noise, rng), measured)
         (validation if test == "validate" else fit).append(record)
         figures[test] = {
             "gap": _gap(measured, _predicted(nominal, sent, bench)),
-            "noise_floor": _gap(np.array([[s.noise_std] for s in bench.rig.sensors]), 0.0, measured),
+            "noise_floor": _gap(np.array([[s.noise_std] for s in real.plant.sensors]), 0.0, measured),
             # without random forces the motion is what the exact model predicts
             "true_model": _gap(
                 measured,
@@ -132,8 +160,53 @@ def _case(
     told = [{"kind": UNKNOWN, "outside": e["kind"]} if e["kind"] in OUTSIDE else e for e in effects]
     if any(e["kind"] == UNKNOWN for e in told):
         told = [e for e in told if e["kind"] == UNKNOWN]
-    label = {"title": name, "snr_db": bench.snr_db, "effects": told or [{"kind": NONE}], "records": figures}
+    label = {
+        "title": name,
+        "snr_db": bench.snr_db,
+        "effects": told or [{"kind": NONE}],
+        "length": bench.rig.modes.length,
+        "budget": _budget(figures["validate"]),
+        "records": figures,
+    }
     return Case(name, bench.rig, tuple(fit), tuple(validation)), label
+
+
+def _check_strong(
+    bench: Bench,
+    tests: dict[str, np.ndarray],
+    nominal: RootedPlant,
+    dirty: RootedPlant,
+    real: RootedPlant,
+    rng: np.random.Generator,
+) -> None:
+    """Some record to fit must show the effects at least nearly as strongly as the dirt, else nothing strong hides."""
+    ratios = []
+    for test, commands in tests.items():
+        if test == "validate":
+            continue
+        y = []
+        for plant in (nominal, dirty, real):
+            moved, _ = tested(plant, bench, test, commands, np.random.default_rng(rng.integers(2**31)))
+            y.append(plant.readings(moved, bench.sample_time))
+        if not np.isfinite(y).all():
+            raise Unsuitable("the altered structure runs away")
+        ratios.append(_gap(y[2], y[1]) / max(_gap(y[1], y[0]), 1e-12))
+    if max(ratios) < STRONG:
+        raise Unsuitable(f"the effects make {max(ratios):.2g} times the gap that the dirt makes, at most")
+
+
+def _logged(sent: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+    """Inputs as they are logged, with noise of a share of their rms; those at rest are logged as they are."""
+    if noise == 0:
+        return sent
+    return sent + noise * np.sqrt(np.mean(sent**2, axis=1, keepdims=True)) * rng.standard_normal(sent.shape)
+
+
+def _budget(figures: dict[str, float]) -> dict[str, float]:
+    """Shares of the mean square of the nominal residual: what a perfect model takes away, what it leaves, noise."""
+    whole, left = figures["gap"] ** 2, figures["true_model"] ** 2
+    noise = min(figures["noise_floor"] ** 2, left)
+    return {"explained": (whole - left) / whole, "unexplained": (left - noise) / whole, "noise": noise / whole}
 
 
 def _check_visible(figures: dict[str, dict], effects: list[dict]) -> None:
@@ -184,6 +257,37 @@ def draw_kinds(n: int, seed: int, *, like: Case | None = None) -> list[tuple[str
     return drawn
 
 
+def draw_dirty_kinds(n: int, seed: int, *, dirt: str = "all", size: float | None = None) -> list[DirtyDraw]:
+    """What n dirty trials hide: the class and size of the dirt, and the kinds; every third hides nothing.
+
+    Args:
+        dirt: a class, or "all" for each in turn.
+        size: of the dirt; None for each of `SIZES` in turn.
+    """
+    rng = np.random.default_rng(seed)
+    drawn: list[DirtyDraw] = []
+    for i in range(n):
+        name = DIRT_CLASSES[i % len(DIRT_CLASSES)] if dirt == "all" else dirt
+        turn = i // len(DIRT_CLASSES) if dirt == "all" else i
+        how_large = SIZES[turn % len(SIZES)] if size is None else size
+        pool = [k for k in KINDS if k not in MIMICS[name]]
+        if name == TRIPLE:
+            kinds = _draw_triple(pool, rng)
+        elif (turn // len(SIZES) + turn) % 3 == 2:
+            kinds = ()
+        else:
+            kinds = (str(rng.choice(pool)),)
+        drawn.append(DirtyDraw(name, how_large, kinds))
+    return drawn
+
+
+def _draw_triple(pool: list[str], rng: np.random.Generator) -> tuple[str, ...]:
+    while True:
+        kinds = {str(kind) for kind in rng.choice(pool, 3, replace=False)}
+        if "truncated_modes" not in kinds and not any(twins <= kinds for twins in TWINS):
+            return tuple(sorted(kinds))
+
+
 def _draw_pair(pool: list[str], rng: np.random.Generator) -> tuple[str, str]:
     while True:
         first, second = (str(kind) for kind in rng.choice(pool, 2, replace=False))
@@ -199,6 +303,8 @@ def write_trials(
     *,
     like: Case | None = None,
     kinds: Sequence[Sequence[str]] | None = None,
+    dirt: str | None = None,
+    size: float | None = None,
     report: Callable[[str, float], None] = lambda text, share: None,
 ) -> None:
     """Write n cases as folders, and their labels as one JSON file elsewhere.
@@ -206,7 +312,9 @@ def write_trials(
     Args:
         like: a case whose rig and records all are like; None draws a bench a case. Kinds that a bench cannot show
             give way to others.
-        kinds: what each case hides; None draws them, see `draw_kinds`.
+        kinds: what each case hides; None draws them, see `draw_kinds` and `draw_dirty_kinds`.
+        dirt: class of the small errors beside what hides, of `DIRT_CLASSES`, or "all" for each in turn; None for none.
+        size: of these errors; None for each of `SIZES` in turn.
         report: told (what, share done).
 
     Raises:
@@ -215,24 +323,30 @@ def write_trials(
     folder, labels = Path(folder), Path(labels)
     if labels.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
+    if dirt is None:
+        draws = [DirtyDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like)]
+    else:
+        draws = draw_dirty_kinds(n, seed, dirt=dirt, size=size)
+    if kinds is not None:
+        draws = [draw._replace(kinds=tuple(hidden)) for draw, hidden in zip(draws, kinds, strict=True)]
     told = {}
-    for i, hidden in enumerate(draw_kinds(n, seed, like=like) if kinds is None else kinds):
+    for i, draw in enumerate(draws):
         name = f"case-{i + 1:03d}"
-        case, told[name] = _first_possible(seed, i, tuple(hidden), like, name)
+        case, told[name] = _first_possible(seed, i, draw, like, name)
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
     labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _first_possible(seed: int, i: int, kinds: tuple[str, ...], like: Case | None, name: str) -> tuple[Case, dict]:
+def _first_possible(seed: int, i: int, draw: DirtyDraw, like: Case | None, name: str) -> tuple[Case, dict]:
     """The trial, or with kinds that this rig cannot show, one of kinds that it can."""
-    rng = np.random.default_rng([seed, i])
+    rng, kinds = np.random.default_rng([seed, i]), draw.kinds
+    pool = [k for k in KINDS if k != "truncated_modes" and k not in MIMICS[draw.dirt]]
     for _ in range(100):
+        case_seed = int(rng.integers(2**31))
         try:
-            return make_trial(int(rng.integers(2**31)), kinds=kinds, like=like, name=name)
+            return make_trial(case_seed, kinds=kinds, like=like, name=name, dirt=draw.dirt, size=draw.size)
         except ValueError:
-            kinds = tuple(
-                str(k) for k in rng.choice([k for k in KINDS if k != "truncated_modes"], len(kinds), replace=False)
-            )
+            kinds = tuple(str(k) for k in rng.choice(pool, len(kinds), replace=False))
     raise ValueError("this bench shows none of the effects; are its sensors and levels right?")

@@ -102,7 +102,8 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
         steps: in each piece.
 
     Returns:
-        displacement, velocity, acceleration, each (n_samples, n).
+        (3, n_edges, n_samples, n) displacement, velocity and acceleration where each piece of a sample interval begins,
+        the first of them at the sample itself.
     """
     mix, table = drive
     dt = sample_time
@@ -111,7 +112,7 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
     size = 2 * n + m + system[3][0].shape[0]
     y, trial = np.zeros(size), np.zeros(size)
     k1, k2, k3, k4 = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
-    out = np.zeros((3, n_samples, n))
+    out = np.zeros((3, edges.size, n_samples, n))
     aims = np.zeros((m, n_samples))
     targets = np.zeros(m)
     for k in range(n_samples):
@@ -136,8 +137,8 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
             for step in range(steps[piece]):
                 t = (k + start) * dt + step * h
                 _rates(t, y, k1, system, targets, held[k])
-                if piece == 0 and step == 0:
-                    out[0, k], out[1, k], out[2, k] = y[:n], y[n : 2 * n], k1[n : 2 * n]
+                if step == 0:
+                    out[0, piece, k], out[1, piece, k], out[2, piece, k] = y[:n], y[n : 2 * n], k1[n : 2 * n]
                 for i in range(size):
                     trial[i] = y[i] + 0.5 * h * k1[i]
                 _rates(t + 0.5 * h, trial, k2, system, targets, held[k])
@@ -150,4 +151,4 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
                 for i in range(size):
                     y[i] += h * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]) / 6.0
             start = edges[piece]
-    return out[0], out[1], out[2]
+    return out

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -26,6 +26,7 @@ class Plant:
         n_modes: how many modes it shows.
         altered: what its member has that the nominal one has not.
         damping_factor: of every damping ratio.
+        damping_factors: of each mode's damping ratio, in their order; a mode beyond them takes 1.
         laws: (code, at, parameters) of forces at points, codes of `motion`.
         drag, stretching, stiffness_rate: N s²/m³, N/m, 1/s.
         tones: (at, amplitude, frequency in Hz, phase) of unmeasured forces.
@@ -33,6 +34,8 @@ class Plant:
         mix: (n_inputs, n_inputs) what each actuator gets of every command; None for the identity.
         curvature: (n_inputs,) of u + curvature u |u|; None for none.
         reading_laws: readings (n_outputs, n_samples), sample time -> readings, before gain and bias.
+        noise_memory: correlation of a sensor's noise with its noise one sample before; 0 for white noise.
+        logging_noise: standard deviation of the noise of each logged input, as a share of the input's rms in a record.
     """
 
     nominal: Rig
@@ -41,6 +44,7 @@ class Plant:
     n_modes: int
     altered: Alterations = field(default_factory=Alterations)
     damping_factor: float = 1.0
+    damping_factors: tuple[float, ...] = ()
     laws: tuple[tuple[int, float, tuple[float, ...]], ...] = ()
     drag: float = 0.0
     stretching: float = 0.0
@@ -50,6 +54,8 @@ class Plant:
     mix: np.ndarray | None = None
     curvature: np.ndarray | None = None
     reading_laws: tuple[Callable[[np.ndarray, float], np.ndarray], ...] = ()
+    noise_memory: float = 0.0
+    logging_noise: float = 0.0
 
     @classmethod
     def of(cls, nominal: Rig) -> "Plant":
@@ -80,6 +86,21 @@ class Plant:
         return RootedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
 
 
+class ModalMotion(NamedTuple):
+    """Modal displacement, velocity and acceleration at the samples, each (n_samples, n_modes), and between them.
+
+    Attributes:
+        starts: (n_pieces,) fractions of a sample interval.
+        pieces: (3, n_pieces, n_samples, n_modes) the motion at these.
+    """
+
+    displacement: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    starts: np.ndarray
+    pieces: np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class RootedPlant:
     """A plant with its modes; shapes are (n_places, n_modes), `field` carries the weights of a quadrature too."""
@@ -101,8 +122,8 @@ class RootedPlant:
         feedback: float = 0.0,
         rng: np.random.Generator | None = None,
         finest: float = FINEST,
-    ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
-        """Modal displacement, velocity and acceleration (n_samples, n_modes), and the commands that were sent.
+    ) -> tuple[ModalMotion, np.ndarray]:
+        """The modal motion, and the commands that were sent.
 
         Args:
             commands: (n_inputs, n_samples); with feedback, what is added to it.
@@ -117,7 +138,8 @@ class RootedPlant:
         drives = np.array([[a.gain, a.dead_zone, a.limit, a.delay] for a in plant.actuators])
         curvature = np.zeros(m) if plant.curvature is None else plant.curvature
         mix = np.eye(m) if plant.mix is None else plant.mix
-        ends = np.unique(np.round([*((a.delay / sample_time) % 1.0 for a in plant.actuators), 1.0], 12))
+        late = [a.delay / sample_time for a in plant.actuators] + [-s.delay / sample_time for s in plant.sensors]
+        ends = np.unique(np.round([*(delay % 1.0 for delay in late), 1.0], 12))
         edges = ends[ends > 0]
         turns = max(modes.omega[-1] * sample_time / finest, 8.0)
         steps = np.ceil(turns * np.diff(np.r_[0.0, edges])).astype(np.int64)
@@ -137,7 +159,7 @@ class RootedPlant:
             (laws, np.ascontiguousarray(self.at_laws)),
             (float(plant.drag), np.ascontiguousarray(self.field)),
         )
-        moved = motion.integrate(
+        pieces = motion.integrate(
             system,
             (mix, np.c_[drives, curvature]),
             sent,
@@ -147,21 +169,31 @@ class RootedPlant:
             edges,
             steps,
         )
-        return moved, sent
+        return ModalMotion(*pieces[:, 0], np.r_[0.0, edges[:-1]], pieces), sent
 
-    def truth(self, moved: tuple[np.ndarray, np.ndarray, np.ndarray]) -> np.ndarray:
-        """What perfect sensors would read, (n_outputs, n_samples)."""
-        order = [MEASURED[s.quantity][1] for s in self.plant.sensors]
-        return np.array([moved[k] @ shape for k, shape in zip(order, self.at_sensors, strict=True)])
+    def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
+        """What perfect sensors would read, each after its delay, (n_outputs, n_samples)."""
+        rows = []
+        for sensor, shape in zip(self.plant.sensors, self.at_sensors, strict=True):
+            order = MEASURED[sensor.quantity][1]
+            if sensor.delay == 0:
+                rows.append(moved[order] @ shape)
+                continue
+            back = np.round(-sensor.delay / sample_time, 12)
+            piece = int(np.argmin(np.abs(moved.starts - back % 1.0)))
+            shift = -int(np.floor(back))
+            read = moved.pieces[order, piece] @ shape
+            rows.append(np.r_[np.zeros(shift), read][: read.size])
+        return np.array(rows)
 
     def readings(
         self,
-        moved: tuple[np.ndarray, np.ndarray, np.ndarray],
+        moved: ModalMotion,
         sample_time: float,
         rng: np.random.Generator | None = None,
     ) -> np.ndarray:
         """What the sensors read, (n_outputs, n_samples); without `rng` the mean of what rounding makes of noise."""
-        y = self.truth(moved)
+        y = self.truth(moved, sample_time)
         for law in self.plant.reading_laws:
             y = law(y, sample_time)
         rows = []
@@ -169,7 +201,7 @@ class RootedPlant:
             row = _lag(row, sensor.time_constant, sample_time)
             row = sensor.gain * row + sensor.bias + sensor.drift * np.arange(row.size) / (row.size - 1)
             if rng is not None:
-                row = row + sensor.noise_std * rng.standard_normal(row.size)
+                row = row + sensor.noise_std * _noise(rng, row.size, self.plant.noise_memory)
             row = np.clip(row, -sensor.limit, sensor.limit)
             if sensor.step > 0:
                 mean = rng is None and sensor.noise_std > 0
@@ -191,7 +223,21 @@ def _damping_ratios(plant: Plant) -> np.ndarray:
     """The nominal ratios, mode by mode; modes beyond the nominal ones take the last."""
     zeta = plant.nominal.modes.zeta
     padded = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
-    return plant.damping_factor * padded
+    factors = np.ones(plant.n_modes)
+    known = plant.damping_factors[: plant.n_modes]
+    factors[: len(known)] = known
+    return plant.damping_factor * factors * padded
+
+
+def _noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.ndarray:
+    """Gaussian noise of unit standard deviation, e_k = memory e_{k-1} + sqrt(1 - memory²) white."""
+    white = rng.standard_normal(n_samples)
+    if memory == 0:
+        return white
+    noise = white.copy()
+    for k in range(1, n_samples):
+        noise[k] = memory * noise[k - 1] + np.sqrt(1.0 - memory**2) * white[k]
+    return noise
 
 
 def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.trials.benches import Bench
-from workbench.trials.plant import Plant, RootedPlant
+from workbench.trials.plant import ModalMotion, Plant, RootedPlant
 
 COARSE = 0.2  # radians of the highest mode in one step: enough to draw a strength by
 
@@ -27,7 +27,7 @@ class Scene:
     bench: Bench
     nominal: RootedPlant
     commands: np.ndarray
-    moved: tuple[np.ndarray, np.ndarray, np.ndarray]
+    moved: ModalMotion
     outputs: np.ndarray
 
     @classmethod

@@ -5,8 +5,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 
+import numpy as np
+
 NONE, UNKNOWN = "none", "unknown"
 NEAR = 0.02  # of the length: how far off a place may be
+NEAR_IN_DIRT = 0.03  # likewise beside the small errors of a real test
+HONEST = 0.05  # of the nominal residual's mean square: how far off a budget's unexplained share may be
+NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
 
 
 @dataclass(frozen=True)
@@ -56,6 +61,108 @@ def score(
         "positions": max(errors) <= NEAR if errors else None,
         "shrinkage": {k: v for k, v in verdict.get("shrinkage", {}).items() if k != "ci95"},
     }
+
+
+def score_dirty(
+    verdict: dict, label: dict, *, length: float, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
+) -> dict:
+    """How a verdict (as JSON) agrees with the label of a trial that has small errors beside its effects.
+
+    Args:
+        length: of the structure; places count as right within 3 % of it.
+        inputs, outputs: names in order, needed where a label counts them from zero.
+
+    Returns:
+        {"class", "size": of the small errors; "hidden", "told": sets of kinds in words;
+        "named": what hides is named, its channels and places right, and nothing else is; of three effects, two and an
+        honest budget will do;
+        "wrong": a kind, or a channel, is named that does not hide; "false_alarm": anything is, and nothing hides;
+        "position_errors": of effects named rightly, shares of the length;
+        "covered": (within their 95 % interval, of) of the numbers and places of those effects;
+        "budget_error": of the unexplained share; None without a budget, or where not all that hides is named}.
+    """
+    hidden = [e for e in label["effects"] if e["kind"] not in (NONE, UNKNOWN)]
+    told = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
+    pairs = _found(hidden, told, length, inputs, outputs)
+    errors = [abs(h["at"] - t["at"]) / length for h, t in pairs if "at" in h and t.get("at") is not None]
+    covered = [inside for h, t in pairs for inside in _inside(h, t)]
+    budget = verdict.get("budget", {}).get("unexplained")
+    complete = len(pairs) == len(hidden) == len(told)
+    off = None if budget is None or not complete else abs(budget - label["budget"]["unexplained"])
+    placed = all(error <= NEAR_IN_DIRT for error in errors)
+    in_part = len(hidden) == 3 and len(pairs) == len(told) == 2 and budget is not None and budget > HONEST
+    return {
+        "class": label.get("class", ""),
+        "size": label.get("size", 1.0),
+        "hidden": _words(hidden),
+        "told": _words(verdict["effects"]),
+        "named": (complete or in_part) and placed and len(told) == len(verdict["effects"]),
+        "wrong": len(pairs) < len(told),
+        "false_alarm": not hidden and bool(told),
+        "position_errors": errors,
+        "covered": (sum(covered), len(covered)),
+        "budget_error": off,
+    }
+
+
+def tally_dirty(scores: Iterable[dict]) -> dict[str, float]:
+    """Shares over many scores of `score_dirty`.
+
+    Returns:
+        {"cases", "named", "wrong", "false_alarms" (a count), "placed" within 3 %, "covered" by 95 % intervals,
+        "honest" budgets (within 0.05)}; NaN where there is nothing to count.
+    """
+    scores = list(scores)
+    hiding = [s for s in scores if s["hidden"] != NONE]
+    errors = [e for s in hiding for e in s["position_errors"]]
+    inside, of = np.sum([s["covered"] for s in hiding] or [(0, 0)], axis=0)
+    budgets = [s["budget_error"] for s in scores if s["budget_error"] is not None]
+    return {
+        "cases": float(len(scores)),
+        "named": _share([s["named"] for s in hiding]),
+        "wrong": _share([s["wrong"] for s in scores]),
+        "false_alarms": float(sum(s["false_alarm"] for s in scores)),
+        "placed": _share([e <= NEAR_IN_DIRT for e in errors]),
+        "covered": float(inside / of) if of else float("nan"),
+        "honest": _share([b <= HONEST for b in budgets]),
+    }
+
+
+def _share(flags: Sequence[bool]) -> float:
+    return float(np.mean(flags)) if flags else float("nan")
+
+
+def _found(
+    hidden: list[dict], told: list[dict], length: float, inputs: Sequence[str], outputs: Sequence[str]
+) -> list[tuple[dict, dict]]:
+    """Hidden effects beside those told of the same kind and channel, each once, the nearest first."""
+    alike = [
+        (_distance(h, t) / length, i, j)
+        for i, h in enumerate(hidden)
+        for j, t in enumerate(told)
+        if h["kind"] == t["kind"] and _same_channel(h, t, inputs, outputs)
+    ]
+    pairs: list[tuple[int, int]] = []
+    for _, i, j in sorted(alike):
+        if all(i != k and j != m for k, m in pairs):
+            pairs.append((i, j))
+    return [(hidden[i], told[j]) for i, j in pairs]
+
+
+def _distance(hidden: dict, told: dict) -> float:
+    return abs(hidden["at"] - told["at"]) if "at" in hidden and told.get("at") is not None else 0.0
+
+
+def _inside(hidden: dict, told: dict) -> Iterable[bool]:
+    """Whether each number that has a standard deviation is within its 95 % interval of the truth."""
+    deviations = {**told.get("parameters_std", {}), "at": told.get("at_std")}
+    values = {**told.get("parameters", {}), "at": told.get("at")}
+    for name, deviation in deviations.items():
+        if deviation and name in hidden and values.get(name) is not None:
+            off = values[name] - hidden[name]
+            if name == "phase":
+                off = (off + np.pi) % (2.0 * np.pi) - np.pi
+            yield bool(abs(off) <= NORMAL_95 * deviation)
 
 
 def tally(scores: Iterable[dict]) -> Tally:

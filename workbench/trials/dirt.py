@@ -1,0 +1,131 @@
+"""Dirt: the small errors of a real test that no effect of the catalogue names, in classes and sizes."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.trials.benches import Bench
+from workbench.trials.plant import Plant
+
+CLEAN, TRIPLE = "clean", "triple"
+DIRT_CLASSES = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "mixed", TRIPLE)
+SIZES = (0.5, 1.0, 2.0)
+MIXED = ("shape", "offset", "noise", "input", "late")  # each at half the size
+
+# At size 1, and in proportion to the size unless said otherwise.
+VARIATION = 0.02  # standard deviation along the structure of its stiffness, and of its mass
+WAVES = 4  # half waves along the structure of the finest variation
+DAMPING_SPREAD = 0.3  # each mode's damping ratio is off by at most this share
+STIFFNESS_OFFSET, DAMPING_OFFSET = 0.015, 0.2  # of all stiffness and all damping, at most
+NOISE_RATIO = 1.0 / 0.6  # the true noise over the stated one, to the power of the size
+NOISE_MEMORY = 0.9  # correlation of coloured noise over one sample, to the power of 1 / size
+LOGGING_NOISE = 0.01  # of an input's rms
+LATE = 0.3  # of a sample: the latest sensor, at most
+
+# What a class of dirt does itself, and no verdict could tell from it.
+MIMICS: dict[str, frozenset[str]] = {
+    CLEAN: frozenset(),
+    "shape": frozenset({"modulus_error", "modal_damping", "axial_load", "truncated_modes"}),
+    "offset": frozenset({"modulus_error", "modal_damping", "stiffness_drift"}),
+    "noise": frozenset({"random_disturbance", "sensor_quantisation"}),
+    "coloured": frozenset({"random_disturbance", "sensor_quantisation"}),
+    "input": frozenset({"random_disturbance"}),
+    "late": frozenset({"actuator_delay", "actuator_lag", "sensor_lag", "sensor_delay"}),
+    TRIPLE: frozenset(),
+}
+MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
+
+
+@dataclass(frozen=True)
+class Dirt:
+    """Small errors of a test.
+
+    Attributes:
+        stiffness_waves, mass_waves: of their smooth variation along the structure, see `Alterations`.
+        stiffness_factor, damping_factor: of all stiffness, of all damping.
+        damping_factors: of each mode's damping ratio.
+        noise_ratio: the true standard deviation of the sensors' noise over the stated one.
+        noise_memory: correlation of that noise over one sample.
+        logging_noise: of each logged input, as a share of its rms.
+        delays: of each sensor, in samples.
+    """
+
+    stiffness_waves: tuple[float, ...] = ()
+    mass_waves: tuple[float, ...] = ()
+    stiffness_factor: float = 1.0
+    damping_factor: float = 1.0
+    damping_factors: tuple[float, ...] = ()
+    noise_ratio: float = 1.0
+    noise_memory: float = 0.0
+    logging_noise: float = 0.0
+    delays: tuple[float, ...] = ()
+
+    def on(self, plant: Plant, sample_time: float) -> Plant:
+        """The plant with this dirt, before any effect is hidden in it."""
+        delays = self.delays or (0.0,) * len(plant.sensors)
+        sensors = tuple(
+            replace(s, noise_std=s.noise_std * self.noise_ratio, delay=s.delay + delay * sample_time)
+            for s, delay in zip(plant.sensors, delays, strict=True)
+        )
+        altered = replace(
+            plant.altered,
+            stiffness_factor=plant.altered.stiffness_factor * self.stiffness_factor,
+            stiffness_waves=self.stiffness_waves,
+            mass_waves=self.mass_waves,
+        )
+        return replace(
+            plant,
+            sensors=sensors,
+            altered=altered,
+            damping_factor=plant.damping_factor * self.damping_factor,
+            damping_factors=self.damping_factors,
+            noise_memory=self.noise_memory,
+            logging_noise=self.logging_noise,
+        )
+
+
+def draw_dirt(name: str, size: float, bench: Bench, rng: np.random.Generator) -> Dirt:
+    """Dirt of a class at random.
+
+    Args:
+        name: of `DIRT_CLASSES`.
+        size: 1 for what a careful laboratory has; 0 for none.
+
+    Raises:
+        ValueError: an unknown class, a negative size.
+    """
+    if name not in DIRT_CLASSES:
+        raise ValueError(f"dirt {name!r} is none of {', '.join(DIRT_CLASSES)}")
+    if not size >= 0:
+        raise ValueError(f"the size of dirt must be 0 or more; got {size}")
+    dirt = Dirt()
+    for part in MIXED if name == "mixed" else (name,):
+        dirt = _with_part(dirt, part, 0.5 * size if name == "mixed" else size, bench, rng)
+    return dirt
+
+
+def _with_part(dirt: Dirt, name: str, size: float, bench: Bench, rng: np.random.Generator) -> Dirt:
+    if name == "shape":
+        spread = rng.uniform(-1.0, 1.0, bench.rig.modes.n_modes) * DAMPING_SPREAD * size
+        waves = [_waves(VARIATION * size, rng) for _ in range(2)]
+        factors = tuple(map(float, np.exp(spread)))
+        return replace(dirt, stiffness_waves=waves[0], mass_waves=waves[1], damping_factors=factors)
+    if name == "offset":
+        stiffness, damping = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.5, 1.0, 2) * size
+        factors = np.exp(np.array([STIFFNESS_OFFSET * stiffness, DAMPING_OFFSET * damping]))
+        return replace(dirt, stiffness_factor=float(factors[0]), damping_factor=float(factors[1]))
+    if name == "noise":
+        return replace(dirt, noise_ratio=NOISE_RATIO**size)
+    if name == "coloured":
+        return replace(dirt, noise_memory=NOISE_MEMORY ** (1.0 / size) if size > 0 else 0.0)
+    if name == "input":
+        return replace(dirt, logging_noise=LOGGING_NOISE * size)
+    if name == "late":
+        return replace(dirt, delays=tuple(map(float, rng.uniform(0.0, LATE * size, len(bench.rig.sensors)))))
+    return dirt
+
+
+def _waves(size: float, rng: np.random.Generator) -> tuple[float, ...]:
+    """Coefficients of cosines with a standard deviation of `size` along the structure."""
+    waves = rng.standard_normal(WAVES) / np.arange(1, WAVES + 1)
+    return tuple(map(float, waves * size * np.sqrt(2.0) / np.linalg.norm(waves)))
