@@ -36,7 +36,7 @@ def held_equivalent(u):
 def linear_rig(omega, zeta, stiffness):
     """One degree of freedom, from input volt to output volt."""
     shapes = KnownPlaces(("V1", "V2"), np.full((2, 1), omega / np.sqrt(stiffness)))
-    modes = Modes(omega=[omega], damping=[zeta], shapes=shapes, length=1.0)
+    modes = Modes(omega=[omega], damping=[zeta], shapes=shapes, domain=1.0)
     return Rig(modes, (Actuator("V1", 0.0),), (Sensor("V2", 1.0, noise_std=RESOLUTION),))
 
 

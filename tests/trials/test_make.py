@@ -104,7 +104,7 @@ ON_MODAL_DATA = ("point_mass", "cubic_spring", "actuator_gain", "sensor_misplace
 def test_trials_on_plain_modal_data_use_its_levels_and_places(kind):
     rng = np.random.default_rng(1)
     shapes = KnownPlaces(("F1", "F2", "d1", "d2", "d3"), rng.standard_normal((5, 3)))
-    modes = Modes(omega=np.array([3.0, 7.0, 16.0]), damping=np.full(3, 0.01), shapes=shapes, length=4.0)
+    modes = Modes(omega=np.array([3.0, 7.0, 16.0]), damping=np.full(3, 0.01), shapes=shapes, domain=4.0)
     sensors = tuple(Sensor(f"d{i + 1}", 2.0 + i, noise_std=2e-4) for i in range(3))
     rig = Rig(modes, (Actuator("F1", 0.0), Actuator("F2", 1.0)), sensors)
     inputs = 0.3 * rng.standard_normal((2, 600))

@@ -15,6 +15,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Interval
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes
 
@@ -179,7 +180,7 @@ def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
         )
     names = tuple(e["name"] for e in (*inputs, *outputs))
     shapes = KnownPlaces(names, values)
-    modes = Modes(omega=omega, damping=damping, shapes=shapes, length=float(max(len(names) - 1, 1)))
+    modes = Modes(omega=omega, damping=damping, shapes=shapes, domain=Interval(float(max(len(names) - 1, 1))))
     actuators = tuple(_actuator(e, float(i)) for i, e in enumerate(inputs))
     sensors = tuple(_sensor(e, float(i + len(inputs))) for i, e in enumerate(outputs))
     return Rig(modes, actuators, sensors)

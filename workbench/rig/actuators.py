@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.structure.domain import Place, same_place
+
 
 @dataclass(frozen=True)
 class Actuator:
@@ -11,7 +13,7 @@ class Actuator:
 
     Attributes:
         name: of the input.
-        at: place along the structure, m.
+        at: its place on the structure: x (m), (x, y), or the name of a point.
         kind: "force" (N) or "moment" (N m).
         gain: force per command.
         dead_zone: command (after the gain) below which nothing happens; sign(u) max(|u| - width, 0).
@@ -19,10 +21,11 @@ class Actuator:
         delay: s.
         time_constant: of a first-order lag, s.
         direct: a measured force applied without an actuator, such as a hammer; changes of the drive leave it alone.
+        direction: of the force, or the axis of the moment, where the structure has more than one at a place.
     """
 
     name: str
-    at: float
+    at: Place
     kind: str = "force"
     gain: float = 1.0
     dead_zone: float = 0.0
@@ -30,8 +33,10 @@ class Actuator:
     delay: float = 0.0
     time_constant: float = 0.0
     direct: bool = False
+    direction: str | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "at", same_place(self.at))
         if self.kind not in ("force", "moment"):
             raise ValueError(f"actuator {self.name}: kind is force or moment; got {self.kind!r}")
         for quantity in ("dead_zone", "delay", "time_constant"):

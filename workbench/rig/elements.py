@@ -1,103 +1,115 @@
 """What touches the structure, at a point or all along: springs, dampers, friction, stops, air, stretching.
 
-A force is positive in the direction of positive displacement w; v is the velocity there.
+A force is positive in the direction of positive displacement w; v is the velocity there. An element stands at a place,
+or `Between` two: w is then the displacement of the first less that of the second, and the force on that is opposite.
 """
 
 from dataclasses import dataclass
 
+from workbench.structure.domain import Where, same_place
+
+
+class _AtPlace:
+    """What stands at a place, or between two: kept as a float, a pair or a name, whatever it was given as."""
+
+    at: Where
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "at", same_place(self.at))
+
 
 @dataclass(frozen=True)
-class LinearSpring:
+class LinearSpring(_AtPlace):
     """-k w at x, k in N/m; in the rig rather than in the structure, so the modes stay what they are."""
 
-    at: float
+    at: Where
     stiffness: float
 
 
 @dataclass(frozen=True)
-class LinearDamper:
+class LinearDamper(_AtPlace):
     """-c v at x, c in N s/m."""
 
-    at: float
+    at: Where
     coefficient: float
 
 
 @dataclass(frozen=True)
-class CubicSpring:
+class CubicSpring(_AtPlace):
     """-k w³ at x, k in N/m³; negative softens."""
 
-    at: float
+    at: Where
     stiffness: float
 
 
 @dataclass(frozen=True)
-class PowerSpring:
+class PowerSpring(_AtPlace):
     """-F |w / w_r|^p in the direction of w, at x: F (N), negative to soften, at the displacement w_r (m); p ≥ 1."""
 
-    at: float
+    at: Where
     force: float
     reference: float
     exponent: float
 
 
 @dataclass(frozen=True)
-class EvenSpring:
+class EvenSpring(_AtPlace):
     """-F |w / w_r|^p to one side, whichever way w points, at x: F (N) at the displacement w_r (m), p at least 1."""
 
-    at: float
+    at: Where
     force: float
     reference: float
     exponent: float
 
 
 @dataclass(frozen=True)
-class PowerDamper:
+class PowerDamper(_AtPlace):
     """-F |v / v_r|^p in the direction of v, at x: F (N) at the velocity v_r (m/s), p at least 1."""
 
-    at: float
+    at: Where
     force: float
     reference: float
     exponent: float
 
 
 @dataclass(frozen=True)
-class Clearance:
+class Clearance(_AtPlace):
     """Springs k (N/m) that touch at w > gap and at w < -gap (m)."""
 
-    at: float
+    at: Where
     stiffness: float
     gap: float
 
 
 @dataclass(frozen=True)
-class OneSidedStop:
+class OneSidedStop(_AtPlace):
     """A spring k (N/m) that touches at w > gap (m)."""
 
-    at: float
+    at: Where
     stiffness: float
     gap: float
 
 
 @dataclass(frozen=True)
-class CoulombFriction:
+class CoulombFriction(_AtPlace):
     """-F tanh(v / v_s) at x: force F in N, smoothing speed v_s in m/s."""
 
-    at: float
+    at: Where
     force: float
     smoothing_speed: float
 
 
 @dataclass(frozen=True)
-class BoucWen:
+class BoucWen(_AtPlace):
     """A hysteretic spring -k z at x, z' = v - (|v| z + v |z|) / (2 z_y): k in N/m, yield displacement z_y in m."""
 
-    at: float
+    at: Where
     stiffness: float
     yield_displacement: float
 
 
 @dataclass(frozen=True)
-class UserLaw:
+class UserLaw(_AtPlace):
     """A force law of the user's own at x.
 
     Attributes:
@@ -106,7 +118,7 @@ class UserLaw:
         parameters: up to three numbers handed to it.
     """
 
-    at: float
+    at: Where
     law: object
     parameters: tuple[float, ...] = ()
 
@@ -126,20 +138,20 @@ class MidplaneStretching:
 
 
 @dataclass(frozen=True)
-class PeriodicForce:
+class PeriodicForce(_AtPlace):
     """amplitude sin(2π f t + phase) at x, t from the start of the record: N, Hz, rad."""
 
-    at: float
+    at: Where
     frequency_hz: float
     amplitude: float
     phase: float
 
 
 @dataclass(frozen=True)
-class RandomForce:
+class RandomForce(_AtPlace):
     """An unmeasured random force at x: rms in N. No prediction can hold it, only its statistics."""
 
-    at: float
+    at: Where
     rms: float
 
 

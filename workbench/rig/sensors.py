@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.structure.domain import Place, same_place
+
 # quantity: (derivative along x, derivative in time)
 MEASURED = {
     "displacement": (0, 0),
@@ -20,7 +22,7 @@ class Sensor:
 
     Attributes:
         name: of the output.
-        at: place along the structure, m.
+        at: its place on the structure: x (m), (x, y), or the name of a point.
         quantity: "displacement", "slope", "velocity", "angular velocity" or "acceleration".
         noise_std: standard deviation of its white noise.
         gain: reading per truth.
@@ -30,10 +32,11 @@ class Sensor:
         time_constant: of a first-order lag, s.
         limit: readings stop at ± this.
         step: readings are multiples of this; 0 for none.
+        direction: of the displacement, or the axis of the slope, where the structure has more than one at a place.
     """
 
     name: str
-    at: float
+    at: Place
     quantity: str = "displacement"
     noise_std: float = 0.0
     gain: float = 1.0
@@ -43,8 +46,10 @@ class Sensor:
     time_constant: float = 0.0
     limit: float = np.inf
     step: float = 0.0
+    direction: str | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "at", same_place(self.at))
         if self.quantity not in MEASURED:
             raise ValueError(f"sensor {self.name}: quantity is one of {', '.join(MEASURED)}; got {self.quantity!r}")
         for quantity in ("noise_std", "delay", "time_constant", "step"):

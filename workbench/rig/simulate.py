@@ -180,10 +180,10 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
 def participation_of(rig: Rig) -> np.ndarray:
     """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
     shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
-    for derivative, kind in enumerate(("force", "moment")):
-        group = [j for j, a in enumerate(rig.actuators) if a.kind == kind]
-        if group:
-            shapes[:, group] = rig.modes.phi([rig.actuators[j].at for j in group], derivative).T
+    kinds = [(1 if a.kind == "moment" else 0, a.direction) for a in rig.actuators]
+    for derivative, direction in set(kinds):
+        group = [j for j, kind in enumerate(kinds) if kind == (derivative, direction)]
+        shapes[:, group] = rig.modes.phi([rig.actuators[j].at for j in group], derivative, direction=direction).T
     return shapes
 
 
@@ -205,7 +205,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
     for element in rig.elements:
         if not isinstance(element, PeriodicForce):
             continue
-        shape = modes.phi(element.at)[0]
+        shape = modes.phi_at(element.at)
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
         response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
         acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
@@ -254,10 +254,10 @@ def reading_of(rig: Rig) -> tuple[np.ndarray, np.ndarray]:
 
 def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
     """Order in time, sensors and shapes (n_here, n_modes), of sensors of a kind at a time."""
-    measured = [MEASURED[sensor.quantity] for sensor in rig.sensors]
-    for derivative, order in set(measured):
-        here = [j for j, kind in enumerate(measured) if kind == (derivative, order)]
-        yield order, here, rig.modes.phi([rig.sensors[j].at for j in here], derivative)
+    measured = [(*MEASURED[sensor.quantity], sensor.direction) for sensor in rig.sensors]
+    for derivative, order, direction in set(measured):
+        here = [j for j, kind in enumerate(measured) if kind == (derivative, order, direction)]
+        yield order, here, rig.modes.phi([rig.sensors[j].at for j in here], derivative, direction=direction)
 
 
 def _step(
@@ -287,7 +287,7 @@ def _step(
         if isinstance(element, PeriodicForce):
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
             forces, at_samples = np.vstack([forces, mean]), np.vstack([at_samples, now])
-            participation = np.column_stack([participation, modes.phi(element.at)[0]])
+            participation = np.column_stack([participation, modes.phi_at(element.at)])
     driven = forces.any(axis=1)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
     parameters = np.zeros((len(points), 3))
@@ -315,7 +315,7 @@ def _step(
         np.ascontiguousarray(drag_shapes.T),
         drag * drag_weights,
         np.array([LAWS[type(e)][0] for e in points], dtype=np.int64),
-        modes.phi([e.at for e in points]) if points else np.zeros((0, modes.n_modes)),
+        np.array([modes.phi_at(e.at) for e in points]) if points else np.zeros((0, modes.n_modes)),
         parameters,
         known,
         orders,
@@ -350,14 +350,8 @@ def _stepper(laws: tuple[Callable, ...]):
 
 def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
     """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
-    points, weights = _gauss(max(3 * rig.modes.n_modes + 12, 30))
-    length = rig.modes.length
-    return rig.modes.phi(0.5 * length * (points + 1.0), derivative), 0.5 * length * weights
-
-
-@cache
-def _gauss(n_points: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.polynomial.legendre.leggauss(n_points)
+    points, weights = rig.modes.domain.quadrature(max(3 * rig.modes.n_modes + 12, 30))
+    return rig.modes.phi(points, derivative), weights
 
 
 def _stretching(rig: Rig) -> np.ndarray:

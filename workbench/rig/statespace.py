@@ -11,7 +11,7 @@ from workbench.structure.modes import Modes
 
 
 def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
-    """Modal forces per unit command, B_rj = φ_r(x_j), or φ_r'(x_j) for a moment: (n_modes, n_actuators).
+    """Modal forces per unit command, B_rj = φ_r at its place, or the slope there for a moment: (n_modes, n_actuators).
 
     Raises:
         ValueError: an actuator on a support, where it can do no work.
@@ -19,19 +19,21 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     columns = []
     for actuator in actuators:
         derivative = 1 if actuator.kind == "moment" else 0
-        for at, held in modes.essential:
-            if held == derivative and abs(actuator.at - at) <= 1e-9 * modes.length:
-                raise ValueError(
-                    f"actuator {actuator.name} stands on the support at x = {at:g}, where it moves no mode;"
-                    " move it inside"
-                )
-        columns.append(actuator.gain * modes.phi(actuator.at, derivative)[0])
+        if modes.is_held(actuator.at, derivative, direction=actuator.direction):
+            raise ValueError(
+                f"actuator {actuator.name} stands on the support at {modes.domain.text(actuator.at)}, where it moves"
+                " no mode; move it inside"
+            )
+        columns.append(actuator.gain * modes.phi_at(actuator.at, derivative, direction=actuator.direction))
     return np.array(columns).reshape(len(columns), modes.n_modes).T
 
 
 def output_matrix(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
     """Mode shapes (or their slopes) at the sensors, times gain: (n_sensors, n_modes)."""
-    rows = [sensor.gain * modes.phi(sensor.at, MEASURED[sensor.quantity][0])[0] for sensor in sensors]
+    rows = [
+        sensor.gain * modes.phi_at(sensor.at, MEASURED[sensor.quantity][0], direction=sensor.direction)
+        for sensor in sensors
+    ]
     return np.array(rows).reshape(len(rows), modes.n_modes)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
+from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes
 from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile, ProfileLike, as_profile
@@ -47,6 +48,8 @@ class _Member:
             object.__setattr__(self, name, profile)
             self._check_positive(name, profile)
         for part in self.attachments:
+            if not isinstance(part.at, float):
+                raise ValueError(f"{part}: a place along a bar or beam is a position x, m; got {part.at!r}")
             if not 0 <= part.at <= self.length:
                 raise ValueError(f"{part} stands outside the structure, which runs from 0 to {self.length:g}")
             if isinstance(part, PointMass) and (part.mass < 0 or part.rotary_inertia < 0):
@@ -148,7 +151,7 @@ class _Member:
             omega=omega,
             damping=self._damping_matrix(omega, segments, coefficients),
             shapes=shapes,
-            length=self.length,
+            domain=Interval(self.length),
             essential=essential,
         )
 

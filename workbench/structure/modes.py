@@ -1,12 +1,18 @@
 """Modes: what a structure's own computation and its measurement agree to speak of."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, wraps
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-Shapes = Callable[[np.ndarray, int], np.ndarray]
+from workbench.structure.domain import Between, Derivative, Domain, Interval, Where, as_domain
+
+Shapes = Callable[[np.ndarray, Any], np.ndarray]
+HELD = 1e-9  # of the largest motion anywhere: what moves less is held by a support
 
 
 def frozen(array: ArrayLike, dtype=float) -> np.ndarray:
@@ -20,7 +26,7 @@ def frozen(array: ArrayLike, dtype=float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Modes:
-    """Mass-normalised modes, known everywhere along the structure: ∫ m φ_r φ_s dx = δ_rs (2.5).
+    """Mass-normalised modes, known all over their domain: ∫ m φ_r φ_s dx = δ_rs (2.5).
 
     Each modal coordinate obeys q_r'' + Σ_s c_rs q_s' + ω_r² q_r = f_r (2.10).
 
@@ -28,9 +34,11 @@ class Modes:
         omega: (n_modes,) undamped natural frequencies, rad/s, not decreasing; 0 for a rigid-body mode.
         damping: (n_modes, n_modes) coefficients c_rs of (2.11), 1/s; diagonal 2 ζ_r ω_r for modal damping. A vector
             (n_modes,) is taken as the damping ratios ζ_r.
-        shapes: callable (x (n_points,), derivative) -> (n_points, n_modes).
-        length: extent of the structure, m; positions are in [0, length].
-        essential: ((x, derivative), ...) where the supports hold the shape or its slope at zero.
+        shapes: callable (located, derivative) -> (n_points, n_modes) of what `domain.locate` makes of places:
+            positions (n_points,) on an interval, with the order of derivative along x; (n_points, 2) on a rectangle,
+            with the orders (i, j) along x and y; indices (n_points,) of named points, where there is no derivative.
+        domain: which places there are; a number is the length, m, of an interval.
+        essential: ((x, derivative), ...) where the supports of an interval hold the shape or its slope at zero.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), where the modes were identified; None where computed.
 
     Raises:
@@ -40,11 +48,12 @@ class Modes:
     omega: np.ndarray
     damping: np.ndarray
     shapes: Shapes = field(repr=False)
-    length: float
+    domain: Domain
     essential: tuple[tuple[float, int], ...] = ()
     covariance: np.ndarray | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "domain", as_domain(self.domain))
         omega = frozen(self.omega)
         damping = np.array(self.damping, float)
         if omega.ndim != 1 or omega.size == 0:
@@ -84,18 +93,54 @@ class Modes:
         diagonal = np.diag(self.damping)
         return bool(np.abs(self.damping - np.diag(diagonal)).max() <= 1e-12 * max(np.abs(diagonal).max(), 1e-300))
 
-    def phi(self, x: ArrayLike, derivative: int = 0) -> np.ndarray:
-        """Mode shapes at x (m), or their derivatives along x: (n_points, n_modes).
+    @property
+    def length(self) -> float:
+        """Length of the interval, m.
 
         Raises:
-            ValueError: a position outside the structure.
+            AttributeError: modes of another domain, which has a `domain.size`.
         """
-        x = np.atleast_1d(np.asarray(x, float))
-        slack = 1e-9 * self.length
-        outside = (x < -slack) | (x > self.length + slack) | ~np.isfinite(x)
-        if outside.any():
-            raise ValueError(f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}")
-        return np.asarray(self.shapes(np.clip(x, 0.0, self.length), derivative), float)
+        if not isinstance(self.domain, Interval):
+            raise AttributeError("only modes along an interval have a length; see domain.size")
+        return self.domain.length
+
+    def phi(self, places: Any, derivative: Derivative = 0, *, direction: str | None = None) -> np.ndarray:
+        """Mode shapes at places, or their slopes: (n_places, n_modes).
+
+        Args:
+            places: one or several of the domain: positions x (m), pairs (x, y), or names.
+            derivative: 0 for the displacement, 1 for the slope, further ones along an interval; (i, j) for those along
+                x and y of a rectangle.
+            direction: of the displacement, or the axis of the slope, where the domain has more than one.
+
+        Raises:
+            ValueError: a place outside the structure, a direction that it does not have there.
+        """
+        places, derivative, sign = self.domain.slope(places, derivative, direction)
+        found = np.asarray(self.shapes(self.domain.locate(places), derivative), float)
+        return found if sign == 1.0 else sign * found
+
+    def phi_at(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> np.ndarray:
+        """Mode shapes (n_modes,) at one place, or at the first of two less those at the second."""
+        if isinstance(where, Between):
+            first, second = (self.phi(place, derivative, direction=direction)[0] for place in where)
+            return first - second
+        return self.phi(where, derivative, direction=direction)[0]
+
+    def is_held(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> bool:
+        """Whether a support holds the displacement, or the slope, at a place, so that no mode moves it."""
+        if isinstance(self.domain, Interval) and not isinstance(where, Between):
+            slack = 1e-9 * self.domain.length
+            return any(held == derivative and abs(where - at) <= slack for at, held in self.essential)  # type: ignore
+        if derivative:
+            return False
+        moved = np.abs(self.phi_at(where, derivative, direction=direction)).max()
+        return bool(moved <= HELD * self._largest)
+
+    @cached_property
+    def _largest(self) -> float:
+        """The largest displacement of any mode on a grid over the domain."""
+        return float(np.abs(self.phi(self.domain.grid(12))).max())
 
     def select(self, modes: Sequence[int] | slice) -> "Modes":
         """Only some of the modes, by zero-based index."""
@@ -110,11 +155,27 @@ class Modes:
         return Modes(
             omega=self.omega[index],
             damping=self.damping[np.ix_(index, index)],
-            shapes=lambda x, derivative: shapes(x, derivative)[:, index],
-            length=self.length,
+            shapes=lambda located, derivative: shapes(located, derivative)[:, index],
+            domain=self.domain,
             essential=self.essential,
             covariance=covariance,
         )
+
+
+def _taking_a_length(init: Callable[..., None]) -> Callable[..., None]:
+    """The constructor of `Modes` with the former name `length` of its `domain`."""
+
+    @wraps(init)
+    def with_length(self: Modes, *args: Any, **kwargs: Any) -> None:
+        if "length" in kwargs:
+            warnings.warn("Modes(length=...) is now Modes(domain=...)", DeprecationWarning, stacklevel=2)
+            kwargs["domain"] = kwargs.pop("length")
+        init(self, *args, **kwargs)
+
+    return with_length
+
+
+Modes.__init__ = _taking_a_length(Modes.__init__)  # type: ignore[method-assign]
 
 
 @dataclass(frozen=True, eq=False)

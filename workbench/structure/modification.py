@@ -3,6 +3,7 @@
 import numpy as np
 from scipy.linalg import eigh
 
+from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
@@ -27,8 +28,8 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...]) -> Modes:
         )
         for derivative, value in enumerate(pair):
             if value:
-                shape = modes.phi(part.at, derivative)[0]
-                target += value * np.outer(shape, shape)
+                shapes = _moved(modes, part, derivative)
+                target += value * shapes.T @ shapes
     if any(isinstance(part, PointMass | PointSpring) for part in attachments):
         eigenvalues, vectors = eigh(stiffness, mass)
         vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
@@ -39,13 +40,20 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...]) -> Modes:
     for part in extra_damping:
         for derivative, value in enumerate((part.coefficient, part.rotational_coefficient)):
             if value:
-                shape = modes.phi(part.at, derivative)[0] @ vectors
-                damping = damping + value * np.outer(shape, shape)
-    shapes = modes.shapes
+                shape = _moved(modes, part, derivative) @ vectors
+                damping = damping + value * shape.T @ shape
+    unchanged = modes.shapes
     return Modes(
         omega=omega,
         damping=damping,
-        shapes=lambda x, derivative: shapes(x, derivative) @ vectors,
-        length=modes.length,
+        shapes=lambda located, derivative: unchanged(located, derivative) @ vectors,
+        domain=modes.domain,
         essential=modes.essential,
     )
+
+
+def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
+    """Shapes (n_directions, n_modes) of what an attachment moves by: a mass moves in every direction of its node."""
+    if isinstance(part, PointMass) and isinstance(modes.domain, NamedPoints) and derivative == 0:
+        return modes.phi(modes.domain.translations(str(part.at)))
+    return modes.phi_at(part.at, derivative)[None, :]

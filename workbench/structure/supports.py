@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.structure.domain import Where, same_place
+
 HELD = np.inf
 
 
@@ -38,29 +40,38 @@ def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
     return NAMED_ENDS[end]
 
 
+class _AtPlace:
+    """What stands at a place: kept as a float, a pair or a name, whatever it was given as."""
+
+    at: Where
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "at", same_place(self.at))
+
+
 @dataclass(frozen=True)
-class PointMass:
+class PointMass(_AtPlace):
     """A rigid body attached at a point: mass (kg) and rotary inertia (kg m²) about that point."""
 
-    at: float
+    at: Where
     mass: float
     rotary_inertia: float = 0.0
 
 
 @dataclass(frozen=True)
-class PointSpring:
+class PointSpring(_AtPlace):
     """A linear spring from a point to ground: against translation (N/m) and rotation (N m/rad)."""
 
-    at: float
+    at: Where
     stiffness: float
     rotational_stiffness: float = 0.0
 
 
 @dataclass(frozen=True)
-class PointDamper:
+class PointDamper(_AtPlace):
     """A viscous damper from a point to ground: against translation (N s/m) and rotation (N m s/rad)."""
 
-    at: float
+    at: Where
     coefficient: float
     rotational_coefficient: float = 0.0
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from workbench.identification.free_decay.ibrahim import normalised_shapes
+from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import PointMass
@@ -184,7 +185,7 @@ def eigenfunctions(
         omega=sampled.omega,
         damping=sampled.zeta,
         shapes=lambda x, derivative: splines(values, x, derivative),
-        length=length,
+        domain=Interval(length),
         essential=ends.essential,
         covariance=covariance,
     )

@@ -1,0 +1,388 @@
+"""Which places a structure has: along an interval, over a rectangle, or at named points.
+
+A place is a float (m, along an interval), a pair (x, y) of floats (m, on a rectangle) or a name (of a point). What acts
+between two places, on the displacement of the first less that of the second, stands at `Between(first, second)`.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from itertools import combinations
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+SLACK = 1e-9  # of the extent: how far outside a place may lie by rounding
+
+Place = float | tuple[float, float] | str
+
+
+class Between(NamedTuple):
+    """Two places: what stands there acts on the displacement of the first less that of the second."""
+
+    first: Place
+    second: Place
+
+
+Where = Place | Between
+Derivative = int | tuple[int, int]
+
+
+class PlaceError(ValueError):
+    """A place that a structure does not have, or a direction that it does not have there."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Places along a bar or beam: x from 0 to `length`, m.
+
+    Raises:
+        ValueError: a length that is not positive.
+    """
+
+    length: float
+    coordinates: ClassVar[tuple[str, ...]] = ("at",)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.length) and self.length > 0):
+            raise ValueError(f"the length of a structure must be positive; got {self.length}")
+
+    @property
+    def size(self) -> float:
+        """The length, m."""
+        return self.length
+
+    def locate(self, places: Any) -> np.ndarray:
+        """Positions (n_places,), m.
+
+        Raises:
+            PlaceError: a place outside, or one that is no position.
+        """
+        try:
+            x = np.atleast_1d(np.asarray(places, float))
+        except (TypeError, ValueError):
+            raise PlaceError(f"a place along an interval is a position x in m; got {places!r}") from None
+        slack = SLACK * self.length
+        outside = (x < -slack) | (x > self.length + slack) | ~np.isfinite(x)
+        if outside.any():
+            raise PlaceError(f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}")
+        return np.clip(x, 0.0, self.length)
+
+    def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
+        """Places, derivative along x and sign of a displacement (derivative 0), slope (1) and so on."""
+        if direction not in (None, "w"):
+            raise PlaceError(f"along an interval there is one direction, so none is named; got {direction!r}")
+        return places, derivative, 1.0
+
+    def grid(self, n: int) -> tuple[float, ...]:
+        """Places inside, `n` spacings from end to end."""
+        return tuple((self.length * np.arange(1, n) / n).tolist())
+
+    def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Legendre points (n,), m, and weights (n,), m: ∫ f dx = Σ w f."""
+        points, weights = _gauss(n)
+        return 0.5 * self.length * (points + 1.0), 0.5 * self.length * weights
+
+    def distance(self, one: Place, other: Place) -> float:
+        """Between two places, m."""
+        x, y = self.locate([one, other])
+        return float(abs(x - y))
+
+    def separation(self, one: Where, other: Where) -> float:
+        """Distance between two places over the length."""
+        return abs(float(one) - float(other)) / self.length  # type: ignore[arg-type]
+
+    def text(self, place: Where) -> str:
+        """How a place is written: x = 3.4."""
+        if isinstance(place, Between):
+            return f"between {self.text(place.first)} and {self.text(place.second)}"
+        return f"x = {place:.3g}"
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Places on a plate or membrane: (x, y), x from 0 to `length[0]` and y from 0 to `length[1]`, m.
+
+    The displacement w is normal to it. A slope is the rotation about an axis, right-handed: ∂w/∂y about x, -∂w/∂x
+    about y.
+
+    Raises:
+        ValueError: lengths that are not positive.
+    """
+
+    length: tuple[float, float]
+    coordinates: ClassVar[tuple[str, ...]] = ("x", "y")
+
+    def __post_init__(self) -> None:
+        a, b = self.length
+        object.__setattr__(self, "length", (float(a), float(b)))
+        if not (np.isfinite(self.length).all() and min(self.length) > 0):
+            raise ValueError(f"the lengths of a rectangle must be positive; got {self.length}")
+
+    @property
+    def size(self) -> float:
+        """The diagonal, m."""
+        return float(np.hypot(*self.length))
+
+    def locate(self, places: Any) -> np.ndarray:
+        """Positions (n_places, 2), m.
+
+        Raises:
+            PlaceError: a place outside, or one that is no pair.
+        """
+        try:
+            xy = np.atleast_2d(np.asarray(places, float))
+        except (TypeError, ValueError):
+            xy = np.zeros((0, 0))
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise PlaceError(f"a place on a rectangle is a pair (x, y) in m; got {places!r}")
+        extent = np.array(self.length)
+        slack = SLACK * extent
+        outside = ((xy < -slack) | (xy > extent + slack) | ~np.isfinite(xy)).any(axis=1)
+        if outside.any():
+            x, y = xy[outside][0]
+            a, b = self.length
+            raise PlaceError(f"(x, y) = ({x:g}, {y:g}) lies outside the structure, 0 to {a:g} by 0 to {b:g}")
+        return np.clip(xy, 0.0, extent)
+
+    def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
+        """Places, derivatives along x and y and sign of a displacement, a slope about an axis, or (i, j) as it is."""
+        if isinstance(derivative, tuple):
+            return places, derivative, 1.0
+        if derivative == 0 and direction in (None, "w", "z"):
+            return places, (0, 0), 1.0
+        if derivative == 1 and direction in ("x", "y"):
+            return (places, (0, 1), 1.0) if direction == "x" else (places, (1, 0), -1.0)
+        if derivative == 1:
+            raise PlaceError(f"a slope or moment on a plate is about an axis: direction 'x' or 'y'; got {direction!r}")
+        raise PlaceError(f"a plate moves along its normal, direction 'z' or none; got {direction!r}")
+
+    def grid(self, n: int) -> tuple[tuple[float, float], ...]:
+        """Places inside, `n` spacings along the longer side and as many a metre along the other."""
+        spacing = max(self.length) / n
+        along = [np.arange(1, m) * side / m for side in self.length for m in [max(round(side / spacing), 2)]]
+        return tuple((float(x), float(y)) for x in along[0] for y in along[1])
+
+    def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Legendre points (n_points, 2), m, and weights (n_points,), m²: ∫∫ f dx dy = Σ w f.
+
+        Modes are as many over a rectangle as along an interval, so that each way there are fewer waves: 8 + 2 √n points
+        each way serve as many modes as n along an interval.
+        """
+        points, weights = _gauss(8 + round(2.0 * np.sqrt(n)))
+        a, b = self.length
+        x, y = np.meshgrid(0.5 * a * (points + 1.0), 0.5 * b * (points + 1.0), indexing="ij")
+        return np.column_stack([x.ravel(), y.ravel()]), 0.25 * a * b * np.outer(weights, weights).ravel()
+
+    def distance(self, one: Place, other: Place) -> float:
+        """Between two places, m."""
+        p, q = self.locate([one, other])
+        return float(np.hypot(*(p - q)))
+
+    def separation(self, one: Where, other: Where) -> float:
+        """Distance between two places over the diagonal."""
+        return float(np.hypot(one[0] - other[0], one[1] - other[1])) / self.size  # type: ignore
+
+    def text(self, place: Where) -> str:
+        """How a place is written: (x, y) = (0.63, 0.72)."""
+        if isinstance(place, Between):
+            return f"between {self.text(place.first)} and {self.text(place.second)}"
+        x, y = place  # type: ignore[misc]
+        return f"(x, y) = ({x:.3g}, {y:.3g})"
+
+
+TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("rx", "ry", "rz")
+
+
+@dataclass(frozen=True, eq=False)
+class NamedPoints:
+    """Places with a name each, a degree of freedom of a node: those of a finite-element model, or of a bench's sensors.
+
+    Attributes:
+        names: (n_points,) all different.
+        positions: (n_points, 3), m; None where they are not known.
+        directions: (n_points,) of "x", "y", "z", "rx", "ry", "rz", or "" where not known.
+        nodes: (n_points,) the node that each belongs to; each its own where not given.
+
+    Raises:
+        ValueError: no names or two alike, positions or directions that do not fit the names.
+    """
+
+    names: tuple[str, ...]
+    positions: np.ndarray | None = None
+    directions: tuple[str, ...] = ()
+    nodes: tuple[str, ...] = ()
+    coordinates: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self) -> None:
+        names = tuple(self.names)
+        n = len(names)
+        if n == 0 or len(set(names)) < n:
+            twice = next((name for name in names if names.count(name) > 1), None)
+            raise ValueError(f"named points need names, all different; got {'none' if n == 0 else f'{twice!r} twice'}")
+        object.__setattr__(self, "names", names)
+        object.__setattr__(self, "directions", tuple(self.directions) or ("",) * n)
+        object.__setattr__(self, "nodes", tuple(map(str, self.nodes)) or names)
+        for direction in self.directions:
+            if direction not in ("", *TRANSLATIONS, *ROTATIONS):
+                raise ValueError(f"a direction is one of x, y, z, rx, ry, rz; got {direction!r}")
+        if len(self.directions) != n or len(self.nodes) != n:
+            raise ValueError(
+                f"{n} named points need as many directions and nodes; got {len(self.directions)} and {len(self.nodes)}"
+            )
+        if self.positions is not None:
+            positions = np.array(self.positions, float)
+            if positions.shape != (n, 3) or not np.isfinite(positions).all():
+                raise ValueError(f"positions of {n} named points must be finite, ({n}, 3); got {positions.shape}")
+            positions.flags.writeable = False
+            object.__setattr__(self, "positions", positions)
+
+    @cached_property
+    def _index(self) -> dict[str, int]:
+        return {name: i for i, name in enumerate(self.names)}
+
+    @cached_property
+    def size(self) -> float:
+        """The diagonal of the box that holds all points, m.
+
+        Raises:
+            PlaceError: positions are not known.
+        """
+        return float(np.linalg.norm(np.ptp(self._positions, axis=0)))
+
+    @property
+    def _positions(self) -> np.ndarray:
+        if self.positions is None:
+            raise PlaceError("the positions of the named points are not known, so there is no distance; give positions")
+        return self.positions
+
+    def locate(self, places: Any) -> np.ndarray:
+        """Indices (n_places,) of named points.
+
+        Raises:
+            PlaceError: a name that no point has.
+        """
+        names = [places] if isinstance(places, str) else list(np.atleast_1d(np.asarray(places, object)))
+        found = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
+        if -1 in found:
+            name = names[found.index(-1)]
+            raise PlaceError(f"there is no point {name!r}; the points are {_some(self.names)}")
+        return np.array(found, int)
+
+    def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
+        """Names, derivative 0 and sign: the point of the same node that moves or turns in the direction."""
+        if derivative not in (0, 1):
+            raise PlaceError(f"named points know displacements and rotations, no derivative of order {derivative}")
+        names = [places] if isinstance(places, str) else list(places)
+        if direction is not None:
+            wanted = direction if derivative == 0 or direction.startswith("r") else f"r{direction}"
+            return [self.of_node(name, wanted) for name in names], 0, 1.0
+        if derivative == 1:
+            for i, name in zip(self.locate(names), names, strict=True):
+                if self.directions[i] not in ROTATIONS:
+                    raise PlaceError(
+                        f"named points tell no slopes; {name!r} is no rotation: give a point of direction rx, ry or rz"
+                    )
+        return names, 0, 1.0
+
+    def of_node(self, name: str, direction: str) -> str:
+        """The point of a node in a direction, by the node's name or that of any of its points.
+
+        Raises:
+            PlaceError: a node or direction that is not known.
+        """
+        node = self.nodes[self._index[name]] if name in self._index else name
+        alike = {d: n for n, m, d in zip(self.names, self.nodes, self.directions, strict=True) if m == node}
+        if direction not in alike:
+            raise PlaceError(
+                f"point {name!r} has no direction {direction!r}; it has"
+                f" {', '.join(d or 'one without a name' for d in alike) or 'none'}"
+            )
+        return alike[direction]
+
+    def translations(self, name: str) -> tuple[str, ...]:
+        """The points of the same node that are displacements: what a mass there moves with."""
+        node = self.nodes[int(self.locate(name)[0])]
+        each = zip(self.names, self.nodes, self.directions, strict=True)
+        return tuple(n for n, m, direction in each if m == node and direction not in ROTATIONS) or (name,)
+
+    def grid(self, n: int = 0) -> tuple[str, ...]:
+        """The points that are displacements."""
+        return tuple(x for x, d in zip(self.names, self.directions, strict=True) if d not in ROTATIONS) or self.names
+
+    def pairs(self) -> Iterator[Between]:
+        """Any two points of one direction, of different nodes."""
+        each = list(zip(self.grid(), self.locate(self.grid()), strict=True))
+        for (one, i), (other, j) in combinations(each, 2):
+            if self.directions[i] == self.directions[j] and self.nodes[i] != self.nodes[j]:
+                yield Between(one, other)
+
+    def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """There is none.
+
+        Raises:
+            PlaceError: always.
+        """
+        raise PlaceError("named points have no shapes between them to integrate; describe the structure as a member")
+
+    def distance(self, one: Place, other: Place) -> float:
+        """Between two points, m.
+
+        Raises:
+            PlaceError: positions are not known.
+        """
+        i, j = self.locate([one, other])
+        return float(np.linalg.norm(self._positions[i] - self._positions[j]))
+
+    def separation(self, one: Where, other: Where) -> float:
+        """0 for the same place and 1 for another: there is no way from one to the other."""
+        return float(_unordered(one) != _unordered(other))
+
+    def text(self, place: Where) -> str:
+        """How a place is written: its name."""
+        if isinstance(place, Between):
+            return f"between {place.first} and {place.second}"
+        return str(place)
+
+
+Domain = Interval | Rectangle | NamedPoints
+
+
+def as_domain(domain: Domain | float) -> Domain:
+    """The domain itself, or the interval of that length, m."""
+    return domain if isinstance(domain, Interval | Rectangle | NamedPoints) else Interval(float(domain))
+
+
+def same_place(place: Any) -> Any:
+    """A place in a form that can be kept and compared: a float, a pair of floats, a name, or `Between` two of these.
+
+    Raises:
+        PlaceError: nothing of the kind.
+    """
+    if isinstance(place, str) or type(place) is float:
+        return place
+    if isinstance(place, Between):
+        return Between(same_place(place.first), same_place(place.second))
+    try:
+        values = np.asarray(place, float)
+        if values.shape in ((), (1,)):
+            return float(values.reshape(()))
+        if values.shape == (2,):
+            return (float(values[0]), float(values[1]))
+    except (TypeError, ValueError):
+        pass
+    raise PlaceError(f"a place is a position x, a pair (x, y), or the name of a point; got {place!r}")
+
+
+def _unordered(place: Where) -> Any:
+    return frozenset(place) if isinstance(place, Between) else place
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+
+
+@cache
+def _gauss(n_points: int) -> tuple[np.ndarray, np.ndarray]:
+    points, weights = np.polynomial.legendre.leggauss(n_points)
+    return points, weights
