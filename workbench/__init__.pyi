@@ -53,6 +53,10 @@ from .rig.statespace import state_space as state_space
 from .structure.damping import ModalDamping as ModalDamping
 from .structure.damping import ProportionalDamping as ProportionalDamping
 from .structure.damping import ViscousDamping as ViscousDamping
+from .structure.domain import Between as Between
+from .structure.domain import Interval as Interval
+from .structure.domain import NamedPoints as NamedPoints
+from .structure.domain import Rectangle as Rectangle
 from .structure.member import Bar as Bar
 from .structure.member import Beam as Beam
 from .structure.modes import Modes as Modes
