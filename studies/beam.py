@@ -6,11 +6,11 @@ the ends and the mass of the beam, never its modes. The law designed on what was
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import Law
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.placement import place, placement_task
 from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
 from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works

@@ -3,9 +3,9 @@
 import numpy as np
 from scipy.integrate import quad
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.estimation.modal_filter import hermite_filter
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.spillover.spillover import energy_gained, finite_spillover, spillover
 from workbench.draw.design import plot_displacements, plot_work
 from workbench.rig.actuators import Actuator

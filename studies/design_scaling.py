@@ -7,11 +7,11 @@ import control
 import numpy as np
 from scipy.optimize import differential_evolution
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_gains
 from workbench.design.laws.pole_assignment import assign
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.placement import law_at, nodes_of_mode, place
 from workbench.design.placement.task import batch_work, placement_task
 from workbench.draw.design import plot_scaling

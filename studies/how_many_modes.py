@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, impulse_state
 from workbench.design.placement.how_many import how_many_modes
 from workbench.design.placement.placement import nodes_of_mode
 from workbench.design.spillover.spillover import finite_spillover

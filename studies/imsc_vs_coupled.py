@@ -7,16 +7,24 @@ from time import perf_counter
 import control
 import numpy as np
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state
-from workbench.design.estimation.controller import close_with, filtered
+from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles, riccati_gains, riccati_matrices
+from workbench.design.laws.on_off import on_off
+from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state
+from workbench.design.loop.on_off_response import respond_on_off
 from workbench.design.spillover.judge import judge, judge_on_off
-from workbench.design.spillover.on_off import on_off, on_off_work, respond_on_off
 from workbench.design.spillover.robustness import survival_of, wrong_by
-from workbench.design.spillover.spillover import distributed_cost, effort, modal_cost, quadratic_cost, spillover
+from workbench.design.spillover.spillover import (
+    distributed_cost,
+    effort,
+    modal_cost,
+    on_off_work,
+    quadratic_cost,
+    spillover,
+)
 from workbench.draw.design import plot_comparison, plot_designs, plot_switching
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor

@@ -11,8 +11,8 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from workbench import study as many
-from workbench.design.estimation.closed_loop import impulse_state
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.spillover.spillover import effort, spillover
 from workbench.draw.many import plot_cases
 from workbench.rig.actuators import Actuator

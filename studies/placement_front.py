@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import impulse_state
 from workbench.design.laws.coupled import coupled_lqr
+from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.placement.certificate import certify
 from workbench.design.placement.coupled_placement import place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import kalman, luenberger
-from workbench.design.estimation.reidentify import open_loop, updated
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.reidentify import open_loop, updated
 from workbench.design.spillover.robustness import draw_modes, survive
 from workbench.design.spillover.spillover import distributed_cost, modal_cost
 from workbench.draw.design import plot_drift, plot_survival

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import close_loop
-from workbench.design.estimation.controller import close_with, filtered
+from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import Law
-from workbench.design.spillover.explain import explain, stability_margin
+from workbench.design.loop.closed_loop import close_loop, close_with
+from workbench.design.spillover.explain import explain
 from workbench.design.spillover.remedies import remedies, sensors_that_suffice
 from workbench.draw.design import plot_cure, plot_spillover_paths
 from workbench.rig.actuators import Actuator
@@ -24,7 +24,7 @@ BESIDE, ACROSS = 10.0 / 6.0, 50.0 / 6.0
 
 def margins_of_filter(modes, way, actuators, count=24):
     places = modes.length * np.arange(1, count + 1) / (count + 1)
-    return stability_margin(close_with(modes, way(actuators, places)))
+    return close_with(modes, way(actuators, places)).margin
 
 
 def study(outcome, data=None):
@@ -54,7 +54,7 @@ def study(outcome, data=None):
         return filtered(law(actuators, share), displacement_filter(modes.select(range(CONTROLLED)), sensors, 1.0))
 
     def reduced(controller):
-        return stability_margin(close_with(modes.select(range(CONTROLLED)), controller))
+        return close_with(modes.select(range(CONTROLLED)), controller).margin
 
     one = ACTUATORS[:1]
     stable, unstable = (explain(modes, observed(one, [place])) for place in (BESIDE, ACROSS))
@@ -99,7 +99,7 @@ def study(outcome, data=None):
         "an even grid of k sensors takes mode 2(k + 1) - r for mode r, so a filter of displacements alone is cured only"
         " once the alias of its highest mode lies beyond the plant's"
     )
-    perfect = stability_margin(close_loop(modes, law(one)))
+    perfect = close_loop(modes, law(one)).margin
     outcome.check("a number of sensors suffices for the modal filter, up to", counts["modal filter"] or np.inf, 24)
     outcome.check(
         "its margin with 24 sensors over that with exact modal coordinates",

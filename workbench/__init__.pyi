@@ -2,9 +2,6 @@
 # name is first used. Everything else comes from its room: `from workbench.rig.elements import CubicSpring`.
 
 from .cases.case import read_case as read_case
-from .design.estimation.closed_loop import close_loop as close_loop
-from .design.estimation.closed_loop import impulse_state as impulse_state
-from .design.estimation.closed_loop import respond as respond
 from .design.estimation.observers import kalman as kalman
 from .design.estimation.observers import luenberger as luenberger
 from .design.laws.coupled import coupled_lqr as coupled_lqr
@@ -13,12 +10,15 @@ from .design.laws.imsc import imsc as imsc
 from .design.laws.imsc import imsc_poles as imsc_poles
 from .design.laws.law import DesignError as DesignError
 from .design.laws.law import Law as Law
+from .design.laws.on_off import on_off as on_off
+from .design.loop.closed_loop import close_loop as close_loop
+from .design.loop.closed_loop import impulse_state as impulse_state
+from .design.loop.closed_loop import respond as respond
 from .design.placement.certificate import certify as certify
 from .design.placement.placement import place as place
 from .design.placement.placement import placement_task as placement_task
 from .design.placement.sensor_placement import place_sensors as place_sensors
 from .design.spillover.explain import explain as explain
-from .design.spillover.on_off import on_off as on_off
 from .design.spillover.remedies import remedies as remedies
 from .design.spillover.spillover import spillover as spillover
 from .draw.plot import plot as plot

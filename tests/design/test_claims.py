@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.estimation.modal_filter import hermite_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.sensor_placement import filter_error, place_sensors
 from workbench.design.spillover.spillover import distributed_cost, effort, finite_spillover, modal_cost, spillover
 from workbench.rig.actuators import Actuator

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

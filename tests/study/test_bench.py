@@ -51,7 +51,7 @@ def test_it_begins_with_the_design_of_section_5_8():
 
 
 def test_effort_is_that_of_the_lyapunov_equation():
-    from workbench.design.estimation.closed_loop import impulse_state
+    from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.spillover import effort
 
     tried = try_out(RIG, replace(start(RIG), final_time=120.0))

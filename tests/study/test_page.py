@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.draw.interactive import Undescribed, described, drawable
 from workbench.draw.motion import mode_motion, response_motion
 from workbench.draw.style import new_figure

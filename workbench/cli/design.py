@@ -41,7 +41,7 @@ def design(
     """
     import numpy as np
 
-    from workbench.design.estimation.closed_loop import impulse_state
+    from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import survival_of, wrong_by
     from workbench.study.whole_file import check_target

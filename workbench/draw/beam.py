@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from workbench.design.estimation.closed_loop import Response
+from workbench.design.loop.closed_loop import Response
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.records.record import Record
 from workbench.structure.modes import Modes

@@ -6,11 +6,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from workbench.design.estimation.closed_loop import Response
+from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.closed_loop import Response
+from workbench.design.loop.on_off_response import Switched
 from workbench.design.placement.how_many import HowMany
 from workbench.design.placement.placement import Placement
 from workbench.design.spillover.explain import Explanation
-from workbench.design.spillover.on_off import OnOffLaw, Switched
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import Response
+from workbench.design.loop.closed_loop import Response
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes, SampledModes

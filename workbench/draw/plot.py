@@ -5,8 +5,8 @@ from functools import singledispatch
 import numpy as np
 from matplotlib.figure import Figure
 
-from workbench.design.estimation.closed_loop import Response
 from workbench.design.estimation.modal_filter import ModalFilter
+from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.how_many import HowMany
 from workbench.design.placement.placement import Placement
 from workbench.design.spillover.explain import Explanation

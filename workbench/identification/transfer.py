@@ -22,8 +22,9 @@ from workbench.identification.input_output.mode_clusters import NARROW, parts_of
 from workbench.identification.input_output.model_order import Told, evidence_of, tell
 from workbench.identification.input_output.spectral_lines import Lines
 from workbench.identification.signal.standard_errors import StandardErrors
-from workbench.identification.signal.synthesis import TIME_DERIVATIVE, time_derivatives
+from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel
+from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
 
 # Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
@@ -252,7 +253,7 @@ def _together(found: Sequence[TransferModes], channels) -> TransferModes:
 
 def _residual_powers(channels) -> list[int]:
     """Of s, with what modes above and below the band leave in it."""
-    told = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in TIME_DERIVATIVE}
+    told = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in MEASURED}
     above = told or {0, 2}
     return sorted({int(power) for k in above for power in (k, k - 2)})
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from workbench.structure.modes import modal_state_matrix
+
 
 @dataclass(frozen=True, eq=False)
 class ModalPoles:
@@ -37,8 +39,7 @@ def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
         poles = -0.5 * diagonal + 1j * np.sqrt(omega**2 - 0.25 * diagonal**2)
         return ModalPoles(poles, np.diag(1.0 / (2j * poles.imag)), 2.0 * np.eye(omega.size), uncoupled=True)
     n = omega.size
-    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), -damping]])
-    values, vectors = np.linalg.eig(a)
+    values, vectors = np.linalg.eig(modal_state_matrix(omega**2, damping))
     inverse = np.linalg.inv(vectors)
     keep = values.imag >= 0
     twice = np.where(values.imag > 0, 2.0, 1.0)

@@ -54,8 +54,7 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     n = modes.n_modes
     b = input_matrix(modes, actuators)
     shapes = output_matrix(modes, sensors)
-    stiffness = np.diag(modes.omega**2)
-    a = np.block([[np.zeros((n, n)), np.eye(n)], [-stiffness, -modes.damping]])
+    a = modes.state_matrix
     bb = np.vstack([np.zeros_like(b), b])
     c = np.zeros((len(sensors), 2 * n))
     d = np.zeros((len(sensors), len(actuators)))
@@ -64,7 +63,7 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
         if order < 2:
             c[j, order * n : (order + 1) * n] = shapes[j]
         else:
-            c[j] = np.r_[-shapes[j] @ stiffness, -shapes[j] @ modes.damping]
+            c[j] = shapes[j] @ a[n:]
             d[j] = shapes[j] @ b
     states = [f"q{r + 1}" for r in range(n)] + [f"dq{r + 1}" for r in range(n)]
     a, bb, c, d, states = _with_actuator_lags(a, bb, c, d, states, actuators)

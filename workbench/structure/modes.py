@@ -24,6 +24,17 @@ def frozen(array: ArrayLike, dtype=float) -> np.ndarray:
     return copy
 
 
+def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
+    """A = [0 I; -S -C] of q'' + C q' + S q = f, states (q_1..q_n, q_1'..q_n'): (2 n_modes, 2 n_modes), rad/s.
+
+    Args:
+        stiffness: S, (n_modes,) the diagonal ω_r², or (n_modes, n_modes), 1/s².
+        damping: C, (n_modes,) the diagonal, or (n_modes, n_modes), 1/s.
+    """
+    s, c = (np.diag(m) if np.ndim(m) == 1 else np.asarray(m) for m in (stiffness, damping))
+    return np.block([[np.zeros(s.shape), np.eye(len(s))], [-s, -c]])
+
+
 @dataclass(frozen=True, eq=False)
 class Modes:
     """Mass-normalised modes, known all over their domain: ∫ m φ_r φ_s dx = δ_rs (2.5).
@@ -75,6 +86,11 @@ class Modes:
     @property
     def n_modes(self) -> int:
         return self.omega.size
+
+    @property
+    def state_matrix(self) -> np.ndarray:
+        """A = [0 I; -Ω² -C], states (q, q'): (2 n_modes, 2 n_modes), rad/s."""
+        return modal_state_matrix(self.omega**2, self.damping)
 
     @property
     def zeta(self) -> np.ndarray:

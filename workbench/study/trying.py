@@ -9,11 +9,11 @@ import numpy as np
 from scipy.integrate import simpson
 
 from workbench.cases.case import read_rig
-from workbench.design.estimation.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
+from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
 from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig

@@ -4,10 +4,10 @@ import control
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc_poles
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ViscousDamping
 from workbench.structure.member import Beam

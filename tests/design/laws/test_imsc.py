@@ -4,10 +4,10 @@ import control
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam

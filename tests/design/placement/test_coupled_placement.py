@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.coupled_placement import place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled
 from workbench.design.placement.coupled_spillover import coupled_batch, coupled_figures

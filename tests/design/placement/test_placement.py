@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.certificate import _Bounds, certify
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.peak import largest

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.spillover.comparison import compare
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam

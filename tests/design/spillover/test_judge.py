@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 from scipy.integrate import simpson
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state
-from workbench.design.estimation.controller import close_with, filtered
+from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
+from workbench.design.laws.on_off import on_off
+from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state
 from workbench.design.spillover.judge import judge, judge_on_off
-from workbench.design.spillover.on_off import on_off
 from workbench.design.spillover.spillover import effort, quadratic_cost
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 
-from workbench.design.estimation.closed_loop import impulse_state
 from workbench.design.laws.law import DesignError
-from workbench.design.laws.switching import Relay, switch, travel
-from workbench.design.spillover.on_off import on_off, on_off_work, respond_on_off
+from workbench.design.laws.on_off import Relay, on_off
+from workbench.design.loop.closed_loop import impulse_state
+from workbench.design.loop.on_off_response import respond_on_off
+from workbench.design.loop.switching import switch, travel
+from workbench.design.spillover.spillover import on_off_work
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam

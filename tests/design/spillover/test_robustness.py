@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import hermite_filter
-from workbench.design.estimation.reidentify import open_loop, updated
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
+from workbench.design.loop.closed_loop import close_loop, impulse_state
+from workbench.design.loop.reidentify import open_loop, updated
 from workbench.design.spillover.robustness import draw_modes, survival_of, survive, wrong_by
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping

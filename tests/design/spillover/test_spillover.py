@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad_vec
 
-from workbench.design.estimation.closed_loop import close_loop, impulse_state, respond
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.spillover.spillover import effort, energy_gained, finite_spillover, quadratic_cost, spillover
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping

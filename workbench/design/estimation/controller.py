@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import ClosedLoop, close_loop
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.statespace import input_matrix, output_matrix
+from workbench.rig.statespace import output_matrix
 from workbench.structure.modes import Modes, frozen
 
 
@@ -84,19 +83,3 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     direct = np.hstack(columns)
     empty = np.zeros((0, 0)), np.zeros((0, direct.shape[1])), np.zeros((m, 0))
     return Controller(law, tuple(sensors), *empty, direct, f"{law.name} through a modal filter")
-
-
-def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
-    """The loop of all modes, controlled and residual, states (q, q', z); a law alone reads exact modal coordinates."""
-    if isinstance(controller, Law):
-        return close_loop(modes, controller)
-    n = modes.n_modes
-    b = input_matrix(modes, controller.law.actuators)
-    force = np.vstack([np.zeros_like(b), b])
-    r = reading(modes, controller.sensors)
-    plant = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]])
-    feedback = np.hstack([controller.direct @ r, controller.commands])
-    matrix = np.block(
-        [[plant + force @ controller.direct @ r, force @ controller.commands], [controller.reads @ r, controller.state]]
-    )
-    return ClosedLoop(modes, controller.law, matrix, feedback)

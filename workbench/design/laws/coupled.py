@@ -10,17 +10,16 @@ from workbench.design.laws.law import DesignError, Law, controlled_indices, move
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
-from workbench.structure.modes import Modes
+from workbench.structure.modes import Modes, modal_state_matrix
 
 
-def controlled_plant(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]):
+def controlled_plant(
+    modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]
+) -> tuple[np.ndarray, np.ndarray]:
     """A (2n, 2n) and B (2n, n_actuators) of the controlled modes alone."""
     index = list(controlled)
-    n = len(index)
     b = input_matrix(modes, actuators)[index]
-    a = np.block(
-        [[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega[index] ** 2), -modes.damping[np.ix_(index, index)]]]
-    )
+    a = modal_state_matrix(modes.omega[index] ** 2, modes.damping[np.ix_(index, index)])
     return a, np.vstack([np.zeros_like(b), b])
 
 

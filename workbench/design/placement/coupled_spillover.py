@@ -10,7 +10,7 @@ from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lya
 
 from workbench.design.placement.peak import largest
 from workbench.design.placement.task import Placement
-from workbench.structure.modes import Modes
+from workbench.structure.modes import Modes, modal_state_matrix
 
 ON_THE_AXIS = 1e-7
 
@@ -30,7 +30,7 @@ def coupled_figures(
     n, m = n_controlled, positions.size
     shapes = modes.phi(positions).T
     omega = modes.omega[:n]
-    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), np.zeros((n, n))]])
+    a = modal_state_matrix(omega**2, np.zeros(n))
     b = np.vstack([np.zeros((n, m)), shapes[:n]])
     start = np.r_[np.zeros(n), impulse * modes.phi(impulse_at)[0, :n]]
     try:
@@ -72,7 +72,7 @@ def coupled_batch(
     n, count = n_controlled, len(positions)
     shapes = modes.phi(positions.ravel()).reshape(*positions.shape, modes.n_modes)
     omega = modes.omega[:n]
-    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2), np.zeros((n, n))]])
+    a = modal_state_matrix(omega**2, np.zeros(n))
     b = np.zeros((count, 2 * n, positions.shape[1]))
     b[:, n:] = shapes[:, :, :n].transpose(0, 2, 1)
     hamiltonian = np.zeros((count, 4 * n, 4 * n))

@@ -13,7 +13,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from workbench.design.laws.imsc import riccati_gains
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.peak import largest
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, frozen, modal_state_matrix
 
 SINGULAR_SHARE = 1e-14
 SHOWN_INSTANTS = 240
@@ -161,7 +161,7 @@ def placement_task(
     rates = impulse * modes.phi(places)[:, :n] * np.sqrt(shares)[:, None]
     s = 1j * modes.omega[n:, None]
     unit = -(g1 + g2 * s) / (s**2 + g2 * s + omega**2 + g1)
-    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(omega**2 + g1), -np.diag(g2)]])
+    a = modal_state_matrix(omega**2 + g1, g2)
     gains = np.hstack([np.diag(g1), np.diag(g2)])
     slowest = -np.linalg.eigvals(a).real.max()
     if np.isfinite(final_time):

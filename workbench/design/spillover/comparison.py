@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import close_loop, respond
 from workbench.design.estimation.controller import Controller, filtered
 from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import luenberger
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.design.loop.closed_loop import close_loop, respond
 from workbench.design.spillover.explain import Explanation, explain
 from workbench.design.spillover.spillover import Spillover, effort, finite_spillover, quadratic_cost
 from workbench.rig.actuators import Actuator

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from workbench.design.estimation.closed_loop import ClosedLoop
-from workbench.design.estimation.controller import Controller, close_with, reading
+from workbench.design.estimation.controller import Controller, reading
+from workbench.design.loop.closed_loop import ClosedLoop, close_with
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
@@ -93,12 +93,7 @@ class Explanation:
     @property
     def margin(self) -> float:
         """Distance of the rightmost pole from the axis, 1/s; negative where the loop is unstable."""
-        return stability_margin(self.loop)
-
-
-def stability_margin(loop: ClosedLoop) -> float:
-    """-max Re of the poles, 1/s."""
-    return float(-loop.poles.real.max())
+        return self.loop.margin
 
 
 def explain(modes: Modes, controller: Controller) -> Explanation:
@@ -122,7 +117,7 @@ def explain(modes: Modes, controller: Controller) -> Explanation:
             moved.append(Moved(residual[i], at[i].pole, closed, at[i].paths(closed)))
     moved.sort(key=lambda m: -m.closed_pole.real)
     alone = close_with(modes.select(controller.law.controlled), controller)
-    return Explanation(loop, tuple(moved), stability_margin(alone), _behind(modes, controller, loop, moved))
+    return Explanation(loop, tuple(moved), alone.margin, _behind(modes, controller, loop, moved))
 
 
 def _behind(modes: Modes, controller: Controller, loop: ClosedLoop, moved: list[Moved]) -> Moved | None:
@@ -133,9 +128,7 @@ def _behind(modes: Modes, controller: Controller, loop: ClosedLoop, moved: list[
         return moved[0]
 
     def margin_without(one: Moved) -> float:
-        return stability_margin(
-            close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller)
-        )
+        return close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller).margin
 
     suspects = sorted(moved, key=lambda m: -abs(m.shift))[:SUSPECTS]
     margins = [margin_without(one) for one in suspects]

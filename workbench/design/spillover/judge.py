@@ -4,10 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.design.estimation.closed_loop import ClosedLoop
 from workbench.design.laws.law import DesignError
-from workbench.design.spillover.on_off import OnOffLaw, on_off_work, respond_on_off
-from workbench.design.spillover.spillover import second_moments
+from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.closed_loop import ClosedLoop
+from workbench.design.loop.on_off_response import respond_on_off
+from workbench.design.spillover.spillover import on_off_work, second_moments
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
@@ -42,7 +43,7 @@ def judge(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: flo
     """
     _check(weight, final_time)
     modes, n = loop.modes, loop.modes.n_modes
-    margin = float(-loop.poles.real.max())
+    margin = loop.margin
     if not loop.stable:
         return Judged(np.inf, np.inf, np.inf, margin)
     state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]

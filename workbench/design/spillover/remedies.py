@@ -9,9 +9,9 @@ from functools import partial
 
 import numpy as np
 
-from workbench.design.estimation.controller import Controller, close_with
+from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError
-from workbench.design.spillover.explain import stability_margin
+from workbench.design.loop.closed_loop import close_with
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes
 
@@ -74,11 +74,11 @@ def remedies(
             loop = close_with(modes, redesign(setting.actuators, setting.sensors, setting.share))
         except (DesignError, ValueError):
             return -np.inf
-        return stability_margin(loop) - margin
+        return loop.margin - margin
 
     def remedy(kind: str, change: str, size: float, setting: _Setting) -> Remedy:
         controller = redesign(setting.actuators, setting.sensors, setting.share)
-        return Remedy(kind, change, size, stability_margin(close_with(modes, controller)), controller)
+        return Remedy(kind, change, size, close_with(modes, controller).margin, controller)
 
     def moved(move: Callable[[float], _Setting], way: float, distance: float) -> float:
         return met(move(way * distance))
@@ -124,7 +124,7 @@ def sensors_that_suffice(
     for k in range(1, most + 1):
         places = modes.length * np.arange(1, k + 1) / (k + 1)
         try:
-            margins[k - 1] = stability_margin(close_with(modes, redesign(tuple(actuators), tuple(places), 1.0)))
+            margins[k - 1] = close_with(modes, redesign(tuple(actuators), tuple(places), 1.0)).margin
         except (DesignError, ValueError):
             continue
         if k > lasting and (margins[k - 1 - lasting : k] > margin).all():

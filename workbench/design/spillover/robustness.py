@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.design.estimation.controller import Controller, close_with
+from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
-from workbench.design.spillover.explain import stability_margin
+from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.structure.modes import Modes, frozen
 
@@ -147,7 +147,7 @@ def survive(
         margins, work = np.empty(len(possible)), np.full(len(possible), np.nan)
         for i, modes in enumerate(possible):
             loop = close_with(modes, controller)
-            margins[i] = stability_margin(loop)
+            margins[i] = loop.margin
             if margins[i] > 0:
                 work[i] = finite_spillover(loop, state, final_time).residual_total
         found[name] = Survival(margins, work)

@@ -14,12 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 
-from workbench.design.estimation.closed_loop import ClosedLoop
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
+from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.closed_loop import ClosedLoop
+from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, frozen
+
+GAUSS_POINTS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +133,22 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
     force_rows = input_matrix(loop.modes, loop.law.actuators) @ loop.feedback
     work = np.array([force_rows[r] @ moments[:, n + r] for r in range(n)])
     return Spillover(work, loop.law.controlled, final_time)
+
+
+def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: float) -> Spillover:
+    """Work of the actuators in every mode up to a finite time, ∫ f_r q_r' dt, piece by piece between switchings."""
+    stretches = switchings(modes, law, state, final_time)
+    events = np.unique(np.r_[0.0, [s.end for mode in stretches for s in mode], final_time])
+    pieces = np.maximum(1, np.ceil(np.diff(events) * modes.omega.max())).astype(int)
+    edges = np.concatenate(
+        [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(events[:-1], events[1:], pieces)] + [[final_time]]
+    )
+    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
+    width = 0.5 * np.diff(edges)[:, None]
+    at = (edges[:-1, None] + width * (1 + points)).ravel()
+    response = motion(modes, law, state, at, stretches)
+    power = (input_matrix(modes, law.actuators) @ response.forces) * response.modal[modes.n_modes :]
+    return Spillover(power @ (width * weights).ravel(), law.controlled, final_time)
 
 
 def second_moments(a: np.ndarray, state: np.ndarray, final_time: float) -> np.ndarray:

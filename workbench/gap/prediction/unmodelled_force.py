@@ -39,11 +39,9 @@ class SampledModel:
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
     """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,)."""
     n = modes.n_modes
-    stiffness = np.diag(modes.omega**2)
+    own = modes.state_matrix
     a = np.zeros((3 * n, 3 * n))
-    a[:n, n : 2 * n] = np.eye(n)
-    a[n : 2 * n, :n] = -stiffness
-    a[n : 2 * n, n : 2 * n] = -modes.damping
+    a[: 2 * n, : 2 * n] = own
     a[n : 2 * n, 2 * n :] = np.eye(n)
     step = expm(a * sample_time)
     output = np.zeros((len(sensors), 2 * n))
@@ -54,7 +52,7 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
         if order < 2:
             output[j, order * n : (order + 1) * n] = shape
         else:
-            output[j] = np.r_[-shape @ stiffness, -shape @ modes.damping]
+            output[j] = shape @ own[n:]
             feedthrough[j] = shape
     return SampledModel(step[: 2 * n, : 2 * n], step[: 2 * n, 2 * n :], output, feedthrough, noise**2)
 
@@ -117,9 +115,7 @@ def wandering_force_filter(
     n = modes.n_modes
     size = 2 * n + 1
     a = np.zeros((size, size))
-    a[:n, n : 2 * n] = np.eye(n)
-    a[n : 2 * n, :n] = -np.diag(modes.omega**2)
-    a[n : 2 * n, n : 2 * n] = -modes.damping
+    a[: 2 * n, : 2 * n] = modes.state_matrix
     a[n : 2 * n, -1] = shape
     a[-1, -1] = -1.0 / correlation_time
     # displacements as velocities, so that the matrix is no larger than the highest frequency

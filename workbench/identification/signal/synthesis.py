@@ -5,14 +5,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from workbench.records.record import Channel, Record
+from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import Modes, SampledModes
-
-TIME_DERIVATIVE = {"displacement": 0, "slope": 0, "velocity": 1, "angular velocity": 1, "acceleration": 2}
 
 
 def time_derivatives(channels: Sequence[Channel]) -> np.ndarray:
     """Order of the time derivative each channel measures, (n_channels,); 0 where its quantity is not a motion."""
-    return np.array([TIME_DERIVATIVE.get(channel.quantity, 0) for channel in channels])
+    return np.array([MEASURED.get(channel.quantity, (0, 0))[1] for channel in channels])
 
 
 def struck(modes: Modes, *, at: float, positions: Sequence[float], impulse: float = 1.0) -> SampledModes:
@@ -73,10 +72,10 @@ def free_decay(
             f"mode {beyond[0] + 1} at {modes.frequencies_hz[beyond[0]]:g} Hz lies beyond half the sample rate,"
             f" {half_rate:g} Hz; sample faster, leave it out, or ask for aliases"
         )
-    if quantity not in TIME_DERIVATIVE:
-        raise ValueError(f"a free decay is of {', '.join(TIME_DERIVATIVE)}; got {quantity!r}")
+    if quantity not in MEASURED:
+        raise ValueError(f"a free decay is of {', '.join(MEASURED)}; got {quantity!r}")
     time = start_time + sample_time * np.arange(n_samples)
-    amplitudes = modes.shapes * modes.poles ** TIME_DERIVATIVE[quantity]
+    amplitudes = modes.shapes * modes.poles ** MEASURED[quantity][1]
     outputs = (amplitudes @ np.exp(modes.poles[:, None] * time)).real
     if noise_std:
         outputs = outputs + noise_std * np.random.default_rng(seed).standard_normal(outputs.shape)

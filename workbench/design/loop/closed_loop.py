@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import expm
 
+from workbench.design.estimation.controller import Controller, reading
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
 from workbench.rig.statespace import input_matrix
@@ -38,6 +39,11 @@ class ClosedLoop:
     def poles(self) -> np.ndarray:
         """Closed-loop poles (n_states,), rad/s."""
         return frozen(np.linalg.eigvals(self.matrix), complex)
+
+    @property
+    def margin(self) -> float:
+        """Stability margin, -max Re of the poles, 1/s; negative where the loop is unstable."""
+        return float(-self.poles.real.max())
 
     @property
     def stable(self) -> bool:
@@ -103,8 +109,20 @@ def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> Cl
     estimate = np.kron(np.eye(2), seen)
     feedback = -law.gain @ estimate
     b = input_matrix(modes, law.actuators)
-    open_loop = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]])
-    return ClosedLoop(modes, law, open_loop + np.vstack([np.zeros_like(b), b]) @ feedback, feedback)
+    return ClosedLoop(modes, law, modes.state_matrix + np.vstack([np.zeros_like(b), b]) @ feedback, feedback)
+
+
+def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
+    """The loop of all modes, controlled and residual, states (q, q', z); a law alone reads exact modal coordinates."""
+    if isinstance(controller, Law):
+        return close_loop(modes, controller)
+    b = input_matrix(modes, controller.law.actuators)
+    force = np.vstack([np.zeros_like(b), b])
+    r = reading(modes, controller.sensors)
+    feedback = np.hstack([controller.direct @ r, controller.commands])
+    plant = modes.state_matrix + force @ controller.direct @ r
+    matrix = np.block([[plant, force @ controller.commands], [controller.reads @ r, controller.state]])
+    return ClosedLoop(modes, controller.law, matrix, feedback)
 
 
 def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> np.ndarray:

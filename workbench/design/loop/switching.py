@@ -13,28 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
+from workbench.design.laws.on_off import Relay
+
 # of the largest |s| in reach: an extremum of s that comes no further past an edge than this touches and turns back
 TOUCH = 1e-13
 MOST_EVENTS = 1_000_000
-
-
-@dataclass(frozen=True)
-class Relay:
-    """An on-off force on one mode.
-
-    Attributes:
-        omega: ω of the mode, rad/s.
-        damping: c = 2 ζ ω, 1/s.
-        force: k > 0, modal.
-        dead_band: d >= 0, of s.
-        slope: λ >= 0 of s = q' + λ q, 1/s; 0 switches on the rate alone.
-    """
-
-    omega: float
-    damping: float
-    force: float
-    dead_band: float
-    slope: float = 0.0
 
 
 @dataclass(frozen=True)

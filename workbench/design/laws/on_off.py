@@ -1,0 +1,101 @@
+"""Modal on-off control: each controlled mode has a relay with a dead band, the actuators share the modal forces.
+
+Meirovitch, VanLandingham & Öz (1977), reference [77] of the dissertation: f_r = -k_r sgn(s_r) outside a dead band of
+s_r = q_r' + λ_r q_r, and F = B⁺ f on the actuators.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.design.laws.law import DesignError, controlled_indices, participation
+from workbench.rig.actuators import Actuator
+from workbench.structure.modes import Modes, frozen
+
+
+@dataclass(frozen=True)
+class Relay:
+    """An on-off force on one mode.
+
+    Attributes:
+        omega: ω of the mode, rad/s.
+        damping: c = 2 ζ ω, 1/s.
+        force: k > 0, modal.
+        dead_band: d >= 0, of s.
+        slope: λ >= 0 of s = q' + λ q, 1/s; 0 switches on the rate alone.
+    """
+
+    omega: float
+    damping: float
+    force: float
+    dead_band: float
+    slope: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class OnOffLaw:
+    """A relay on every controlled mode.
+
+    Attributes:
+        relays: one a controlled mode.
+        spread: (n_actuators, n_controlled) B⁺, from modal forces to actuator forces.
+        controlled: (n_controlled,) zero-based indices.
+        actuators: that the law drives.
+        name: for tables and plots.
+    """
+
+    relays: tuple[Relay, ...]
+    spread: np.ndarray
+    controlled: tuple[int, ...]
+    actuators: tuple[Actuator, ...]
+    name: str = "on-off"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "spread", frozen(self.spread))
+
+
+def on_off(
+    modes: Modes,
+    controlled: int | Sequence[int],
+    actuators: Sequence[Actuator],
+    *,
+    force: ArrayLike,
+    dead_band: ArrayLike,
+    slope: ArrayLike = 0.0,
+) -> OnOffLaw:
+    """Modal on-off control with a dead band.
+
+    Args:
+        modes, controlled, actuators: as for `imsc`.
+        force: k, modal force, scalar or (n_controlled,), positive.
+        dead_band: d of s = q' + λ q, likewise, not negative. Undamped modes are left with at most ½ d² of energy
+            where λ = 0.
+        slope: λ, 1/s, likewise, not negative.
+
+    Raises:
+        DesignError: damping that couples the modes, or figures out of range.
+    """
+    index = controlled_indices(modes, controlled)
+    if not modes.proportional:
+        raise DesignError(
+            "damping couples the modes, so they cannot be switched one by one; neglect its coupling terms"
+        )
+    n = len(index)
+    values = []
+    for name, value, least in (
+        ("force", force, "positive"),
+        ("dead_band", dead_band, "0 or more"),
+        ("slope", slope, "0 or more"),
+    ):
+        value = np.broadcast_to(np.asarray(value, float), n)
+        if not np.isfinite(value).all() or (value < 0).any() or (least == "positive" and not value.all()):
+            raise DesignError(f"on-off {name} must be {least}; got {value.min():g}")
+        values.append(value)
+    c = np.diag(modes.damping)
+    relays = tuple(
+        Relay(float(modes.omega[r]), float(c[r]), float(k), float(d), float(s))
+        for r, k, d, s in zip(index, *values, strict=True)
+    )
+    return OnOffLaw(relays, np.linalg.pinv(participation(modes, index, actuators)), index, tuple(actuators))
