@@ -27,8 +27,10 @@ bench: $(BIN)/workbench  ## speeds, as ratios, in a quarter of an hour; the benc
 	$(BIN)/workbench study many_cases
 	$(BIN)/workbench study diagnosis_speed
 
-docs: $(BIN)/workbench  ## README.md and a page a room, workbench/*/README.md: every example, number and name in them checked
-	$(BIN)/python -m pytest -q tests/test_readme.py
+docs: $(BIN)/workbench  ## the site, out/docs/index.html; a broken link or reference is an error
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs out/docs
+	@echo "open out/docs/index.html"
 
 lint: $(BIN)/workbench  ## style and types
 	$(BIN)/ruff check workbench studies tests

@@ -127,10 +127,14 @@ def test_every_result_is_what_its_study_wrote():
 
 def test_every_room_has_a_page_that_the_readme_shows():
     rooms = [path.parent.name for path in (ROOT / "workbench").glob("*/__init__.py")]
-    assert sorted(re.findall(r"\(workbench/(\w+)/README.md\)", README)) == sorted(rooms)
-    for room in rooms:
-        text = (ROOT / "workbench" / room / "README.md").read_text(encoding="utf-8")
-        named = re.findall(r"`([a-z_/]+\.py)`", text)
-        assert named and all((ROOT / "workbench" / room / name).is_file() for name in named), room
-        for function in re.findall(r"`wb\.(\w+)", text):
-            assert function in workbench.__all__, (room, function)
+    pages = dict(re.findall(r"^\| \[`(\w+)`\]\((docs/\S+\.md)\)", README, re.M))
+    assert sorted(pages) == sorted(rooms)
+    for room, page in pages.items():
+        folder, text = ROOT / "workbench" / room, (ROOT / page).read_text(encoding="utf-8")
+        pointer = (folder / "README.md").read_text(encoding="utf-8")
+        assert f"({'../../' + page})" in pointer and len(pointer.splitlines()) <= 12, room
+        for shown in (text, pointer):
+            named = re.findall(r"`([a-z_/]+\.py)`", shown)
+            assert named and all((folder / name).is_file() for name in named), (room, named)
+            for name in re.findall(r"`wb\.(\w+)", shown):
+                assert name in workbench.__all__, (room, name)
