@@ -1,6 +1,7 @@
 """`workbench diagnose`: where simulation and test disagree, and why."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -19,6 +20,12 @@ def diagnose(
     free_nominal: Annotated[
         bool, typer.Option("--free-nominal", help="Re-estimate the nominal frequencies and damping with every effect.")
     ] = False,
+    mend: Annotated[
+        bool, typer.Option("--mend", help="Mend faults of wiring and units that are found, and go on.")
+    ] = False,
+    as_wired: Annotated[
+        bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without mending them.")
+    ] = False,
     workers: Annotated[int | None, typer.Option(help="Processes that share the work; one a core unless given.")] = None,
 ) -> None:
     """Locate the gap between a simulation and a test, name the missing effect, and measure how far the gap closes.
@@ -28,11 +35,21 @@ def diagnose(
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
     from workbench.gap.effects.structural import known_places
+    from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.study.verdict_page import verdict_page
     from workbench.study.whole_file import check_target, write_whole
 
     check_target(json_path)
     found = read_case(case)
+    check_kept_apart(found.fit, found.validation)
+    faults = wiring(found.rig, found.fit)
+    for fault in faults:
+        say(f"  {'mended' if mend else 'wiring'}     {fault.sentence}")
+    if faults and not (mend or as_wired):
+        raise ValueError("diagnose again with --mend to go on with this mended, or with --as-wired to go on as it is")
+    if mend:
+        rig, fit = mended(faults, found.rig, found.fit)
+        found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
     with progress_bar() as progress:
         verdict = run(
             found.rig,

@@ -14,6 +14,7 @@ from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.shrinkage import Shrinkage, measure
 from workbench.gap.report.verdict import Verdict
+from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, opened
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -51,8 +52,8 @@ def diagnose(
         free_nominal: fit the nominal frequencies, damping and modal mass along with every candidate from the first.
 
     Raises:
-        ValueError: records that do not fit the rig or cannot be of it, modes that are not those of its structure, or
-            sensors without noise_std.
+        ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
+            fitted, modes that are not those of the structure, or sensors without noise_std.
     """
     for record in (*records, *validation):
         _check(rig, record)
@@ -60,6 +61,8 @@ def diagnose(
         raise ValueError("a diagnosis needs at least one record to fit; got none")
     check_modes(rig)
     check_records(rig, records, settle=settle)
+    check_kept_apart(records, validation)
+    faults = () if settle else wiring(rig, records)
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     # the threads of the search and those of the linear algebra would wait for one another
     with threadpool_limits(1, user_api="blas"):
@@ -89,7 +92,7 @@ def diagnose(
                 attribution=attribution,
                 readiness=ready(),
                 experiment=_next(rig, attribution, sharing),
-                notes=_notes(attribution, outcome),
+                notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome)),
             )
 
 

@@ -1,0 +1,170 @@
+"""Faults of wiring and units, put into cases that another numerical route simulated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.report.wiring import WiringFault, check_kept_apart, mended, wiring
+from workbench.structure.damping import ModalDamping
+from workbench.trials.make import make_trial
+
+SEED = 4  # three actuators and a hammer, accelerometers and a velocity sensor
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Nothing is hidden in it."""
+    return make_trial(SEED)[0]
+
+
+def change(records, *, outputs=None, inputs=None, sample_time=1.0):
+    """The records with their signals multiplied by matrices, and their sample time by a number."""
+    return [
+        replace(
+            r,
+            outputs=r.outputs if outputs is None else outputs @ r.outputs,
+            inputs=r.inputs if inputs is None else inputs @ r.inputs,
+            sample_time=sample_time * r.sample_time,
+        )
+        for r in records
+    ]
+
+
+def diagonal(n, at, value):
+    matrix = np.eye(n)
+    matrix[at, at] = value
+    return matrix
+
+
+def exchanged(n, i, j):
+    matrix = np.eye(n)
+    matrix[[i, j]] = matrix[[j, i]]
+    return matrix
+
+
+def expect(case, records, sentence, rig=None):
+    """One fault, with that sentence, whose mend leaves none."""
+    rig = case.rig if rig is None else rig
+    faults = wiring(rig, records)
+    assert [fault.sentence for fault in faults] == [sentence]
+    assert wiring(*mended(faults, rig, records)) == ()
+    return faults[0]
+
+
+def test_nothing_is_wrong_with_a_case_wired_rightly(case):
+    assert wiring(case.rig, case.fit) == ()
+
+
+def test_exchanged_inputs_are_named_and_mended_to_the_last_bit(case):
+    records = change(case.fit, inputs=exchanged(4, 0, 2))
+    fault = expect(case, records, "The inputs F1 and F3 are exchanged: swap them in case.toml.")
+    _, again = fault.mend(case.rig, records)
+    assert all(np.array_equal(a.inputs, b.inputs) for a, b in zip(again, case.fit, strict=True))
+
+
+def test_exchanged_outputs_are_named(case):
+    expect(
+        case,
+        change(case.fit, outputs=exchanged(7, 1, 4)),
+        "The outputs a2 and a5 are exchanged: swap them in case.toml.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("factor", "sentence"),
+    [
+        (-1.0, "The output a3 has the sign turned: multiply by -1."),
+        (1 / 9.80665, "The output a3 looks like g where m/s² is meant: multiply by 9.80665."),
+        (1e3, "The output a3 is 1000 times too large, such as mm for m: multiply by 0.001."),
+        (2 * np.pi, "The output a3 is 2π times too large: multiply by 0.159155."),
+        (0.01, "The output a3 is 100 times too small: multiply by 100."),
+    ],
+)
+def test_an_output_in_another_unit_is_named(case, factor, sentence):
+    expect(case, change(case.fit, outputs=diagonal(7, 2, factor)), sentence)
+
+
+def test_two_outputs_with_turned_signs_are_named_together(case):
+    matrix = diagonal(7, 0, -1.0) @ diagonal(7, 3, -1.0)
+    expect(case, change(case.fit, outputs=matrix), "The outputs a1 and a4 have the sign turned: multiply by -1.")
+
+
+def test_all_outputs_in_another_unit_may_as_well_be_the_inputs(case):
+    words = "All outputs are 1000 times too small, such as km for m, or all inputs are 1000 times too large, such as mN"
+    expect(case, change(case.fit, inputs=1e3 * np.eye(4)), f"{words} for N: multiply by 1000 (the outputs).")
+
+
+def test_a_hammer_in_millinewton_and_an_input_with_its_sign_turned_are_named(case):
+    hammer = "The input hammer is 1000 times too large, such as mN for N: multiply by 0.001."
+    expect(case, change(case.fit, inputs=diagonal(4, 3, 1e3)), hammer)
+    expect(case, change(case.fit, inputs=diagonal(4, 1, -1.0)), "The input F2 has the sign turned: multiply by -1.")
+
+
+def test_a_mislabelled_quantity_is_named(case):
+    sensors = (replace(case.rig.sensors[0], quantity="velocity"), *case.rig.sensors[1:])
+    sentence = 'The output a1 is acceleration, not velocity: write quantity = "acceleration" in case.toml.'
+    expect(case, case.fit, sentence, rig=replace(case.rig, sensors=sensors))
+
+
+def test_a_sampling_rate_off_by_two_is_named_of_all_records_or_of_one(case):
+    dt = case.fit[0].sample_time
+    told = f"write sample_time = {dt:.6g} s."
+    expect(case, change(case.fit, sample_time=2.0), f"All records are sampled at twice the stated rate: {told}")
+    one = [*change(case.fit[:1], sample_time=0.5), *case.fit[1:]]
+    expect(case, one, f"The record {case.fit[0].name} is sampled at half the stated rate: {told}")
+
+
+def test_damping_in_per_cent_is_named(case):
+    rig = case.rig
+    zeta = float(rig.modes.zeta[0])
+    structure = replace(rig.structure, damping=ModalDamping(100.0 * zeta))
+    rig = replace(rig, structure=structure, modes=replace(rig.modes, damping=100.0 * rig.modes.damping))
+    words = "The damping looks like per cent where a ratio is meant: divide it by 100"
+    fault = expect(case, case.fit, f"{words} (the largest would be {zeta:.4g}, not {100 * zeta:.4g}).", rig=rig)
+    assert fault.mend(rig, case.fit)[0].structure.damping.zeta == pytest.approx(zeta)
+
+
+def test_the_same_data_under_two_names_are_named(case):
+    copied = np.eye(7)
+    copied[5] = copied[4]
+    found = expect(
+        case,
+        change(case.fit, outputs=copied),
+        "The outputs a5 and a6 hold the same samples, and the model agrees better with a5: measure a6 again, or leave"
+        " it out.",
+    )
+    rig, records = found.mend(case.rig, case.fit)
+    assert [s.name for s in rig.sensors] == list(records[0].output_names) == ["a1", "a2", "a3", "a4", "a5", "v1"]
+
+
+def test_one_record_twice_is_named_and_a_validation_record_that_repeats_one_is_refused(case):
+    twice = [*case.fit, replace(case.fit[1], name="again")]
+    first = case.fit[1].name
+    expect(case, twice, f"The records {first} and again hold the same samples: leave again out of case.toml.")
+    part = replace(case.fit[1], outputs=case.fit[1].outputs[:, :900], inputs=case.fit[1].inputs[:, :900], name="part")
+    with pytest.raises(ValueError, match=f"validation record 'part' repeats the fit record '{first}'"):
+        check_kept_apart(case.fit, [part])
+    with pytest.raises(ValueError, match="repeats the fit record"):
+        diagnose(case.rig, case.fit, validation=[part], workers=1)
+
+
+def test_faults_that_hide_one_another_are_found_one_after_the_other(case):
+    records = change(case.fit, inputs=exchanged(4, 0, 1), outputs=diagonal(7, 0, -1.0))
+    faults = wiring(case.rig, records)
+    assert {fault.kind for fault in faults} == {"exchanged inputs", "sign"}
+    assert wiring(*mended(faults, case.rig, records)) == ()
+
+
+@pytest.mark.parametrize(
+    "kinds", [("sensor_misplacement",), ("actuator_gain",), ("sensor_gain",), ("one_sided_stop",), ("modal_damping",)]
+)
+def test_an_effect_is_not_taken_for_a_fault_of_wiring(kinds):
+    case, _ = make_trial(21, kinds=kinds)
+    assert wiring(case.rig, case.fit) == ()
+
+
+def test_a_fault_says_how_much_it_closes(case):
+    [fault] = wiring(case.rig, change(case.fit, inputs=exchanged(4, 0, 2)))
+    assert isinstance(fault, WiringFault) and 0.99 < fault.closes <= 1.0

@@ -1,0 +1,512 @@
+"""Faults of wiring, of units and of bookkeeping, looked for before any effect.
+
+A fault is believed where its mend takes nearly all of the gap away on the channels that it concerns. Physics gone
+astray does not do that: no missing effect turns a sign, multiplies by 1000, or exchanges two channels.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped, simulate
+from workbench.structure.damping import ModalDamping
+
+Mend = Callable[[Rig, Sequence[Record]], tuple[Rig, tuple[Record, ...]]]
+
+WIDE_GAP = 0.3  # root mean square per standard deviation of a channel from which it may be wired wrongly: a turned sign
+# leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
+LEFT = 0.15  # share of a channel's measured power that may remain beyond the noise: a prediction of nothing leaves all
+CLOSED = 0.9  # share of the closable power that a mend must take away, on the channels that it concerns
+NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
+MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
+MOST_ROUNDS = 4  # faults that hide one another are found one after the other
+PER_CENT_FROM = 0.05  # damping ratio above which a structure is asked whether per cent was meant
+G, TURN = 9.80665, 2.0 * np.pi
+
+# measured / predicted: what an output does that reads so, and what an input does that is logged so as to give it
+FACTORS = {
+    -1.0: ("have the sign turned", "have the sign turned"),
+    1.0 / G: ("are 9.81 times too small", "are 9.81 times too large"),
+    G: ("are 9.81 times too large", "are 9.81 times too small, such as kgf for N"),
+    1e3: ("are 1000 times too large, such as mm for m", "are 1000 times too small, such as kN for N"),
+    1e-3: ("are 1000 times too small, such as km for m", "are 1000 times too large, such as mN for N"),
+    1e6: ("are a million times too large, such as μm for m", "are a million times too small"),
+    1e2: ("are 100 times too large, such as cm for m", "are 100 times too small"),
+    1e-2: ("are 100 times too small", "are 100 times too large, such as per cent"),
+    TURN: ("are 2π times too large", "are 2π times too small"),
+    1.0 / TURN: ("are 2π times too small, such as Hz for rad/s", "are 2π times too large"),
+}
+IN_G = "look like g where m/s² is meant"
+RATES = {2.0: "twice", 0.5: "half", 1e3: "1000 times", 1e-3: "a thousandth of"}
+QUANTITIES = ("displacement", "velocity", "acceleration")
+
+
+@dataclass(frozen=True, eq=False)
+class WiringFault:
+    """A fault of wiring, units or bookkeeping.
+
+    Attributes:
+        kind: "exchanged inputs", "exchanged outputs", "sign", "unit", "quantity", "sample rate", "damping",
+            "frequency", "copied channel" or "repeated record".
+        sentence: what is wrong, and the mend.
+        closes: share of the closable power of the gap that the mend takes away on the channels that it concerns; nan
+            where no prediction was needed to see the fault.
+        mend: (rig, records) -> (rig, records) without the fault.
+    """
+
+    kind: str
+    sentence: str
+    closes: float
+    mend: Mend
+
+
+def wiring(rig: Rig, records: Sequence[Record]) -> tuple[WiringFault, ...]:
+    """The faults of wiring and units that the records show against the nominal rig, in the order to mend them.
+
+    Args:
+        rig: nominal.
+        records: with the rig's inputs and outputs, in its order.
+    """
+    found = [*_repeated(records), *_copied(rig, records)]
+    rig, seen = mended(found, rig, records)
+    for _ in range(MOST_ROUNDS):
+        faults = _best(rig, seen)
+        if not faults:
+            break
+        for fault in faults:
+            found.append(fault)
+            rig, seen = fault.mend(rig, seen)
+    return tuple(found)
+
+
+def mended(faults: Iterable[WiringFault], rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+    """The rig and the records without the faults."""
+    kept = tuple(records)
+    for fault in faults:
+        rig, kept = fault.mend(rig, kept)
+    return rig, kept
+
+
+def check_kept_apart(records: Sequence[Record], validation: Sequence[Record]) -> None:
+    """Refuse validation records that repeat a record to be fitted.
+
+    Raises:
+        ValueError: naming both.
+    """
+    for kept in validation:
+        for record in records:
+            if _same(kept, record):
+                raise ValueError(
+                    f"validation record {kept.name!r} repeats the fit record {record.name!r}: nothing would be measured"
+                    " by it; keep another record for validation, or none"
+                )
+
+
+# --- seen without a model
+
+
+def _same(one: Record, other: Record) -> bool:
+    """Whether one record repeats the other, or its beginning."""
+    n = min(one.n_samples, other.n_samples)
+    if n < 2 or one.outputs.shape[0] != other.outputs.shape[0] or one.n_inputs != other.n_inputs:
+        return False
+    moves = bool(np.ptp(one.outputs[:, :n], axis=1).any())
+    return moves and all(
+        np.array_equal(getattr(one, part)[:, :n], getattr(other, part)[:, :n]) for part in ("outputs", "inputs")
+    )
+
+
+def _repeated(records: Sequence[Record]) -> list[WiringFault]:
+    faults, again = [], set()
+    for i, j in combinations(range(len(records)), 2):
+        if j not in again and i not in again and _same(records[i], records[j]):
+            again.add(j)
+            first, second = records[i].name, records[j].name
+            faults.append(
+                WiringFault(
+                    "repeated record",
+                    f"The records {first} and {second} hold the same samples: leave {second} out of case.toml.",
+                    np.nan,
+                    _without_record(second),
+                )
+            )
+    return faults
+
+
+def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
+    """Outputs with the same samples: noise differs from sensor to sensor, so one is a copy."""
+    faults, gone = [], set()
+    for i, j in combinations(range(len(rig.sensors)), 2):
+        one, other = rig.sensors[i], rig.sensors[j]
+        alike = (one.at, one.quantity) == (other.at, other.quantity) and not one.noise_std + other.noise_std
+        same = all(np.array_equal(r.outputs[i], r.outputs[j]) for r in records)
+        if not same or alike or {i, j} & gone or not any(np.ptp(r.outputs[i]) for r in records):
+            continue
+        errors = [np.zeros(2)]
+        for record in records:
+            predicted = _predict(rig, record)
+            errors.append(np.array([((record.outputs[k] - predicted[k]) ** 2).mean() for k in (i, j)]))
+        copy = j if sum(errors)[0] <= sum(errors)[1] else i
+        gone.add(copy)
+        kept = i + j - copy
+        faults.append(
+            WiringFault(
+                "copied channel",
+                f"The outputs {one.name} and {other.name} hold the same samples, and the model agrees better with"
+                f" {rig.sensors[kept].name}: measure {rig.sensors[copy].name} again, or leave it out.",
+                np.nan,
+                _without_output(rig.sensors[copy].name),
+            )
+        )
+    return faults
+
+
+# --- seen against the model
+
+
+@dataclass(frozen=True, eq=False)
+class _Gap:
+    """Measured beside predicted, by output; power is in units of the noise where that is larger than a thousandth."""
+
+    measured: list[np.ndarray]
+    noise: np.ndarray
+    scale: np.ndarray
+
+    @staticmethod
+    def of(rig: Rig, records: Sequence[Record]) -> "_Gap":
+        measured = [record.outputs for record in records]
+        power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
+        scale = np.where(power > 0, power, 1.0)
+        return _Gap(measured, np.array([s.noise_std for s in rig.sensors]) ** 2 / scale, scale)
+
+    def power(self, predicted: Sequence[np.ndarray]) -> np.ndarray:
+        """(n_outputs,) mean square of what is left, as a share of the mean square measured."""
+        count = sum(y.shape[1] for y in self.measured)
+        with np.errstate(over="ignore", invalid="ignore"):
+            left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
+        return np.nan_to_num(left / count / self.scale, nan=np.inf)
+
+    def closed(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed."""
+        left = np.maximum(after - self.noise, 0.0)
+        return np.where(left > LEFT, 0.0, 1.0 - left / np.maximum(before - self.noise, 1e-300))
+
+
+def _best(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
+    """The faults of the kind that closes most; none where no mend closes nearly all."""
+    gap = _Gap.of(rig, records)
+    predicted = [_predict(rig, record) for record in records]
+    before = gap.power(predicted)
+    wide = before > np.maximum(WIDE_GAP**2, 4.0 * gap.noise)
+    ways = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_inputs, _quantities, _rates, _structure)
+    # a record at a low level may be sampled wrongly and yet leave no wide gap over all records
+    found = [way(rig, records, gap, predicted, before, wide) for way in (ways if wide.any() else (_rates,))]
+    found = [faults for faults in found if faults]
+    return found[0] if len(found) == 1 else max(found, key=lambda faults: _overall(faults, rig, records), default=[])
+
+
+def _overall(faults: Sequence[WiringFault], rig: Rig, records: Sequence[Record]) -> float:
+    """Minus the share of the measured power that remains with the mends."""
+    rig, kept = mended(faults, rig, records)
+    gap = _Gap.of(rig, kept)
+    return -float(np.minimum(gap.power([_predict(rig, record) for record in kept]), 1.0).mean())
+
+
+def _scaled_outputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    """Outputs that read a known factor times what is predicted."""
+    over = sum((p**2).sum(axis=1) for p in predicted)
+    along = sum((y * p).sum(axis=1) for y, p in zip(gap.measured, predicted, strict=True))
+    gains = np.divide(along, over, out=np.ones_like(over), where=over > 0)
+    factors: dict[float, list[int]] = {}
+    for j in np.flatnonzero(wide):
+        factor = _factor(float(gains[j]))
+        if factor is not None:
+            closed = gap.closed(before, gap.power([factor * p for p in predicted]))[j]
+            if closed >= CLOSED:
+                factors.setdefault(factor, []).append(int(j))
+    faults = []
+    for factor, outputs in factors.items():
+        names = [rig.sensors[j].name for j in outputs]
+        closes = float(gap.closed(before, gap.power([factor * p for p in predicted]))[outputs].min())
+        every = len(outputs) == len(rig.sensors)
+        what, of_inputs = FACTORS[factor]
+        if factor == 1.0 / G and {rig.sensors[j].quantity for j in outputs} == {"acceleration"}:
+            what = IN_G
+        who = "All outputs" if every and len(names) > 1 else _named("output", names)
+        rest = f", or all inputs {of_inputs}" if every else ""
+        cure = "multiply by -1" if factor == -1.0 else f"multiply by {1.0 / factor:.6g}"
+        kind = "sign" if factor == -1.0 else "unit"
+        sentence = f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
+        faults.append(WiringFault(kind, sentence, closes, _outputs_times(dict.fromkeys(names, 1.0 / factor))))
+    return faults
+
+
+def _factor(gain: float) -> float | None:
+    """The factor of `FACTORS` that a gain is near to; None for any other."""
+    near = [factor for factor in FACTORS if gain * factor > 0 and abs(gain / factor - 1.0) < NEAR]
+    return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
+
+
+def _exchanged_outputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    for i, j in combinations(np.flatnonzero(wide), 2):
+        order = np.arange(len(rig.sensors))
+        order[[i, j]] = j, i
+        after = gap.power([p[order] for p in predicted])
+        closes = float(gap.closed(before, after)[[i, j]].min())
+        if closes >= CLOSED:
+            one, other = rig.sensors[i].name, rig.sensors[j].name
+            sentence = f"The outputs {one} and {other} are exchanged: swap them in case.toml."
+            return [WiringFault("exchanged outputs", sentence, closes, _outputs_swapped(one, other))]
+    return []
+
+
+def _exchanged_inputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    found: list[WiringFault] = []
+    n = len(rig.actuators)
+    for i, j in combinations(range(n), 2):
+        if n > MOST_CHANNELS and j != i + 1:
+            continue
+        one, other = rig.actuators[i].name, rig.actuators[j].name
+        mend = _inputs_swapped(one, other)
+        closes = _closes(gap, before, wide, *mend(rig, records))
+        if closes >= CLOSED:
+            sentence = f"The inputs {one} and {other} are exchanged: swap them in case.toml."
+            found.append(WiringFault("exchanged inputs", sentence, closes, mend))
+    return sorted(found, key=lambda fault: -fault.closes)[:1]
+
+
+def _scaled_inputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    """Inputs that a linear rig would need a known factor larger or smaller, by least squares on their responses."""
+    n = len(rig.actuators)
+    if n < 2 or n > MOST_CHANNELS or is_stepped(rig):
+        return []
+    weights = 1.0 / np.sqrt(gap.scale)[:, None]
+    responses = []
+    for p in range(n):
+        alone = [r.inputs * (np.arange(n) == p)[:, None] for r in records]
+        parts = [simulate(rig, u, sample_time=r.sample_time).outputs for u, r in zip(alone, records, strict=True)]
+        responses.append(np.concatenate([(weights * part).ravel() for part in parts]))
+    matrix = np.array(responses).T
+    sizes = np.linalg.norm(matrix, axis=0)
+    acting = np.flatnonzero(sizes > 1e-9 * sizes.max())
+    if acting.size < 2 or not np.isfinite(matrix).all():
+        return []
+    target = np.concatenate([(weights * y).ravel() for y in gap.measured])
+    gains = np.ones(n)
+    gains[acting] = np.linalg.lstsq(matrix[:, acting] / sizes[acting], target, rcond=1e-6)[0] / sizes[acting]
+    known = {p: _factor(gains[p]) for p in acting}
+    if any(known[p] is None and abs(gains[p] - 1.0) > NEAR for p in acting):
+        return []
+    wrong = {p: factor for p, factor in known.items() if factor is not None}
+    if not wrong or (len(wrong) == acting.size and len(set(wrong.values())) == 1):
+        return []
+    mend = _inputs_times({rig.actuators[p].name: factor for p, factor in wrong.items()})
+    closes = _closes(gap, before, wide, *mend(rig, records))
+    if closes < CLOSED:
+        return []
+    faults = []
+    for factor in dict.fromkeys(wrong.values()):
+        names = [rig.actuators[p].name for p in wrong if wrong[p] == factor]
+        sentence = _one(f"{_named('input', names)} {FACTORS[factor][1]}", names) + f": multiply by {factor:.6g}."
+        kind = "sign" if factor == -1.0 else "unit"
+        faults.append(WiringFault(kind, sentence, closes, _inputs_times(dict.fromkeys(names, factor))))
+    return faults
+
+
+def _quantities(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    """Outputs that are another time derivative of the motion than their label says."""
+    meant: dict[tuple[str, str], list[int]] = {}
+    for quantity in QUANTITIES:
+        here = [j for j in np.flatnonzero(wide) if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
+        if not here:
+            continue
+        names = {rig.sensors[j].name for j in here}
+        closed = gap.closed(before, gap.power([_predict(_relabelled(rig, names, quantity), r) for r in records]))
+        for j in here:
+            if closed[j] >= CLOSED:
+                meant.setdefault((rig.sensors[j].quantity, quantity), []).append(int(j))
+    faults = []
+    for (said, quantity), outputs in meant.items():
+        names = [rig.sensors[j].name for j in outputs]
+        closed = gap.closed(before, gap.power([_predict(_relabelled(rig, set(names), quantity), r) for r in records]))
+        what = _one(f"{_named('output', names)} are {quantity}, not {said}", names)
+        sentence = f'{what}: write quantity = "{quantity}" in case.toml.'
+        mend = _quantity_set(frozenset(names), quantity)
+        faults.append(WiringFault("quantity", sentence, float(closed[outputs].min()), mend))
+    return faults
+
+
+def _rates(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    """Records sampled at another rate than they are said to be."""
+    wrong: dict[float, list[int]] = {}
+    for i, record in enumerate(records):
+        own = _Gap.of(rig, [record])
+        left = own.power([predicted[i]])
+        here = left > np.maximum(WIDE_GAP**2, 4.0 * own.noise)
+        if not here.any():
+            continue
+        shares = {
+            factor: _closes(own, left, here, rig, [replace(record, sample_time=record.sample_time / factor)])
+            for factor in RATES
+        }
+        best = max(shares, key=lambda factor: shares[factor])
+        if shares[best] >= CLOSED:
+            wrong.setdefault(best, []).append(i)
+    faults = []
+    for factor, at in wrong.items():
+        names = [records[i].name for i in at]
+        every = len(at) == len(records)
+        who = "All records" if every and len(at) > 1 else _named("record", names)
+        times = ", ".join(dict.fromkeys(f"{records[i].sample_time / factor:.6g}" for i in at))
+        what = _one(f"{who} are sampled at {RATES[factor]} the stated rate", names)
+        sentence = f"{what}: write sample_time = {times} s."
+        mend = _rate_times(None if every else frozenset(names), factor)
+        whole = _closes(gap, before, wide, *mend(rig, records)) if every else np.nan
+        faults.append(WiringFault("sample rate", sentence, whole, mend))
+    return faults
+
+
+def _structure(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+    """Damping in per cent, frequencies in rad/s for Hz and the other way about."""
+    tries: list[tuple[str, str, Mend]] = []
+    zeta = float(rig.modes.zeta.max(initial=0.0))
+    if zeta > PER_CENT_FROM and (rig.structure is None or isinstance(rig.structure.damping, ModalDamping)):
+        sentence = (
+            f"The damping looks like per cent where a ratio is meant: divide it by 100 (the largest would be"
+            f" {zeta / 100:.4g}, not {zeta:.4g})."
+        )
+        tries.append(("damping", sentence, _modes_times(1.0, 0.01)))
+    if rig.structure is None:
+        for factor, words in ((TURN, "Hz where rad/s is"), (1.0 / TURN, "rad/s where Hz is")):
+            sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
+            tries.append(("frequency", sentence, _modes_times(factor, 1.0)))
+    found = [
+        WiringFault(kind, sentence, _closes(gap, before, wide, *mend(rig, records)), mend)
+        for kind, sentence, mend in tries
+    ]
+    found = [fault for fault in found if fault.closes >= CLOSED]
+    return sorted(found, key=lambda fault: -fault.closes)[:1]
+
+
+def _closes(gap: _Gap, before: np.ndarray, wide: np.ndarray, rig: Rig, records: Sequence[Record]) -> float:
+    """The share that another rig and other records close, in the median of the channels with a wide gap."""
+    after = gap.power([_predict(rig, record) for record in records])
+    return float(np.median(gap.closed(before, after)[wide]))
+
+
+def _predict(rig: Rig, record: Record) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return simulate(rig, record.inputs, sample_time=record.sample_time).outputs
+
+
+def _named(what: str, names: Sequence[str]) -> str:
+    """Such as: The outputs y1, y2 and y3."""
+    if len(names) == 1:
+        return f"The {what} {names[0]}"
+    return f"The {what}s {', '.join(names[:-1])} and {names[-1]}"
+
+
+def _one(sentence: str, names: Sequence[str]) -> str:
+    """The sentence with its first verb in the singular where one thing is spoken of."""
+    if len(names) > 1:
+        return sentence
+    for many, single in ((" are ", " is "), (" have ", " has "), (" look ", " looks ")):
+        if many in sentence:
+            return sentence.replace(many, single, 1)
+    return sentence
+
+
+# --- mends
+
+
+def _without_record(name: str) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        return rig, tuple(record for record in records if record.name != name)
+
+    return mend
+
+
+def _without_output(name: str) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
+        return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
+
+    return mend
+
+
+def _outputs_times(factors: dict[str, float]) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        by = np.array([factors.get(sensor.name, 1.0) for sensor in rig.sensors])
+        sensors = tuple(replace(s, noise_std=abs(f) * s.noise_std) for s, f in zip(rig.sensors, by, strict=True))
+        return replace(rig, sensors=sensors), tuple(replace(r, outputs=by[:, None] * r.outputs) for r in records)
+
+    return mend
+
+
+def _inputs_times(factors: dict[str, float]) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
+        return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
+
+    return mend
+
+
+def _swapped(names: Sequence[str], one: str, other: str) -> list[int]:
+    order = list(range(len(names)))
+    i, j = names.index(one), names.index(other)
+    order[i], order[j] = j, i
+    return order
+
+
+def _outputs_swapped(one: str, other: str) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        order = _swapped([sensor.name for sensor in rig.sensors], one, other)
+        return rig, tuple(replace(record, outputs=record.outputs[order]) for record in records)
+
+    return mend
+
+
+def _inputs_swapped(one: str, other: str) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        order = _swapped([actuator.name for actuator in rig.actuators], one, other)
+        return rig, tuple(replace(record, inputs=record.inputs[order]) for record in records)
+
+    return mend
+
+
+def _relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
+    named = set(names)
+    return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in named else s for s in rig.sensors))
+
+
+def _quantity_set(names: frozenset[str], quantity: str) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        return _relabelled(rig, names, quantity), tuple(records)
+
+    return mend
+
+
+def _rate_times(names: frozenset[str] | None, factor: float) -> Mend:
+    """Of the named records, or of all."""
+
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        return rig, tuple(
+            replace(r, sample_time=r.sample_time / factor) if names is None or r.name in names else r for r in records
+        )
+
+    return mend
+
+
+def _modes_times(omega: float, zeta: float) -> Mend:
+    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
+        modes = replace(rig.modes, omega=omega * rig.modes.omega, damping=omega * zeta * rig.modes.damping)
+        structure = rig.structure
+        if structure is not None and isinstance(structure.damping, ModalDamping):
+            structure = replace(structure, damping=ModalDamping(zeta * np.asarray(structure.damping.zeta, float)))
+        return replace(rig, modes=modes, structure=structure), tuple(records)
+
+    return mend
