@@ -57,13 +57,17 @@ from .structure.domain import Between as Between
 from .structure.domain import Interval as Interval
 from .structure.domain import NamedPoints as NamedPoints
 from .structure.domain import Rectangle as Rectangle
+from .structure.field import Field as Field
 from .structure.member import Bar as Bar
 from .structure.member import Beam as Beam
 from .structure.modes import Modes as Modes
 from .structure.modes import SampledModes as SampledModes
 from .structure.modes import mac as mac
 from .structure.modification import attach as attach
+from .structure.plate import Membrane as Membrane
+from .structure.plate import Plate as Plate
 from .structure.profile import Profile as Profile
+from .structure.supports import Edge as Edge
 from .structure.supports import End as End
 from .structure.supports import PointDamper as PointDamper
 from .structure.supports import PointMass as PointMass

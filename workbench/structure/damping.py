@@ -37,7 +37,10 @@ class ProportionalDamping:
 
 @dataclass(frozen=True, eq=False)
 class ViscousDamping:
-    """A viscous coefficient per length, N s/m², along x: c_rs = ∫ c φ_r φ_s dx (2.11), in general not diagonal."""
+    """A viscous coefficient per length, N s/m², along x: c_rs = ∫ c φ_r φ_s dx (2.11), in general not diagonal.
+
+    On a plate or membrane it is a coefficient per area, N s/m³: a number, a function of (x, y), or a `Field`.
+    """
 
     coefficient_per_length: ProfileLike
 

@@ -1,5 +1,6 @@
 """What holds a structure at its ends and what is attached to it in between."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,52 @@ def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
     if end not in allowed:
         raise ValueError(f"an end is one of {', '.join(allowed)} or an End(translation, rotation); got {end!r}")
     return NAMED_ENDS[end]
+
+
+@dataclass(frozen=True)
+class Edge:
+    """An edge of a plate: stiffness against displacement (N/m per m) and rotation about it (N m/rad per m).
+
+    0 is free, inf is held.
+    """
+
+    translation: float
+    rotation: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("translation", "rotation"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"the {name} stiffness of an edge must be 0 or more; got {getattr(self, name)}")
+
+
+NAMED_EDGES = {
+    "simply supported": Edge(HELD, 0.0),
+    "clamped": Edge(HELD, HELD),
+    "free": Edge(0.0, 0.0),
+    "guided": Edge(0.0, HELD),
+    "fixed": Edge(HELD, 0.0),
+}
+SIDES = ("left", "right", "bottom", "top")
+
+
+def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str, ...]) -> dict[str, Edge]:
+    """Left (x = 0), right, bottom (y = 0) and top edge, from one for all four or from a mapping of the four.
+
+    Raises:
+        ValueError: a side that is missing or unknown, or an edge of unknown name.
+    """
+    each = dict(edges) if isinstance(edges, Mapping) else dict.fromkeys(SIDES, edges)
+    if set(each) != set(SIDES):
+        raise ValueError(f"edges are given for {', '.join(SIDES)}, or one for all; got {', '.join(map(str, each))}")
+    found = {}
+    for side in SIDES:
+        edge = each[side]
+        if not isinstance(edge, Edge) and edge not in allowed:
+            raise ValueError(
+                f"the {side} edge is one of {', '.join(allowed)} or an Edge(translation, rotation); got {edge!r}"
+            )
+        found[side] = edge if isinstance(edge, Edge) else NAMED_EDGES[edge]
+    return found
 
 
 class _AtPlace:
