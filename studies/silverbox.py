@@ -6,7 +6,6 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
-from workbench.cases.case import KnownPlaces
 from workbench.draw.gap import plot_missing_force, plot_rivals
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
@@ -14,7 +13,8 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
-from workbench.structure.modes import Modes
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
 
 NEEDS_DATA = "SNLS80mV.mat of the Silverbox benchmark"
 SAMPLE_TIME = 2**14 / 1e7
@@ -35,9 +35,9 @@ def held_equivalent(u):
 
 def linear_rig(omega, zeta, stiffness):
     """One degree of freedom, from input volt to output volt."""
-    shapes = KnownPlaces(("V1", "V2"), np.full((2, 1), omega / np.sqrt(stiffness)))
-    modes = Modes(omega=[omega], damping=[zeta], shapes=shapes, domain=1.0)
-    return Rig(modes, (Actuator("V1", 0.0),), (Sensor("V2", 1.0, noise_std=RESOLUTION),))
+    shapes = PointShapes(np.full((2, 1), omega / np.sqrt(stiffness)))
+    modes = Modes(omega=[omega], damping=[zeta], shapes=shapes, domain=NamedPoints(("V1", "V2")))
+    return Rig(modes, (Actuator("V1", "V1"),), (Sensor("V2", "V2", noise_std=RESOLUTION),))
 
 
 def best_linear(record):

@@ -7,9 +7,8 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
-from workbench.gap.effects.effect import Effect, Kind, Parameter
+from workbench.gap.effects.effect import Effect, Kind, Parameter, place_parameters
 from workbench.gap.effects.nonlinear import with_element
-from workbench.gap.effects.structural import place_parameter
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.readiness import RecordsError
 from workbench.gap.search.fit import fit
@@ -100,7 +99,10 @@ def test_an_effect_of_the_users_own_joins_the_catalogue():
         name="quadratic_spring",
         path="structure",
         nonlinear=True,
-        parameters=lambda rig, _: (place_parameter(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)),
+        parameters=lambda rig, _: (
+            *place_parameters(rig),
+            Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True),
+        ),
         apply=lambda rig, _, v: with_element(rig, UserLaw(v["at"], quadratic, (v["stiffness"],))),
         starts=lambda evidence, _: [{"at": p.at, "stiffness": k} for p in evidence.at_peaks for k in (0.01, 0.1, 1.0)],
     )

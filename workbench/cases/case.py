@@ -6,7 +6,20 @@ from typing import Any
 
 import numpy as np
 
-from workbench.cases.tables import CaseError, check_keys, count, number, numbers, profile, shown, table_of, tables, text
+from workbench.cases.points import read_points
+from workbench.cases.tables import (
+    CaseError,
+    check_keys,
+    count,
+    inside,
+    number,
+    numbers,
+    profile,
+    shown,
+    table_of,
+    tables,
+    text,
+)
 from workbench.records.file_error import RecordFileError
 from workbench.records.limits import check_size
 from workbench.records.npz_file import arrays as load_arrays
@@ -15,9 +28,9 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import Interval
+from workbench.structure.domain import NamedPoints, Place
 from workbench.structure.member import Bar, Beam, Structure
-from workbench.structure.modes import Modes
+from workbench.structure.modes import Modes, PointShapes
 
 MOST_SAMPLES = 5_000_000
 LEAST_SAMPLES = 16
@@ -27,7 +40,7 @@ MOST_MODES = 200
 TABLES = ("title", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
-MODAL = ("kind", "natural_frequencies_hz", "damping_ratios")
+MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "points")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT, RECORD = ("name", "kind"), ("name", "quantity", "noise_std"), ("name", "file", "sample_time", "use")
 
@@ -47,24 +60,6 @@ class Case:
     rig: Rig
     fit: tuple[Record, ...]
     validation: tuple[Record, ...]
-
-
-class KnownPlaces:
-    """Shapes known only at named inputs and outputs; place i stands at position i.
-
-    Attributes:
-        names: (n_places,) of the inputs, then of the outputs.
-        places: (n_places,) 0, 1, 2, ...
-    """
-
-    def __init__(self, names: tuple[str, ...], values: np.ndarray):
-        self.names, self.values = names, values
-        self.places = np.arange(len(names), dtype=float)
-
-    def __call__(self, x: np.ndarray, derivative: int) -> np.ndarray:
-        if derivative:
-            raise ValueError("plain modal data tell no slopes; describe the structure as a beam or a rod instead")
-        return self.values[np.clip(np.round(x).astype(int), 0, len(self.names) - 1)]
 
 
 def read_case(folder: str | Path) -> Case:
@@ -115,9 +110,12 @@ def _rig(table: dict, path: Path) -> Rig:
     structure = table.get("structure")
     if not isinstance(structure, dict):
         raise CaseError(f"{path}: the table [structure] is missing")
-    build = _modal_rig if structure.get("kind") == "modal" else _member_rig
     try:
-        return build(structure, inputs, outputs)
+        if structure.get("kind") != "modal":
+            return _member_rig(structure, inputs, outputs)
+        if "points" in structure:
+            return _rig_at_points(structure, inputs, outputs, path)
+        return _modal_rig(structure, inputs, outputs)
     except (ValueError, TypeError, ArithmeticError) as error:
         raise CaseError(f"{path}: {error}") from error
 
@@ -178,12 +176,28 @@ def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
                 for e in entries
             ]
         )
-    names = tuple(e["name"] for e in (*inputs, *outputs))
-    shapes = KnownPlaces(names, values)
-    modes = Modes(omega=omega, damping=damping, shapes=shapes, domain=Interval(float(max(len(names) - 1, 1))))
-    actuators = tuple(_actuator(e, float(i)) for i, e in enumerate(inputs))
-    sensors = tuple(_sensor(e, float(i + len(inputs))) for i, e in enumerate(outputs))
-    return Rig(modes, actuators, sensors)
+    points = NamedPoints(tuple(e["name"] for e in (*inputs, *outputs)))
+    modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
+    return Rig(modes, tuple(_actuator(e, e["name"]) for e in inputs), tuple(_sensor(e, e["name"]) for e in outputs))
+
+
+def _rig_at_points(table: dict, inputs: list[dict], outputs: list[dict], path: Path) -> Rig:
+    """Modal data at named points, which a table beside the case file lists."""
+    check_keys(table, MODAL, "[structure]")
+    _check_ports(inputs, outputs, "point")
+    omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
+    damping = numbers(table, "damping_ratios", "[structure]", omega.size)
+    file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
+    points, values = read_points(file, omega.size)
+    modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
+
+    def point(entry: dict, where: str) -> str:
+        name = text(entry, "point", f"{where} {entry['name']!r}")
+        points.locate(name)
+        return name
+
+    actuators = tuple(_actuator(e, point(e, "[[input]]")) for e in inputs)
+    return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]")) for e in outputs))
 
 
 def _check_ports(inputs: list[dict], outputs: list[dict], *places: str) -> None:
@@ -199,14 +213,14 @@ def _place(entry: dict, length: float, where: str) -> float:
     return at
 
 
-def _actuator(entry: dict, at: float) -> Actuator:
+def _actuator(entry: dict, at: Place) -> Actuator:
     kind = entry.get("kind")
     if kind not in ("actuator", "hammer"):
         raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {shown(kind)}")
     return Actuator(entry["name"], at, direct=kind == "hammer")
 
 
-def _sensor(entry: dict, at: float) -> Sensor:
+def _sensor(entry: dict, at: Place) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
@@ -233,12 +247,7 @@ def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
     sample_time = number(entry, "sample_time", where)
     if sample_time <= 0:
         raise CaseError(f"{where}: sample_time must be positive; got {sample_time:g}")
-    try:
-        file = (folder / text(entry, "file", where)).resolve()
-    except (OSError, RuntimeError) as error:  # links that go in a circle
-        raise CaseError(f"{where}: file {entry['file']!r} cannot be found: {error}") from error
-    if not file.is_relative_to(folder.resolve()):
-        raise CaseError(f"{where}: file {entry['file']!r} lies outside the case folder")
+    file = inside(folder, text(entry, "file", where), where)
     arrays = _arrays(file, where)
     names = {a.name for a in rig.actuators} | {s.name for s in rig.sensors}
     missing, extra = sorted(names - arrays.keys()), sorted(arrays.keys() - names - {"t"})

@@ -90,6 +90,21 @@ def text(entry: dict, key: str, where: str) -> str:
     return value
 
 
+def inside(folder: Path, file: str, where: str) -> Path:
+    """A file named in a case, which must lie in its folder.
+
+    Raises:
+        CaseError: a name that leads elsewhere.
+    """
+    try:
+        path = (folder / file).resolve()
+    except (OSError, RuntimeError) as error:  # links that go in a circle
+        raise CaseError(f"{where}: file {file!r} cannot be found: {error}") from error
+    if not path.is_relative_to(folder.resolve()):
+        raise CaseError(f"{where}: file {file!r} lies outside the case folder")
+    return path
+
+
 def number(entry: dict, key: str, where: str, *, low: float = -np.inf) -> float:
     """A finite number, at least `low`.
 

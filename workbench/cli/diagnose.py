@@ -34,7 +34,8 @@ def diagnose(
     """
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
-    from workbench.gap.effects.structural import known_places
+    from workbench.gap.effects.effect import COORDINATES
+    from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.study.verdict_page import verdict_page
     from workbench.study.whole_file import check_target, write_whole
@@ -65,11 +66,10 @@ def diagnose(
     where = verdict.where
     say(f"  path       {where.path}; {'depends' if where.amplitude_dependent else 'does not depend'} on amplitude")
     say(f"  modes      {', '.join(map(str, where.modes)) or 'none'}")
-    if where.path in ("structure", "environment") and known_places(found.rig) is None:
+    if where.path in ("structure", "environment"):
         if verdict.place_stands:
-            say(
-                f"  place      x = {where.at:.4g} ± {where.at_std:.1g} m, of the unmodelled point force, no law assumed"
-            )
+            spread = dict.fromkeys(COORDINATES, where.at_std)
+            say(f"  place      {place_in_words(where.at, spread)}, of the unmodelled point force, no law assumed")
         elif where.place.holds is False:
             say("  place      no single point force explains the gap")
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]

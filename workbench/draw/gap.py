@@ -3,17 +3,20 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import apply_all
-from workbench.gap.effects.structural import known_places, place_name
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate
+from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
+
+MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown, and few have their names level
 
 
 def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure:
@@ -92,27 +95,57 @@ def _plot_places(ax, verdict: Verdict) -> None:
         None: "no place of a force can be told",
     }
     ax.set(title=told[place.holds], ylabel="log-likelihood, less its peak")
-    if known_places(verdict.nominal) is not None:
-        ax.bar([place_name(verdict.nominal, at) for at in place.places], profile, color=COLOURS[3])
+    domain = verdict.nominal.modes.domain
+    if isinstance(domain, Rectangle):
+        _map(ax, verdict, domain)
+        return
+    if isinstance(domain, NamedPoints):
+        shown = np.sort(np.argsort(-profile, kind="stable")[:MOST_BARS])
+        ax.bar([_short(place.places[i]) for i in shown], profile[shown], color=COLOURS[3])
+        ax.tick_params(axis="x", rotation=90 if shown.size > FEW_BARS else 0)
         return
     ax.plot(place.places, profile, color=COLOURS[3])
     ax.axvline(place.at, color=GREY, linestyle=":")
     for effect in verdict.effects:
-        if "at" in effect.values and effect.kind.path in ("structure", "environment"):
-            ax.axvline(effect.values["at"], color=COLOURS[0])
+        if effect.at is not None and effect.kind.path in ("structure", "environment"):
+            ax.axvline(effect.at, color=COLOURS[0])
     near = abs(np.sort(profile)[-min(3, profile.size)])
     low = min(max(profile.min(), -50.0 * max(1.0, near)), -1.0)
     ax.set(xlabel="x [m]", ylim=(low, -0.06 * low))
 
 
+def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
+    """The log-likelihood over a rectangle, its top, and the effects that were named."""
+    place = verdict.where.place
+    x, y = np.array(place.places).T
+    near = abs(np.sort(place.profile)[-min(3, place.profile.size)])
+    low = min(max(place.profile.min(), -50.0 * max(1.0, near)), -1.0)
+    ax.tricontourf(x, y, np.maximum(place.profile, low), levels=12, cmap="Blues")
+    ax.plot(*place.at, "+", color=GREY, markersize=12)
+    for effect in verdict.effects:
+        if effect.at is not None and effect.kind.path in ("structure", "environment"):
+            ax.plot(*effect.at, "o", color=COLOURS[0], fillstyle="none", markersize=9)
+    a, b = domain.length
+    ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(0.0, a), ylim=(0.0, b), aspect="equal")
+
+
+def _short(where: Where) -> str:
+    return " to ".join(map(str, where)) if isinstance(where, Between) else str(where)
+
+
+def _there(verdict: Verdict, where: Where) -> str:
+    text = verdict.nominal.modes.domain.text(where)
+    return text if isinstance(where, Between) else f"at {text}"
+
+
 def plot_missing_force(verdict: Verdict) -> Figure:
     """The force missing at its place beside other effects and freed figures, over displacement and velocity."""
     evidence = verdict.attribution.evidence
-    chosen = [e for e in verdict.effects if "at" in e.values and e.kind.path == "structure"]
+    chosen = [e for e in verdict.effects if e.at is not None and e.kind.path == "structure"]
     beside = [e for e in verdict.effects if chosen and e is not chosen[0]]
     if beside:
         evidence = Evidence.of(apply_all(verdict.nominal, beside), verdict.attribution.search.data)
-    place = evidence.place(chosen[0].values["at"] if chosen else verdict.where.at)
+    place = evidence.place(chosen[0].at if chosen else verdict.where.at)
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
     step = max(1, place.force.size // 4000)
     for ax, series, name in (
@@ -120,7 +153,7 @@ def plot_missing_force(verdict: Verdict) -> Figure:
         (axes[1], place.velocity, "velocity [m/s]"),
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
-        ax.set_xlabel(f"{name} at {place_name(verdict.nominal, place.at)}")
+        ax.set_xlabel(f"{name} {_there(verdict, place.at)}")
         law = _law(chosen, series, name)
         if law is not None:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")

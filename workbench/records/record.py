@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import control
 import numpy as np
 
+from workbench.structure.domain import Place
 from workbench.structure.modes import frozen
 
 QUANTITIES = {
@@ -29,14 +30,14 @@ class Channel:
         name: unique among the inputs, and among the outputs, of a record.
         quantity: what is measured, one of `QUANTITIES` or a word of the user's.
         unit: as written on the axis; taken from the quantity where left empty.
-        at: place along the structure, m; None where unknown or meaningless.
+        at: its place on the structure: x (m), (x, y), or the name of a point; None where unknown or meaningless.
         noise_std: standard deviation of the sensor's white noise, in `unit`; None where unknown.
     """
 
     name: str
     quantity: str = ""
     unit: str = ""
-    at: float | None = None
+    at: Place | None = None
     noise_std: float | None = None
 
     def __post_init__(self) -> None:
@@ -132,8 +133,8 @@ class Record:
 
     @property
     def positions(self) -> np.ndarray:
-        """Places of the outputs (n_outputs,), m; nan where unknown."""
-        return np.array([np.nan if c.at is None else c.at for c in self.output_channels])
+        """Places of the outputs along an interval (n_outputs,), m; nan where unknown, or of another kind."""
+        return np.array([c.at if isinstance(c.at, int | float) else np.nan for c in self.output_channels])
 
     @property
     def output_names(self) -> tuple[str, ...]:

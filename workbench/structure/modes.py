@@ -194,6 +194,20 @@ def _taking_a_length(init: Callable[..., None]) -> Callable[..., None]:
 Modes.__init__ = _taking_a_length(Modes.__init__)  # type: ignore[method-assign]
 
 
+class PointShapes:
+    """Shapes known at named points only: one row a point, one column a mode.
+
+    Attributes:
+        values: (n_points, n_modes), mass-normalised, in the order of the points.
+    """
+
+    def __init__(self, values: ArrayLike):
+        self.values = frozen(np.atleast_2d(values))
+
+    def __call__(self, index: np.ndarray, derivative: int = 0) -> np.ndarray:
+        return self.values[index]
+
+
 @dataclass(frozen=True, eq=False)
 class SampledModes:
     """Modes as a measurement gives them: complex, unscaled, known at the sensors only.

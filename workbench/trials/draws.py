@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Beam
 from workbench.structure.supports import HELD
 from workbench.trials.scene import Scene, Unsuitable
@@ -27,7 +28,9 @@ def _stiff(scene: Scene) -> float:
     """A stiffness that matters at a point, N/m: that of the first elastic mode."""
     modes = scene.bench.rig.modes
     first = int(np.argmax(modes.omega > 0))
-    shape = modes.phi(np.linspace(0.0, 1.0, 41) * modes.length)[:, first]
+    domain = modes.domain
+    places = domain.grid() if isinstance(domain, NamedPoints) else np.linspace(0.0, 1.0, 41) * domain.size
+    shape = modes.phi(places)[:, first]
     return float(modes.omega[first] ** 2 / np.max(shape**2))
 
 
@@ -185,10 +188,10 @@ def _moved_sensor(scene, rng):
 
 
 def _moved_port(scene, rng, side, ports):
-    port, length = ports[rng.integers(len(ports))], scene.bench.rig.modes.length
-    known = getattr(scene.bench.rig.modes.shapes, "places", None)
-    if known is not None:
-        return {side: port.name, "at": float(rng.choice(known[known != port.at]))}
+    port, domain = ports[rng.integers(len(ports))], scene.bench.rig.modes.domain
+    if isinstance(domain, NamedPoints):
+        return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
+    length = domain.size
     step = _sign(rng) * float(rng.uniform(0.03, 0.25)) * length
     at = port.at + step if 0.02 * length < port.at + step < length else port.at - step
     if not 0.02 * length < at < length:

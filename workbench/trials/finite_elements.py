@@ -1,6 +1,8 @@
 """Modes of a member by Hermite and quadratic finite elements of scikit-fem, sharing nothing with `Structure.modes`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import eigh
@@ -110,7 +112,7 @@ def element_modes(
     return ElementModes(np.sqrt(omega2), at_places, full.T @ (slopes @ full))
 
 
-def modal_modes(nominal: Modes, places: np.ndarray, *, altered: Alterations = AS_NOMINAL) -> ElementModes:
+def modal_modes(nominal: Modes, places: Sequence[Any], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
     """The modes of plain modal data once altered: the nominal ones as a basis, without a member behind them.
 
     (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v.

@@ -11,6 +11,7 @@ from joblib import Parallel, delayed
 from workbench.cases.case import Case, read_case
 from workbench.gap.diagnose import diagnose
 from workbench.trials.make import write_trials
+from workbench.trials.scene import extent
 from workbench.trials.scoring import Tally, score, score_dirty, tally
 
 
@@ -81,7 +82,7 @@ def hold_trials(
             verdicts[folder.name] = verdict
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
-            length = read_case(folder).rig.modes.length
+            length = extent(read_case(folder).rig.modes.domain)
             verdict, label = verdicts[folder.name], labels[folder.name]
             scores[folder.name] = score(verdict, label, length=length)
             if dirt is not None:

@@ -17,7 +17,7 @@ from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Di
 from workbench.trials.draws import DRAWS
 from workbench.trials.hidden import HIDE, OUTSIDE, hide
 from workbench.trials.plant import Plant, RootedPlant
-from workbench.trials.scene import Scene, Unsuitable
+from workbench.trials.scene import Scene, Unsuitable, extent
 
 NONE, UNKNOWN = "none", "unknown"
 KINDS = tuple(HIDE)
@@ -164,7 +164,7 @@ def _case(
         "title": name,
         "snr_db": bench.snr_db,
         "effects": told or [{"kind": NONE}],
-        "length": bench.rig.modes.length,
+        "length": extent(bench.rig.modes.domain),
         "budget": _budget(figures["validate"]),
         "records": figures,
     }

@@ -65,9 +65,9 @@ class Plant:
     def rooted(self) -> "RootedPlant":
         """The plant with its modes solved."""
         gauss, weights = np.polynomial.legendre.leggauss(DRAG_POINTS)
-        length = self.nominal.modes.length
+        length = self.nominal.modes.length if self.drag else 0.0
         field_places = 0.5 * length * (gauss + 1.0) if self.drag else np.zeros(0)
-        groups: list[list[float] | np.ndarray] = [
+        groups: list[list[Any] | np.ndarray] = [
             [a.at for a in self.actuators],
             [s.at for s in self.sensors],
             [at for _, at, _ in self.laws],
@@ -75,11 +75,11 @@ class Plant:
             [noise[0] for noise in self.noises],
             field_places,
         ]
-        places = np.array([x for group in groups for x in group], float)
+        places = [x for group in groups for x in group]
         if self.nominal.structure is None:
             modes = modal_modes(self.nominal.modes, places, altered=self.altered)
         else:
-            modes = element_modes(self.nominal.structure, places, self.n_modes, altered=self.altered)
+            modes = element_modes(self.nominal.structure, np.array(places, float), self.n_modes, altered=self.altered)
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
         inputs, sensors, laws, tones, noises, field = shapes
         drag = np.c_[field, 0.5 * length * weights[: len(field_places)]]

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.structure.domain import Domain, NamedPoints, Place, Rectangle
 from workbench.trials.benches import Bench
 from workbench.trials.plant import ModalMotion, Plant, RootedPlant
 
@@ -12,6 +13,11 @@ COARSE = 0.2  # radians of the highest mode in one step: enough to draw a streng
 
 class Unsuitable(ValueError):
     """A kind that a bench cannot show, or a draw that shows no gap."""
+
+
+def extent(domain: Domain) -> float:
+    """What errors of place are measured by, m; 1 where names have no positions."""
+    return 1.0 if isinstance(domain, NamedPoints) and domain.positions is None else domain.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +46,21 @@ class Scene:
     def acting(self) -> list[str]:
         return [a.name for a in self.bench.rig.actuators if not a.direct]
 
-    def motion_at(self, x: float) -> tuple[np.ndarray, np.ndarray]:
+    def motion_at(self, x: Place) -> tuple[np.ndarray, np.ndarray]:
         """Nominal displacement and velocity at a place, (n_samples,) each."""
         shape = self.bench.rig.modes.phi(x)[0]
         return self.moved[0] @ shape, self.moved[1] @ shape
 
-    def place(self, rng: np.random.Generator) -> float:
+    def place(self, rng: np.random.Generator) -> float | str:
         """A place that moves: at least a third of what the liveliest does."""
-        length, known = self.bench.rig.modes.length, getattr(self.bench.rig.modes.shapes, "places", None)
-        grid = np.linspace(0.05, 1.0, 96) * length if known is None else known
+        domain = self.bench.rig.modes.domain
+        if isinstance(domain, Rectangle):
+            raise Unsuitable("trials are made on bars, beams and named points")
+        named = isinstance(domain, NamedPoints)
+        grid = np.array(domain.names) if named else np.linspace(0.05, 1.0, 96) * domain.size
         rms = np.sqrt(np.mean((self.bench.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
-        at = float(rng.choice(grid[rms > rms.max() / 3]))
-        return at if known is not None else round(at - float(rng.uniform(0.0, 0.01)) * length, 4)
+        at = rng.choice(grid[rms > rms.max() / 3])
+        return str(at) if named else round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
         """Noise-free gap between a plant and the nominal one, or another, at the middle level."""

@@ -19,6 +19,7 @@ from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import Search
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import follow
+from workbench.structure.domain import Interval
 
 NOISE, DT = 1e-5, 0.01
 CLEARANCE, GAIN, SPRING = (kind_named(name) for name in ("clearance", "sensor_gain", "ground_spring"))
@@ -50,7 +51,7 @@ def weighed(n_starts: int, seed: int) -> Weighed:
     starts = tuple(Effect(CLEARANCE, None, {"at": float(i)}) for i in range(n_starts))
     moves = rng.normal(size=(n_starts, 40))
     least = np.where(rng.random(n_starts) < 0.3, -30.0, 0.03)
-    return Weighed(starts, moves, 3.0 * rng.normal(size=40), least, np.full(n_starts, 30.0), length=1.0)
+    return Weighed(starts, moves, 3.0 * rng.normal(size=40), least, np.full(n_starts, 30.0), domain=Interval(1.0))
 
 
 def test_what_two_effects_come_to_is_least_squares_within_bounds():

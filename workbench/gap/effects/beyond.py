@@ -4,9 +4,8 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, Parameter
+from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import strength_along, with_element
-from workbench.gap.effects.structural import place_parameter
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
 EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # to start from
@@ -20,17 +19,17 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
             for exponent in EXPONENTS if rms > 0 else ():
                 basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
                 force = strength_along(place.force, basis)
-                yield {"at": place.at, "force_at_rms": force, "exponent": exponent, "rms": rms}
+                yield {**place_values(place.at), "force_at_rms": force, "exponent": exponent, "rms": rms}
 
     return Kind(
         name=name,
         path="structure",
         parameters=lambda rig, _: (
-            place_parameter(rig),
+            *place_parameters(rig),
             Parameter("force_at_rms", "N", -1e15, 1e15),
             Parameter("exponent", "", 1.0, 9.0),
         ),
-        apply=lambda rig, _, v: with_element(rig, element(v["at"], v["force_at_rms"], v["rms"], v["exponent"])),
+        apply=lambda rig, _, v: with_element(rig, element(place_of(v), v["force_at_rms"], v["rms"], v["exponent"])),
         starts=starts,
         nonlinear=True,
         phrase=words,

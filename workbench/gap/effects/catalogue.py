@@ -9,9 +9,13 @@ A kind of your own is one more `Kind`; hand `(*CATALOGUE, mine)` to the diagnosi
 
     mine = Kind(
         name="quadratic_spring", path="structure", nonlinear=True,
-        parameters=lambda rig, _: (place_parameter(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)),
-        apply=lambda rig, _, v: with_element(rig, UserLaw(v["at"], law, (v["stiffness"],))),
-        starts=lambda evidence, _: [{"at": p.at, "stiffness": k} for p in evidence.at_peaks for k in (0.1, 1.0, 10.0)],
+        parameters=lambda rig, _: (
+            *place_parameters(rig), Parameter("stiffness", "N/m^2", 1e-9, 1e9, logarithmic=True)
+        ),
+        apply=lambda rig, _, v: with_element(rig, UserLaw(place_of(v), law, (v["stiffness"],))),
+        starts=lambda evidence, _: [
+            {**place_values(p.at), "stiffness": k} for p in evidence.at_peaks for k in (0.1, 1.0, 10.0)
+        ],
     )
 """
 

@@ -1,15 +1,17 @@
 """An effect: a change of rig, with parameters."""
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 from weakref import WeakValueDictionary
 
 import numpy as np
 
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
 
 ALL = "all"
+COORDINATES = ("at", "x", "y")  # parameters that say where, along an interval or on a rectangle
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,29 @@ class Parameter:
         return value if self.logarithmic else self.scale
 
 
+def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
+    """The coordinates of a place, as parameters: x along an interval, x and y on a rectangle, none at named points."""
+    domain = rig.modes.domain
+    lengths = {} if isinstance(domain, NamedPoints) else dict(zip(domain.coordinates, _lengths(domain), strict=True))
+    return tuple(Parameter(name, "m", 0.0, length, scale=0.01 * length) for name, length in lengths.items())
+
+
+def _lengths(domain: Domain) -> tuple[float, ...]:
+    return domain.length if isinstance(domain, Rectangle) else (domain.size,)
+
+
+def place_of(values: Mapping[str, Any]) -> Any:
+    """The place among the values of an effect: x, (x, y), the name of a point, or `Between` two; None without one."""
+    return (values["x"], values["y"]) if "x" in values else values.get("at")
+
+
+def place_values(where: Where) -> dict[str, Any]:
+    """A place as values of an effect."""
+    if isinstance(where, tuple) and not isinstance(where, Between):
+        return {"x": float(where[0]), "y": float(where[1])}
+    return {"at": where}
+
+
 @dataclass(frozen=True, eq=False)
 class Kind:
     """A kind of effect in the catalogue.
@@ -66,8 +91,8 @@ class Kind:
     name: str
     path: str
     parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
-    apply: Callable[[Rig, Any, dict[str, float]], Rig]
-    starts: Callable[[Any, Any], Iterable[dict[str, float]]]
+    apply: Callable[[Rig, Any, dict[str, Any]], Rig]
+    starts: Callable[[Any, Any], Iterable[dict[str, Any]]]
     targets: Callable[[Rig], tuple] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
@@ -89,13 +114,13 @@ class Effect:
     Attributes:
         kind: of the catalogue.
         target: input, output, "all", an end, or None.
-        values: by parameter name.
+        values: by parameter name; at named points also "at", the name of the point or the two it acts between.
         deviations: standard deviations by parameter name, where it was fitted.
     """
 
     kind: Kind
     target: str | int | None
-    values: dict[str, float]
+    values: dict[str, Any]
     deviations: dict[str, float] = field(default_factory=dict)
 
     def apply(self, rig: Rig) -> Rig:
@@ -104,6 +129,15 @@ class Effect:
 
     def parameters(self, rig: Rig) -> tuple[Parameter, ...]:
         return self.kind.parameters(rig, self.target)
+
+    @property
+    def at(self) -> Any:
+        """Where it stands: x, (x, y), the name of a point, or `Between` two; None where it has no place."""
+        return place_of(self.values)
+
+    def moved_to(self, where: Where) -> "Effect":
+        """The same effect elsewhere."""
+        return replace(self, values={**self.values, **place_values(where)})
 
     @property
     def label(self) -> str:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from workbench.gap.effects.effect import Kind, Parameter
+from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import with_element
-from workbench.gap.effects.structural import place_parameter
 from workbench.rig.elements import PeriodicForce, RandomForce
+from workbench.structure.domain import Between
 
 
 def tone(force: np.ndarray, sample_time: float) -> tuple[float, float, float]:
@@ -26,39 +26,41 @@ def _periodic_starts(evidence, _):
     shortest = min(record.n_samples for record in records)
     ends = np.cumsum([0, *(record.n_samples for record in records)])
     for place in evidence.at_peaks:
+        if isinstance(place.at, Between):
+            continue
         mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
         frequency, amplitude, phase = tone(mean, records[0].sample_time)
-        yield {"at": place.at, "frequency": frequency, "amplitude": amplitude, "phase": phase}
+        yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
 
 PERIODIC_DISTURBANCE = Kind(
     name="periodic_disturbance",
     path="environment",
     parameters=lambda rig, _: (
-        place_parameter(rig),
+        *place_parameters(rig),
         Parameter("frequency", "Hz", 1e-6, 1e6, logarithmic=True),
         Parameter("amplitude", "N", 1e-15, 1e9, logarithmic=True),
         Parameter("phase", "rad", -20.0, 20.0),
     ),
-    apply=lambda rig, _, v: with_element(rig, PeriodicForce(v["at"], v["frequency"], v["amplitude"], v["phase"])),
+    apply=lambda rig, _, v: with_element(rig, PeriodicForce(place_of(v), v["frequency"], v["amplitude"], v["phase"])),
     starts=_periodic_starts,
     phrase="a periodic disturbance",
 )
 
 
 def _random_starts(evidence, _):
-    for place in evidence.at_peaks[:2]:
-        yield {"at": place.at, "rms": float(np.sqrt(np.mean(place.force**2)))}
+    for place in [place for place in evidence.at_peaks if not isinstance(place.at, Between)][:2]:
+        yield {**place_values(place.at), "rms": float(np.sqrt(np.mean(place.force**2)))}
 
 
 RANDOM_DISTURBANCE = Kind(
     name="random_disturbance",
     path="environment",
     parameters=lambda rig, _: (
-        place_parameter(rig),
+        *place_parameters(rig),
         Parameter("rms", "N", 1e-15, 1e9, logarithmic=True),
     ),
-    apply=lambda rig, _, v: with_element(rig, RandomForce(v["at"], v["rms"])),
+    apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=_random_starts,
     phrase="a random disturbance",
 )

@@ -6,7 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, key_of
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, key_of, place_values
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.nonlinear import BOUC_WEN, CLEARANCE, COULOMB_FRICTION
 from workbench.gap.effects.structural import (
@@ -18,6 +18,7 @@ from workbench.gap.effects.structural import (
     TRUNCATED_MODES,
 )
 from workbench.rig.rig import Rig
+from workbench.structure.member import Structure
 
 BESIDE = 0.1  # of the length: farther out a spring does not turn the hinge, it holds the beam
 
@@ -31,11 +32,12 @@ def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
     """
     v = effect.values
     if effect.kind is COULOMB_FRICTION:
-        return (Effect(POINT_DAMPER, None, {"at": v["at"], "coefficient": v["force"] / v["smoothing_speed"]}),)
+        coefficient = v["force"] / v["smoothing_speed"]
+        return (Effect(POINT_DAMPER, None, {**place_values(effect.at), "coefficient": coefficient}),)
     if effect.kind is CLEARANCE:
-        return (Effect(GROUND_SPRING, None, {"at": v["at"], "stiffness": v["stiffness"]}),)
+        return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": v["stiffness"]}),)
     if effect.kind is BOUC_WEN:
-        return (Effect(GROUND_SPRING, None, {"at": v["at"], "stiffness": v["stiffness"]}),)
+        return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": v["stiffness"]}),)
     if effect.kind is GROUND_SPRING:
         return _turned_by(effect, rig)
     if effect.kind is NOMINAL_FIGURES:
@@ -46,7 +48,9 @@ def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
 
 
 def _turned_by(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
-    length, v = rig.modes.length, spring.values
+    if not isinstance(rig.structure, Structure):
+        return ()
+    length, v = rig.structure.length, spring.values
     end, arm = ("left", v["at"]) if v["at"] < 0.5 * length else ("right", length - v["at"])
     if arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
         return ()
@@ -62,11 +66,14 @@ def _all_alike(kind: Kind, figures: Effect, name: str, power: float) -> Effect:
 def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     """The set with two effects of one kind made one, with values to start a fit from: two springs may stand for one."""
     for one, other in combinations(effects, 2):
-        if one.kind is other.kind and one.target == other.target and "at" in one.values:
+        if one.kind is other.kind and one.target == other.target and one.at is not None:
             rest = [effect for effect in effects if effect is not one and effect is not other]
-            places = (one.values["at"], other.values["at"])
-            for at in (*places, 0.5 * sum(places)):
-                yield (*rest, replace(one, values={**one.values, "at": at}))
+            yield (*rest, one)
+            yield (*rest, one.moved_to(other.at))
+            names = [name for name in COORDINATES if isinstance(one.values.get(name), float)]
+            if names:
+                middle = {name: 0.5 * (one.values[name] + other.values[name]) for name in names}
+                yield (*rest, replace(one, values={**one.values, **middle}))
 
 
 def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:

@@ -18,18 +18,6 @@ def _names(n_modes: int) -> list[tuple[str, float, float]]:
     return [*figures, ("modal_mass", MASS_STD, 1.2)]
 
 
-class Rescaled:
-    """Shapes times a factor, with what else the shapes know."""
-
-    def __init__(self, shapes, factor: float):
-        self.shapes, self.factor = shapes, factor
-        if hasattr(shapes, "places"):
-            self.places = shapes.places
-
-    def __call__(self, x: np.ndarray, derivative: int) -> np.ndarray:
-        return self.factor * self.shapes(x, derivative)
-
-
 def _adjusted(rig: Rig, _, values: dict[str, float]) -> Rig:
     modes = rig.modes
     n = min(modes.n_modes, len(values) // 2)
@@ -38,7 +26,7 @@ def _adjusted(rig: Rig, _, values: dict[str, float]) -> Rig:
     damping[:n] = [values[f"damping_{r + 1}"] for r in range(n)]
     scale = np.sqrt(frequency * damping)
     shapes, root = modes.shapes, np.sqrt(values["modal_mass"])
-    scaled = shapes if root == 1 else Rescaled(shapes, 1.0 / root)
+    scaled = shapes if root == 1 else lambda located, derivative: shapes(located, derivative) / root
     changed = replace(
         modes, omega=modes.omega * frequency, damping=modes.damping * np.outer(scale, scale), shapes=scaled
     )

@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from workbench.gap.effects.effect import Kind, Parameter
-from workbench.gap.effects.structural import place_parameter
+from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
 from workbench.rig.elements import (
     AirDrag,
     BoucWen,
@@ -18,6 +17,7 @@ from workbench.rig.elements import (
 )
 from workbench.rig.rig import Rig
 from workbench.rig.stepping import yield_update
+from workbench.structure.member import Structure
 
 
 def with_element(rig: Rig, element) -> Rig:
@@ -28,10 +28,6 @@ def with_element(rig: Rig, element) -> Rig:
 def strength_along(force: np.ndarray, basis: np.ndarray) -> float:
     """The k for which -k basis is nearest to a force."""
     return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
-
-
-def _free_places(evidence) -> np.ndarray:
-    return evidence.places[3::8] if evidence.places.size > 8 else evidence.places
 
 
 def _stiffness(name: str, typical: float = 1.0) -> Parameter:
@@ -45,20 +41,20 @@ def _cubic_starts(evidence, _):
     for place in evidence.at_peaks:
         k = strength_along(place.force, place.displacement**3)
         for share in (0.3, 1.0, 3.0):
-            yield {"at": place.at, "stiffness": share * k}
+            yield {**place_values(place.at), "stiffness": share * k}
             if share == 1.0:
-                yield {"at": place.at, "stiffness": -share * k}
+                yield {**place_values(place.at), "stiffness": -share * k}
 
 
 def _cubic_parameters(rig: Rig, _):
-    return (place_parameter(rig), Parameter("stiffness", "N/m^3", -1e15, 1e15, scale=1.0))
+    return (*place_parameters(rig), Parameter("stiffness", "N/m^3", -1e15, 1e15, scale=1.0))
 
 
 CUBIC_SPRING = Kind(
     name="cubic_spring",
     path="structure",
     parameters=_cubic_parameters,
-    apply=lambda rig, _, v: with_element(rig, CubicSpring(v["at"], v["stiffness"])),
+    apply=lambda rig, _, v: with_element(rig, CubicSpring(place_of(v), v["stiffness"])),
     starts=_cubic_starts,
     nonlinear=True,
     phrase="a cubic spring",
@@ -86,7 +82,7 @@ MIDPLANE_STRETCHING = Kind(
     parameters=lambda rig, _: (Parameter("coefficient", "N/m", 1e-12, 1e15, logarithmic=True),),
     apply=lambda rig, _, v: with_element(rig, MidplaneStretching(v["coefficient"])),
     starts=_stretching_starts,
-    targets=lambda rig: (None,) if rig.structure is not None else (),
+    targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     nonlinear=True,
     phrase="stretching of the midplane",
 )
@@ -111,7 +107,7 @@ AIR_DRAG = Kind(
     parameters=lambda rig, _: (Parameter("coefficient", "N s^2/m^3", 1e-12, 1e12, logarithmic=True),),
     apply=lambda rig, _, v: with_element(rig, AirDrag(v["coefficient"])),
     starts=_drag_starts,
-    targets=lambda rig: (None,) if rig.structure is not None else (),
+    targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     nonlinear=True,
     phrase="air drag",
 )
@@ -122,7 +118,7 @@ AIR_DRAG = Kind(
 
 def _contact_parameters(rig: Rig, _):
     return (
-        place_parameter(rig),
+        *place_parameters(rig),
         _stiffness("stiffness"),
         Parameter("gap", "m", 1e-12, 1e6, logarithmic=True),
     )
@@ -137,8 +133,8 @@ def _contact_starts(two_sided: bool):
                 over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
                 k = strength_along(place.force, over)
                 if k > 0:
-                    yield {"at": place.at, "stiffness": k, "gap": float(gap)}
-                    yield {"at": place.at, "stiffness": 4 * k, "gap": float(gap)}
+                    yield {**place_values(place.at), "stiffness": k, "gap": float(gap)}
+                    yield {**place_values(place.at), "stiffness": 4 * k, "gap": float(gap)}
 
     return starts
 
@@ -147,7 +143,7 @@ CLEARANCE = Kind(
     name="clearance",
     path="structure",
     parameters=_contact_parameters,
-    apply=lambda rig, _, v: with_element(rig, Clearance(v["at"], v["stiffness"], v["gap"])),
+    apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
     starts=_contact_starts(True),
     nonlinear=True,
     phrase="a clearance closed on both sides by springs",
@@ -157,7 +153,7 @@ ONE_SIDED_STOP = Kind(
     name="one_sided_stop",
     path="structure",
     parameters=_contact_parameters,
-    apply=lambda rig, _, v: with_element(rig, OneSidedStop(v["at"], v["stiffness"], v["gap"])),
+    apply=lambda rig, _, v: with_element(rig, OneSidedStop(place_of(v), v["stiffness"], v["gap"])),
     starts=_contact_starts(False),
     nonlinear=True,
     phrase="a one-sided stop",
@@ -173,19 +169,19 @@ def _friction_starts(evidence, _):
         for share in (0.02, 0.1, 0.3):
             force = strength_along(place.force, np.tanh(place.velocity / (share * speed)))
             if force > 0:
-                yield {"at": place.at, "force": force, "smoothing_speed": share * speed}
-                yield {"at": place.at, "force": 2 * force, "smoothing_speed": share * speed}
+                yield {**place_values(place.at), "force": force, "smoothing_speed": share * speed}
+                yield {**place_values(place.at), "force": 2 * force, "smoothing_speed": share * speed}
 
 
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
     parameters=lambda rig, _: (
-        place_parameter(rig),
+        *place_parameters(rig),
         Parameter("force", "N", 1e-12, 1e9, logarithmic=True),
         Parameter("smoothing_speed", "m/s", 1e-9, 1e6, logarithmic=True),
     ),
-    apply=lambda rig, _, v: with_element(rig, CoulombFriction(v["at"], v["force"], v["smoothing_speed"])),
+    apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_friction_starts,
     nonlinear=True,
     phrase="a friction force",
@@ -210,19 +206,19 @@ def _bouc_wen_starts(evidence, _):
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
             k = strength_along(place.force, _hysteresis(place.displacement, share * size))
             if k > 0:
-                yield {"at": place.at, "stiffness": k, "yield_displacement": share * size}
-                yield {"at": place.at, "stiffness": 2 * k, "yield_displacement": share * size}
+                yield {**place_values(place.at), "stiffness": k, "yield_displacement": share * size}
+                yield {**place_values(place.at), "stiffness": 2 * k, "yield_displacement": share * size}
 
 
 BOUC_WEN = Kind(
     name="bouc_wen",
     path="structure",
     parameters=lambda rig, _: (
-        place_parameter(rig),
+        *place_parameters(rig),
         _stiffness("stiffness"),
         Parameter("yield_displacement", "m", 1e-12, 1e6, logarithmic=True),
     ),
-    apply=lambda rig, _, v: with_element(rig, BoucWen(v["at"], v["stiffness"], v["yield_displacement"])),
+    apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
     nonlinear=True,
     phrase="a hysteretic spring",

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.effect import ALL, Kind, Parameter
-from workbench.gap.effects.structural import known_places, place_parameter
+from workbench.gap.effects.effect import ALL, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Interval, NamedPoints
 
 OF_THE_SENSOR = "unit of the sensor"
 
@@ -149,29 +149,40 @@ ACTUATOR_DEAD_ZONE = _actuator(
 
 
 def _position_starts(evidence, _):
-    known = known_places(evidence.rig)
-    if known is not None:
-        return [{"at": float(x)} for x in known]
-    return [{"at": float(x)} for x in evidence.length * np.linspace(0.015, 0.985, 41)]
+    domain = evidence.rig.modes.domain
+    if isinstance(domain, Interval):
+        return [{"at": float(x)} for x in domain.length * np.linspace(0.015, 0.985, 41)]
+    return [place_values(where) for where in domain.grid(12)]
+
+
+def _movable(targets: Callable[[Rig], tuple]) -> Callable[[Rig], tuple]:
+    """Targets that may stand elsewhere; where shapes are known at the inputs and outputs alone, none may."""
+
+    def where_there_is_room(rig: Rig) -> tuple:
+        domain = rig.modes.domain
+        crowded = isinstance(domain, NamedPoints) and len(domain.names) <= len(rig.actuators) + len(rig.sensors)
+        return () if crowded else targets(rig)
+
+    return where_there_is_room
 
 
 ACTUATOR_MISPLACEMENT = Kind(
     name="actuator_misplacement",
     path="actuator",
-    parameters=lambda rig, _: (place_parameter(rig),),
-    apply=lambda rig, target, v: _change_actuators(rig, target, at=v["at"]),
+    parameters=lambda rig, _: place_parameters(rig),
+    apply=lambda rig, target, v: _change_actuators(rig, target, at=place_of(v)),
     starts=_position_starts,
-    targets=lambda rig: each_actuator(rig) if known_places(rig) is None else (),
+    targets=_movable(each_actuator),
     phrase="an actuator that stands elsewhere",
 )
 
 SENSOR_MISPLACEMENT = Kind(
     name="sensor_misplacement",
     path="sensor",
-    parameters=lambda rig, _: (place_parameter(rig),),
-    apply=lambda rig, target, v: _change_sensors(rig, target, at=v["at"]),
+    parameters=lambda rig, _: place_parameters(rig),
+    apply=lambda rig, target, v: _change_sensors(rig, target, at=place_of(v)),
     starts=_position_starts,
-    targets=lambda rig: each_sensor(rig) if known_places(rig) is None else (),
+    targets=_movable(each_sensor),
     phrase="a sensor that stands elsewhere",
 )
 

@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Kind, Parameter
+from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between
 from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
@@ -17,23 +18,6 @@ from workbench.structure.supports import HELD, End, PointDamper, PointMass, Poin
 
 RESOLUTION = 1e-6
 EDGE = 1e-9  # of the length
-
-
-def place_parameter(rig: Rig) -> Parameter:
-    """A position along the structure, as a parameter."""
-    length = rig.modes.length
-    return Parameter("at", "m", 0.0, length, scale=0.01 * length)
-
-
-def known_places(rig: Rig) -> np.ndarray | None:
-    """The only places where the shapes are known, for a rig of plain modal data."""
-    return getattr(rig.modes.shapes, "places", None)
-
-
-def place_name(rig: Rig, at: float) -> str:
-    """What to call a place: the input or output that stands there, for a rig of plain modal data; else x = at."""
-    names = getattr(rig.modes.shapes, "names", None)
-    return f"x = {at:.3g}" if names is None else names[round(at)]
 
 
 def resolved(rig: Rig, structure) -> Rig:
@@ -125,27 +109,27 @@ def _regressed(place, series: str) -> float:
     return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))
 
 
-def _point_starts(name: str, series: str, typical):
+def _point_starts(name: str, series: str, typical, *, between: bool = True):
     def starts(evidence, _) -> Iterable[dict[str, float]]:
         size = typical(evidence.rig)
         for place in evidence.at_peaks:
+            if isinstance(place.at, Between) and not between:
+                continue
             k = _regressed(place, series)
             for share in (0.4, 1.0, 2.0):
                 if k > 0:
-                    yield {"at": place.at, name: share * k}
-        for x in evidence.places[::2]:
+                    yield {**place_values(place.at), name: share * k}
+        for where in evidence.places_to_try:
             for share in (0.004, 0.02, 0.1, 0.4):
-                yield {"at": float(x), name: share * size}
+                yield {**place_values(where), name: share * size}
 
     return starts
 
 
 def _total_mass(rig: Rig) -> float:
-    if rig.structure is None:
-        places = known_places(rig)
-        if places is None:
-            raise ValueError("neither a structure nor the places of the modes are known; the mass cannot be told")
-        return 1.0 / float(np.mean(rig.modes.phi(places)[:, 0] ** 2))
+    if not isinstance(rig.structure, Structure):
+        elastic = int(np.argmax(rig.modes.omega > 0))
+        return 1.0 / float(np.mean(rig.modes.phi(rig.modes.domain.grid(12))[:, elastic] ** 2))
     x = (np.arange(50) + 0.5) / 50 * rig.structure.length
     return float(np.mean(rig.structure.mass_per_length(x)) * rig.structure.length)
 
@@ -162,7 +146,7 @@ def _typical_damping(rig: Rig) -> float:
 def _positive(name: str, unit: str, typical):
     def parameters(rig: Rig, _) -> tuple[Parameter, ...]:
         size = typical(rig)
-        return (place_parameter(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True))
+        return (*place_parameters(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True))
 
     return parameters
 
@@ -171,8 +155,8 @@ POINT_MASS = Kind(
     name="point_mass",
     path="structure",
     parameters=_positive("mass", "kg", _total_mass),
-    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(v["at"], v["mass"]))),
-    starts=_point_starts("mass", "acceleration", _total_mass),
+    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointMass(place_of(v), v["mass"]))),
+    starts=_point_starts("mass", "acceleration", _total_mass, between=False),
     phrase="an added mass",
 )
 
@@ -180,7 +164,7 @@ GROUND_SPRING = Kind(
     name="ground_spring",
     path="structure",
     parameters=_positive("stiffness", "N/m", _typical_stiffness),
-    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(v["at"], v["stiffness"]))),
+    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
     starts=_point_starts("stiffness", "displacement", _typical_stiffness),
     phrase="a spring to ground",
 )
@@ -189,7 +173,7 @@ POINT_DAMPER = Kind(
     name="point_damper",
     path="structure",
     parameters=_positive("coefficient", "N s/m", _typical_damping),
-    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(v["at"], v["coefficient"]))),
+    apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", _typical_damping),
     phrase="a viscous damper to ground",
 )
@@ -210,16 +194,16 @@ def _softened(rig: Rig, _, values) -> Rig:
 
 
 def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
-    length = rig.modes.length
+    length = rig.modes.domain.size
     return (
-        place_parameter(rig),
+        *place_parameters(rig),
         Parameter("width", "m", 0.005 * length, 0.2 * length, scale=0.02 * length),
         Parameter("loss", "", 1e-4, 0.95, scale=0.1),
     )
 
 
 def _loss_starts(evidence, _):
-    length = evidence.length
+    length = evidence.domain.size
     for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
         for loss in (0.003, 0.01, 0.03, 0.12, 0.45):
             yield {"at": x * length, "width": min(0.1, 1.5 * x, 1.5 - 1.5 * x) * length, "loss": loss}
@@ -231,7 +215,7 @@ LOCAL_STIFFNESS_LOSS = Kind(
     parameters=_loss_parameters,
     apply=solved_once(_softened),
     starts=_loss_starts,
-    targets=lambda rig: (None,) if rig.structure is not None else (),
+    targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
     phrase="a local loss of stiffness",
 )
 
@@ -333,7 +317,7 @@ TRUNCATED_MODES = Kind(
     parameters=lambda rig, _: (),
     apply=solved_once(_truncated),
     starts=lambda evidence, _: [{}],
-    targets=lambda rig: tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)) if rig.structure else (),
+    targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
 )
 

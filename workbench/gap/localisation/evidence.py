@@ -1,13 +1,14 @@
 """What the records say before any effect is guessed: the missing force, its place, and the motion there."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from workbench.gap.effects.structural import known_places
+from workbench.gap.localisation.force_lines import lines_of, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
     ForceFilter,
@@ -20,12 +21,17 @@ from workbench.gap.prediction.unmodelled_force import (
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
+from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Rectangle, Where
 
 LEVELS = (1e-3, 1e-2, 1e-1, 1.0)  # rms of a missing force over that of the inputs
 MEMORIES = (10.0, 1000.0)  # its correlation time, in samples
 MOST_PEAKS = 3
 PLACES, FEWER_PLACES = 40, 20  # where a force is looked for: the first, and one beside what is given
 BESIDE, RESOLVED = 0.95, 2e-3  # of the spacing of places
+STILL = 1e-6  # of what moves most: a point, or what is between two, that no force moves
+FINER = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
+POINTS_TRIED, PAIRS_TRIED = 4, 4  # named points, and pairs of them, whose motion is looked at
+CROWD = 12  # named points, of which all are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +39,12 @@ class Place:
     """The missing force at a point and the motion there, one row a record joined end to end.
 
     Attributes:
-        at: m.
+        at: on the structure.
         force: (n_total,) N.
-        displacement, velocity, acceleration: (n_total,) at x, of the real structure as far as the records tell.
+        displacement, velocity, acceleration: (n_total,) there, of the real structure as far as the records tell.
     """
 
-    at: float
+    at: Where
     force: np.ndarray
     displacement: np.ndarray
     velocity: np.ndarray
@@ -55,7 +61,7 @@ class Evidence:
         motions: its motion, one a record.
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
         n_places: where a force is looked for.
-        told: places of the force, m, where they are known from elsewhere.
+        told: places of the force, where they are known from elsewhere.
         sized: its rms, N, and correlation time, in samples, likewise.
         workers: processes that share the work.
     """
@@ -65,7 +71,7 @@ class Evidence:
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
     n_places: int = PLACES
-    told: tuple[float, ...] = ()
+    told: tuple[Where, ...] = ()
     sized: tuple[float, float] | None = None
     workers: Workers = ALONE
 
@@ -90,61 +96,123 @@ class Evidence:
             residuals=tuple(residual[kept] for residual in self.residuals),
         )
 
-    def of_force_at(self, *places: float) -> "Evidence":
-        """The same evidence of a force at places that are known, m."""
+    def of_force_at(self, *places: Where) -> "Evidence":
+        """The same evidence of a force at places that are known."""
         return replace(self, told=places, sized=self.size)
 
     @property
-    def length(self) -> float:
-        return self.rig.modes.length
+    def domain(self) -> Domain:
+        return self.rig.modes.domain
 
     @cached_property
     def model(self) -> SampledModel:
         noise = self.data.noise
         return sampled_model(self.rig.modes, self.rig.sensors, noise, self.data.counted[0].sample_time)
 
-    def filter_at(self, x: float, rms: float, memory: float) -> ForceFilter:
-        """The filter for an unknown force at x of that rms, N, and correlation time, in samples."""
+    def filter_at(self, where: Where, rms: float, memory: float) -> ForceFilter:
+        """The filter for an unknown force somewhere of that rms, N, and correlation time, in samples."""
         modes, sample_time = self.rig.modes, self.data.counted[0].sample_time
-        return wandering_force_filter(modes, self.model, modes.phi(x)[0], rms, memory * sample_time, sample_time)
+        return wandering_force_filter(modes, self.model, modes.phi_at(where), rms, memory * sample_time, sample_time)
 
     @cached_property
-    def places(self) -> np.ndarray:
-        """Positions along the structure where a missing force is looked for, m."""
-        known = known_places(self.rig)
-        if known is not None:
-            return np.asarray(known, float)
-        return self.length * np.arange(1, self.n_places) / self.n_places
+    def places(self) -> Sequence[Any]:
+        """Where an unmodelled force is looked for: all over the structure, or at named points and between them."""
+        if isinstance(self.domain, Interval):
+            return self.domain.length * np.arange(1, self.n_places) / self.n_places
+        if isinstance(self.domain, NamedPoints):
+            places = (*self.domain.grid(), *self.domain.pairs())
+            moved = [float(np.abs(self.rig.modes.phi_at(where)).max()) for where in places]
+            return tuple(where for where, size in zip(places, moved, strict=True) if size > STILL * max(moved))
+        return self.domain.grid(self._along)
+
+    @cached_property
+    def places_to_try(self) -> Sequence[Any]:
+        """Fewer of them, spread out, where linear effects are tried whatever force is missing."""
+        if isinstance(self.domain, Interval):
+            return [float(x) for x in self.places[::2]]
+        if isinstance(self.domain, NamedPoints):
+            return self.domain.grid() if len(self.domain.names) <= CROWD else ()
+        return self.domain.grid(6)
 
     @cached_property
     def size(self) -> tuple[float, float]:
         """Rms, N, and correlation time, in samples, of the missing force: the likeliest of a coarse grid."""
         if self.sized is not None:
             return self.sized
-        coarse = self.places[::5] if self.places.size > 8 else self.places
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
         sizes = [(share * self.data.force_rms, memory) for memory in MEMORIES for share in LEVELS]
+
+        coarse = self._coarse
 
         def likelihood(size: tuple[float, float]) -> float:
             return max(log_likelihood(self.filter_at(x, *size), quick) for x in coarse)
 
         return max(zip(self.workers.map(likelihood, sizes), sizes, strict=True), key=lambda each: each[0])[1]
 
+    @property
+    def _coarse(self) -> Sequence[Any]:
+        """A few places, of which one is near enough to tell how large the force is."""
+        if isinstance(self.domain, Interval):
+            return self.places[::5]
+        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= CROWD:
+            return self.domain.grid()
+        return self._screened[:MOST_PEAKS]
+
     @cached_property
     def profile(self) -> np.ndarray:
-        """Log-likelihood of an unknown force at each of `places`."""
+        """Log-likelihood of an unknown force at each of `places`; but for an interval, the ends of records left out."""
+        if not isinstance(self.domain, Interval):
+            return -0.5 * self._misfits(self.places)
         residuals, size = list(self.residuals), self.size
         along = self.workers.map(lambda x: log_likelihood(self.filter_at(x, *size), residuals), self.places)
         return np.array(along)
 
+    def _misfits(self, places: Sequence[Any]) -> np.ndarray:
+        """What one force of any law at each of the places leaves, in units of the noise."""
+        shapes = np.array([self.rig.modes.phi_at(where) for where in places])
+        return sum(screened(lines, shapes) for lines in self._lines)
+
     @cached_property
-    def peaks(self) -> tuple[float, ...]:
-        """The likeliest places of a missing force, best first, refined between the grid points."""
+    def _lines(self):
+        return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
+
+    @cached_property
+    def _screened(self) -> tuple[Any, ...]:
+        """The likeliest of `places`, best first: tops of a rectangle's profile, some named points and pairs of them."""
+        order = np.argsort(-self.profile, kind="stable")
+        ranked = [self.places[i] for i in order]
+        if isinstance(self.domain, Rectangle):
+            return tuple(self._nearby(top) for top in _tops(ranked, self.domain, 1.5 * self._spacing))
+        pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
+        points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
+        most = len(points) if len(points) <= CROWD else POINTS_TRIED
+        return tuple(ranked[i] for i in sorted((*points[:most], *pairs[:PAIRS_TRIED])))
+
+    @property
+    def _spacing(self) -> float:
+        return max(self.domain.length) / self._along  # type: ignore[union-attr, arg-type]
+
+    @property
+    def _along(self) -> int:
+        """Spacings along the longer side of a rectangle."""
+        return max(self.n_places // 2, 16)
+
+    def _nearby(self, top: tuple[float, float]) -> tuple[float, float]:
+        """The likeliest place beside one of a rectangle's grid."""
+        a, b = self.domain.length  # type: ignore[union-attr, misc]
+        offsets = self._spacing * np.arange(-FINER, FINER + 1) / FINER
+        xs, ys = np.clip(top[0] + offsets, 0.0, a), np.clip(top[1] + offsets, 0.0, b)
+        beside = [(float(x), float(y)) for x in xs for y in ys]
+        return beside[int(np.argmin(self._misfits(beside)))]
+
+    @cached_property
+    def peaks(self) -> tuple[Any, ...]:
+        """The likeliest places of an unmodelled force, best first, refined between the grid points."""
         if self.told:
             return self.told
+        if not isinstance(self.domain, Interval):
+            return self._screened
         profile, places = self.profile, self.places
-        if known_places(self.rig) is not None:
-            return tuple(places[np.argsort(-profile)])
         padded = np.r_[-np.inf, profile, -np.inf]
         tops = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
         refined = self.workers.map(self._refined, places[tops[np.argsort(-profile[tops])][:MOST_PEAKS]])
@@ -163,14 +231,14 @@ class Evidence:
 
     @cached_property
     def at_peaks(self) -> tuple[Place, ...]:
-        """The missing force and the motion at the three likeliest places."""
+        """The missing force and the motion at the likeliest places."""
         _ = self.size  # found once, before the work is shared
         return tuple(self.workers.map(self.place, self.peaks))
 
-    def place(self, x: float) -> Place:
-        """The missing force at x and the motion there, smoothed."""
-        kalman = self.filter_at(x, *self.size)
-        n, shape = self.rig.modes.n_modes, self.rig.modes.phi(x)[0]
+    def place(self, where: Where) -> Place:
+        """The missing force somewhere and the motion there, smoothed."""
+        kalman = self.filter_at(where, *self.size)
+        n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
         pieces = []
         for motion, residual in zip(self.motions, self.residuals, strict=True):
             states = smoothed_states(kalman, residual)
@@ -184,4 +252,15 @@ class Evidence:
                     shape @ (motion.acceleration + error_a) + shape @ shape * force,
                 )
             )
-        return Place(x, *(np.concatenate(series) for series in zip(*pieces, strict=True)))
+        return Place(where, *(np.concatenate(series) for series in zip(*pieces, strict=True)))
+
+
+def _tops(ranked: Sequence[tuple[float, float]], rectangle: Rectangle, apart: float) -> list[tuple[float, float]]:
+    """The first few places, best first, that stand apart from those before them, m."""
+    tops: list[tuple[float, float]] = []
+    for where in ranked:
+        if all(rectangle.distance(where, other) > apart for other in tops):
+            tops.append(where)
+        if len(tops) == MOST_PEAKS:
+            break
+    return tops

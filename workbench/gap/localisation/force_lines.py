@@ -99,6 +99,17 @@ class Lines:
         return self.answers.along(h), np.sum(h * self.left, axis=1), power
 
 
+def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
+    """About what a force leaves where the modes have each of many shapes (n_places, n_modes): the ends are left out."""
+    to_force = np.moveaxis(np.array([lines.answers.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
+    left = np.full(len(shapes), lines.power)
+    for h, r, weight in zip(to_force, lines.left, lines.weights, strict=True):
+        seen = h @ shapes.T
+        power = np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300)
+        left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2 / power
+    return left
+
+
 def _smooth(values: np.ndarray) -> np.ndarray:
     width = min(WIDTH, values.size)
     return np.convolve(np.pad(values, (width // 2, width - 1 - width // 2), mode="edge"), np.ones(width), mode="valid")

@@ -1,17 +1,20 @@
 """The place of a missing force along the structure, with its uncertainty, before any law is guessed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 
-from workbench.gap.effects.structural import known_places
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.localisation.force_lines import Lines, lines_of
+from workbench.gap.localisation.force_lines import Lines, lines_of, screened
+from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 
 VALLEYS = 3  # of the misfit that are gone into
 ROUNDS = 3  # in each: where the force is, which lines tell of it
 BESIDE, RESOLVED = 0.95, 1e-3  # of the spacing of places
+PAIRS_SHOWN = 12  # of named points
 TWO_SIGMA = 4.0  # rise of the misfit
 NOISE, ALL_BUT = 0.1, 1e-5  # left by what may be one force: of the noise, and of the gap
 CHANCE = 3.0  # deviations of a sum of squares
@@ -22,19 +25,19 @@ class Placed:
     """How likely one force, of any law, is at each place, and where it is likeliest.
 
     Attributes:
-        places: (n_places,) m.
+        places: (n_places,) on the structure.
         profile: (n_places,) log-likelihood there, less that of the likeliest place.
-        at: the likeliest place, m.
+        at: the likeliest place.
         at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
-            beyond the noise; 0 for named places.
+            beyond the noise; on a rectangle along the longer axis of the region; 0 for named places.
         share: of the gap's power above the noise, what one force there accounts for.
         holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing tells:
             no gap, one sensor, or records too short.
     """
 
-    places: np.ndarray
+    places: Sequence[Any]
     profile: np.ndarray
-    at: float
+    at: Any
     at_std: float
     share: float
     holds: bool | None
@@ -46,23 +49,35 @@ def placed(evidence: Evidence) -> Placed:
     One sensor tells no place: a force anywhere accounts for all that it reads. Sensors that lag are left out.
     """
     evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
-    named = known_places(evidence.rig) is not None
-    guess, places, length = evidence.peaks[0], evidence.places, evidence.length
+    domain, guess, places = evidence.domain, evidence.peaks[0], evidence.places
     if len(evidence.rig.sensors) < 2:
-        return Placed(places, np.zeros(places.size), guess, 0.0 if named else length / np.sqrt(12.0), 0.0, None)
+        unsure = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
+        return Placed(places, np.zeros(len(places)), guess, unsure, 0.0, None)
     lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
     search = _Search(evidence, lines)
     telling = search.telling(guess)
-    profile = search.along(telling, places)
-    if named:
-        at, std = float(places[int(np.argmin(profile))]), 0.0
-    else:
+    if isinstance(domain, Interval):
+        profile = search.along(telling, places)
         at = min(evidence.workers.map(search.refined, _valleys(places, profile)), key=search.judged)
         telling = search.telling(at)
         profile, std = search.along(telling, places), search.deviation(telling, at)
+    elif isinstance(domain, Rectangle):
+        at, std = min(map(search.refined_over, evidence.peaks), key=lambda found: search.judged(found[0]))
+        telling = search.telling(at)
+        profile = search.screened(telling, places)
+    else:
+        places = _shown(places, evidence.profile)
+        profile = search.along(telling, places)
+        at, std = places[int(np.argmin(profile))], 0.0
     lowest = min(search.misfit(telling, at), profile.min())
     std *= np.sqrt(max(search.left(at), 0.0) + 1.0)
     return Placed(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
+
+
+def _shown(places: Sequence[Any], profile: np.ndarray) -> list[Any]:
+    """All named points, and the likeliest pairs of them."""
+    ranked = [places[i] for i in np.argsort(-profile, kind="stable") if isinstance(places[i], Between)]
+    return [*(where for where in places if not isinstance(where, Between)), *ranked[:PAIRS_SHOWN]]
 
 
 def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
@@ -77,27 +92,27 @@ class _Search:
     evidence: Evidence
     lines: list[Lines]
 
-    def shape(self, x: float) -> np.ndarray:
-        return self.evidence.rig.modes.phi(x)[0]
+    def shape(self, where: Any) -> np.ndarray:
+        return self.evidence.rig.modes.phi_at(where)
 
-    def telling(self, x: float) -> list[Lines]:
-        """The lines by how much they tell of a force at x."""
-        shape = self.shape(x)
+    def telling(self, where: Any) -> list[Lines]:
+        """The lines by how much they tell of a force somewhere."""
+        shape = self.shape(where)
         return [each.weighed(each.telling(shape)) for each in self.lines]
 
-    def misfit(self, lines: list[Lines], x: float) -> float:
-        shape = self.shape(x)
+    def misfit(self, lines: list[Lines], where: Any) -> float:
+        shape = self.shape(where)
         return sum(each.misfit(shape) for each in lines)
 
     @property
     def freedom(self) -> int:
         return sum(each.freedom for each in self.lines)
 
-    def left(self, at: float) -> float:
+    def left(self, at: Any) -> float:
         """What a force there leaves beyond the noise, per value, in units of the noise."""
         return self.misfit(self.lines, at) / max(self.freedom, 1) - 1.0
 
-    def of_one_force(self, at: float) -> tuple[float, bool | None]:
+    def of_one_force(self, at: Any) -> tuple[float, bool | None]:
         """Share of the gap's power that a force there accounts for, and whether it is all of it."""
         values = 2 * sum(each.left.size for each in self.lines)
         gap = sum(each.power for each in self.lines) - values
@@ -107,9 +122,32 @@ class _Search:
         share = float(np.clip(1.0 - left * self.freedom / gap, 0.0, 1.0))
         return share, bool(left < NOISE + chance or share > 1.0 - ALL_BUT)
 
-    def along(self, lines: list[Lines], places: np.ndarray) -> np.ndarray:
+    def along(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:
         """The misfit at each of the places."""
         return np.array(self.evidence.workers.map(lambda x: self.misfit(lines, x), places))
+
+    def screened(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:
+        """About the misfit at each of many places: the ends of the records are left out."""
+        shapes = np.array([self.shape(where) for where in places])
+        return sum(screened(each, shapes) for each in lines)
+
+    def refined_over(self, top: tuple[float, float]) -> tuple[tuple[float, float], float]:
+        """The bottom of a valley over a rectangle, and one standard deviation along its longer axis, m."""
+        rectangle, telling = self.evidence.domain, self.telling(top)
+        extent = np.array(rectangle.length)
+
+        def misfit(xy: np.ndarray) -> float:
+            inside = np.clip(xy, 1e-4 * extent, (1.0 - 1e-4) * extent)
+            return self.misfit(telling, (float(inside[0]), float(inside[1])))
+
+        reach = 0.02 * rectangle.size
+        simplex = np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
+        options = {"initial_simplex": simplex, "xatol": 1e-3 * reach, "fatol": 1e-2, "maxfev": 60}
+        found = minimize(misfit, top, method="Nelder-Mead", options=options)
+        at = np.clip(found.x, 1e-4 * extent, (1.0 - 1e-4) * extent)
+        rises = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in 0.1 * reach * np.array([(1, 0), (0, 1)])]
+        flattest = max(min(rises), 1e-12)  # of |r|², twice the logarithm of a likelihood ratio
+        return (float(at[0]), float(at[1])), float(min(0.1 * reach * np.sqrt(2.0 / flattest), rectangle.size))
 
     def refined(self, top: float) -> float:
         """The bottom of a valley."""
@@ -129,7 +167,7 @@ class _Search:
                 break
         return at
 
-    def judged(self, at: float) -> float:
+    def judged(self, at: Any) -> float:
         """The misfit of a valley by all lines alike: those that one of them weighs would favour it."""
         return self.misfit(self.lines, at)
 
@@ -140,7 +178,7 @@ class _Search:
 
     def _rises(self, lines: list[Lines], at: float, side: float, level: float) -> float:
         """How far on one side the misfit comes to a level."""
-        length = self.evidence.length
+        length = self.evidence.domain.size
         inside, outside = 0.0, 1e-5 * length
         while outside < length and 0 < at + side * outside < length:
             if self.misfit(lines, at + side * outside) > level:
@@ -153,5 +191,6 @@ class _Search:
         return outside
 
     def _inside(self, low: float, high: float) -> tuple[float, float]:
-        edge = 1e-4 * self.evidence.length
-        return max(low, edge), min(high, self.evidence.length - edge)
+        length = self.evidence.domain.size
+        edge = 1e-4 * length
+        return max(low, edge), min(high, length - edge)

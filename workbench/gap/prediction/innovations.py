@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from workbench.gap.effects.structural import known_places
 from workbench.gap.prediction.unmodelled_force import driven, force_filter, sampled_model
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import follow, move, read
+from workbench.structure.domain import Interval, Where
 
 LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
 
@@ -34,20 +34,21 @@ class Follower:
         force: float,
         sample_time: float,
         *,
-        at: float = 0.0,
+        at: Where | None = None,
         rms: float = 0.0,
         loose: float = LOOSE,
     ) -> "Follower":
-        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, m, N.
+        """For sensors of that noise (n_outputs,), and inputs of that rms, N; and a random force at a place, N.
 
         Args:
             loose: how far the rig may go its own way: random forces on it, as a share of the inputs, the less the more.
         """
         modes, n = rig.modes, rig.modes.n_modes
-        places = known_places(rig)
-        along = (np.arange(50) + 0.5) / 50 * modes.length if places is None else places
+        domain = modes.domain
+        along = (np.arange(50) + 0.5) / 50 * domain.length if isinstance(domain, Interval) else domain.grid(12)
         forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
-        patterns, variances = np.column_stack([np.eye(n), modes.phi(at)[0]]), np.r_[forces**2, rms**2]
+        shape = np.zeros(n) if at is None else modes.phi_at(at)
+        patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
         found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), patterns, variances, 0.0)
         gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
         return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
@@ -90,7 +91,7 @@ class Follower:
             sample_time: s.
             substeps: of a sample, where damping couples the modes.
         """
-        sensors = tuple(Sensor(sensor.name, sensor.at, sensor.quantity, gain=sensor.gain) for sensor in rig.sensors)
+        sensors = tuple(Sensor(s.name, s.at, s.quantity, gain=s.gain, direction=s.direction) for s in rig.sensors)
         bare = replace(rig, actuators=(), elements=(), sensors=sensors)
         gain, no_inputs = self._gain_for(rig.modes.n_modes), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps

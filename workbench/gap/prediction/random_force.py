@@ -18,6 +18,7 @@ from workbench.gap.prediction.unmodelled_force import (
     whiten,
 )
 from workbench.rig.rig import Rig
+from workbench.structure.domain import NamedPoints, Where, same_place
 
 COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))
 LEVEL_SPREAD = 0.15
@@ -31,9 +32,9 @@ class RandomForceFit:
     """A random force at x with the same strength and colour in every record.
 
     Attributes:
-        at: m.
+        at: where it acts.
         rms: of the process, N; its part above what the structure answers to is a guess.
-        at_std: standard deviation, m.
+        at_std: standard deviation of each coordinate of the place, m; none of a named point.
         memory, stages: colour of the force; see `force_filter`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
         chi2_by_record: (n_records,) mean squares of the whitened residual.
@@ -42,9 +43,9 @@ class RandomForceFit:
         tonal: least share of the force of a record that one sinusoid accounts for.
     """
 
-    at: float
+    at: Where
     rms: float
-    at_std: float
+    at_std: tuple[float, ...]
     memory: float
     stages: int
     cost: float
@@ -72,61 +73,75 @@ class RandomForceFit:
 
 
 def fit_random_force(
-    rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[float], size: float
+    rig: Rig, data: FitData, residuals: Sequence[np.ndarray], places: Sequence[Where], size: float
 ) -> RandomForceFit:
     """Maximum likelihood of place, strength and colour, from the best of a grid.
 
     Args:
         residuals: (n_outputs, n_samples) a record, in the sensors' units.
-        places: positions to start from, m.
+        places: to start from; named points are compared as they are.
         size: a typical force, N.
     """
     model = sampled_model(rig.modes, rig.sensors, data.noise, data.counted[0].sample_time)
-    residuals, length = list(residuals), rig.modes.length
+    residuals, domain = list(residuals), rig.modes.domain
     quick = residuals[:2]
+    extent = np.zeros(0) if isinstance(domain, NamedPoints) else np.atleast_1d(domain.length)
+    d = extent.size  # coordinates of a place that can be fitted
 
-    def filter_at(x: float, log_rms: float, memory: float, stages: int) -> ForceFilter:
+    def placed_at(point: np.ndarray, start: Where) -> Where:
+        return start if d == 0 else same_place(point[:d] * extent)
+
+    def filter_at(where: Where, log_rms: float, memory: float, stages: int) -> ForceFilter:
         variance = np.exp(2.0 * log_rms) / _power(memory, stages)
-        return force_filter(model, rig.modes.phi(x * length).T, np.array([variance]), memory, stages)
+        return force_filter(model, rig.modes.phi_at(where)[:, None], np.array([variance]), memory, stages)
 
-    def loss(point: np.ndarray, stages: int, records: list[np.ndarray]) -> float:
-        x, memory = point[0], 1.0 / (1.0 + np.exp(-point[2]))
-        if not 0.0 < x < 1.0 or memory > 0.9995:
+    def loss(point: np.ndarray, start: Where, stages: int, records: list[np.ndarray]) -> float:
+        memory = 1.0 / (1.0 + np.exp(-point[d + 1]))
+        if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > 0.9995:
             return 1e300
-        value = -2.0 * log_likelihood(filter_at(x, point[1], memory, stages), records)
+        value = -2.0 * log_likelihood(filter_at(placed_at(point, start), point[d], memory, stages), records)
         return value if np.isfinite(value) else 1e300
 
     grid = [
-        (np.array([x / length, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))]), stages)
-        for x in places
+        (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], where, stages)
+        for where in places
+        for within in [_fractions(where, extent)]
         for share in (3e-3, 3e-2, 3e-1)
         for memory, stages in COLOURS
     ]
-    start, stages = min(grid, key=lambda candidate: loss(candidate[0], candidate[1], quick))
-    simplex = np.array([start, start + (0.03, 0, 0), start + (0, 0.5, 0), start + (0, 0, 0.7)])
+    start, beside, stages = min(grid, key=lambda candidate: loss(*candidate, quick))
+    simplex = start + np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, 0.03), 0.5, 0.7])])
     options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 160}
-    found = minimize(loss, start, args=(stages, residuals), method="Nelder-Mead", options=options)
-    x, log_rms, logit = found.x
+    found = minimize(loss, start, args=(beside, stages, residuals), method="Nelder-Mead", options=options)
+    at, log_rms, logit = placed_at(found.x, beside), found.x[d], found.x[d + 1]
     memory = float(1.0 / (1.0 + np.exp(-logit)))
-    kalman = filter_at(x, log_rms, memory, stages)
+    kalman = filter_at(at, log_rms, memory, stages)
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
     forces = [smoothed_states(kalman, r)[2 * rig.modes.n_modes] for r in residuals]
     return RandomForceFit(
-        at=float(x * length),
+        at=at,
         rms=float(np.exp(log_rms)),
-        at_std=_deviation(lambda p: loss(p, stages, residuals), found.x, 0, 2e-3) * length,
+        at_std=tuple(
+            _deviation(lambda p: loss(p, beside, stages, residuals), found.x, i, 2e-3) * float(extent[i])
+            for i in range(d)
+        ),
         memory=memory,
         stages=stages,
         cost=float((found.fun - noise_part) / n_values),
         chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
         rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
         follows=max(
-            followed(force, record.inputs, rig.modes.phi(x * length)[0] @ np.array([m.displacement, m.velocity]))
+            followed(force, record.inputs, rig.modes.phi_at(at) @ np.array([m.displacement, m.velocity]))
             for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
         ),
         tonal=min(tonal(force, data.counted[0].sample_time) for force in forces),
     )
+
+
+def _fractions(where: Where, extent: np.ndarray) -> np.ndarray:
+    """A place in shares of the extent (n_coordinates,)."""
+    return np.atleast_1d(np.asarray(where)) / extent if extent.size else np.zeros(0)
 
 
 def tonal(force: np.ndarray, sample_time: float) -> float:
@@ -138,7 +153,7 @@ def tonal(force: np.ndarray, sample_time: float) -> float:
 def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceFilter:
     """The filter of a fitted random force."""
     variance = found.rms**2 / _power(found.memory, found.stages)
-    return force_filter(model, rig.modes.phi(found.at).T, np.array([variance]), found.memory, found.stages)
+    return force_filter(model, rig.modes.phi_at(found.at)[:, None], np.array([variance]), found.memory, found.stages)
 
 
 def _power(memory: float, stages: int) -> float:

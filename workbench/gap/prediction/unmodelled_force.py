@@ -48,7 +48,7 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
     feedthrough = np.zeros((len(sensors), n))
     for j, sensor in enumerate(sensors):
         derivative, order = MEASURED[sensor.quantity]
-        shape = sensor.gain * modes.phi(sensor.at, derivative)[0]
+        shape = sensor.gain * modes.phi_at(sensor.at, derivative, direction=sensor.direction)
         if order < 2:
             output[j, order * n : (order + 1) * n] = shape
         else:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.structural import RESOLUTION
 from workbench.gap.localisation.evidence import Evidence
@@ -14,6 +14,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate
+from workbench.structure.domain import Between, Where, same_place
 
 ALIKE = 0.995
 SEEN = 25.0  # of chi-squared: five standard deviations
@@ -238,22 +239,23 @@ def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
         yield from _by_decades(starts[0], evidence.rig)
         yield from starts[1:]
         yield from _by_decades(starts[-1], evidence.rig)
-        if "at" in starts[0].values:
-            liveliest = replace(starts[0], values={**starts[0].values, "at": _liveliest(evidence)})
+        if starts[0].at is not None:
+            liveliest = starts[0].moved_to(_liveliest(evidence))
             yield liveliest
             yield from _by_decades(liveliest, evidence.rig)
 
 
-def _liveliest(evidence: Evidence) -> float:
-    """The place that moves most, of those where a force is looked for, m."""
+def _liveliest(evidence: Evidence) -> Where:
+    """The place that moves most, of those where a force is looked for."""
     power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
-    shapes = evidence.rig.modes.phi(evidence.places)
-    return float(evidence.places[np.argmax(np.sum((shapes @ power) * shapes, axis=1))])
+    places = [where for where in evidence.places if not isinstance(where, Between)]
+    shapes = evidence.rig.modes.phi(places)
+    return same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
 
 
 def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:
     for factor in DECADES:
         for parameter in effect.parameters(rig):
-            if parameter.name != "at":
+            if parameter.name not in COORDINATES:
                 moved = float(np.clip(effect.values[parameter.name] * factor, parameter.low, parameter.high))
                 yield replace(effect, values={**effect.values, parameter.name: moved})

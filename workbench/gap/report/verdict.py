@@ -1,23 +1,25 @@
 """The verdict on a gap: where, which, how far, in a sentence and as JSON."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from workbench.gap.effects.beyond import any_beyond
-from workbench.gap.effects.effect import ALL, Effect
+from workbench.gap.effects.effect import ALL, COORDINATES, Effect
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_FIGURES
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
-from workbench.gap.effects.structural import known_places, place_name
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
 from workbench.gap.report.shrinkage import Shrinkage
 from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Between, NamedPoints
 
-BESIDE = 0.02  # of the length: as near as a place is asked for
+BESIDE = 0.02  # of the extent: as near as a place is asked for
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +72,12 @@ class Verdict:
             return False
         if self.outcome != "explained":
             return True
-        near = max(3.0 * self.where.at_std, BESIDE * self.nominal.modes.length)
-        acting = [e for e in self.effects if "at" in e.values and e.kind.path in ("structure", "environment")]
-        return any(abs(effect.values["at"] - self.where.at) < near for effect in acting)
+        domain = self.nominal.modes.domain
+        acting = [e for e in self.effects if e.at is not None and e.kind.path in ("structure", "environment")]
+        if isinstance(domain, NamedPoints):
+            return any(domain.separation(effect.at, self.where.at) == 0 for effect in acting)
+        near = max(3.0 * self.where.at_std / domain.size, BESIDE)
+        return any(domain.separation(effect.at, self.where.at) < near for effect in acting)
 
     @property
     def nominal_figures(self) -> dict[str, float | None]:
@@ -149,23 +154,33 @@ class Verdict:
 
 def effect_json(effect: Effect, nominal: Rig) -> dict:
     """One effect: kind, parameters with their standard deviations, place, input or output."""
-    values = {name: value for name, value in effect.values.items() if name != "at"}
+    values = {name: value for name, value in effect.values.items() if name not in COORDINATES}
     if effect.kind.name == "truncated_modes":
         values = {"kept": nominal.modes.n_modes, "needed": int(effect.target or 0)}
     if "phase" in values:
         values["phase"] = float((values["phase"] + np.pi) % (2.0 * np.pi) - np.pi)
     entry: dict = {"kind": effect.kind.name, "parameters": {n: _rounded(v) for n, v in values.items()}}
-    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n != "at"}
+    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n not in COORDINATES}
     if deviations:
         entry["parameters_std"] = deviations
     if effect.kind.path in ("actuator", "sensor"):
         entry["input" if effect.kind.path == "actuator" else "output"] = effect.target
     if effect.kind.name == "support_rotation":
         entry["at"], entry["at_std"] = (0.0 if effect.target == "left" else nominal.modes.length), 0.0
-    elif "at" in effect.values:
-        entry["at"] = _rounded(effect.values["at"])
-        entry["at_std"] = _rounded(effect.deviations.get("at", 0.0))
+    elif effect.at is not None:
+        entry |= _place_json(effect.at)
+        spread = [_rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
+        entry["at_std"] = spread if len(spread) > 1 else spread[0]
     return entry
+
+
+def _place_json(where: Any) -> dict[str, Any]:
+    """A place as the case format writes it: x, [x, y], the name of a point, or the two it is between."""
+    if isinstance(where, Between):
+        return {"between": list(where)}
+    if isinstance(where, tuple):
+        return {"at": [_rounded(coordinate) for coordinate in where]}
+    return {"at": where if isinstance(where, str) else _rounded(where)}
 
 
 def where_json(where: Where) -> dict:
@@ -176,7 +191,7 @@ def where_json(where: Where) -> dict:
         "amplitude_dependent": where.amplitude_dependent,
         "linear_share": _rounded(where.linear_share),
         "point": {
-            "at": _rounded(where.at),
+            **_place_json(where.at),
             "at_std": _rounded(where.at_std),
             "share": _rounded(where.place.share),
             "one_force": where.place.holds,
@@ -202,7 +217,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
     numbers = [
         " ".join((name.replace("_", " "), _with_deviation(effect.values[name], effect.deviations.get(name, 0.0)), unit))
         for name, unit in units.items()
-        if name != "at"
+        if name not in COORDINATES
     ]
     text = effect.kind.words
     if effect.kind is NOMINAL_FIGURES:
@@ -215,11 +230,19 @@ def _described(effect: Effect, nominal: Rig) -> str:
         text += ", all of them" if effect.target == ALL else f", {effect.target}"
     elif effect.kind.name == "support_rotation":
         text += f" at the {effect.target} end"
-    if "at" in effect.values and known_places(nominal) is not None:
-        text += f" at {place_name(nominal, effect.values['at'])}"
-    elif "at" in effect.values:
-        text += f" at x = {_with_deviation(effect.values['at'], effect.deviations.get('at', 0.0))}"
+    if effect.at is not None:
+        text += f" {place_in_words(effect.at, effect.deviations)}"
     return text
+
+
+def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
+    """Such as: at x = 3.40 ± 0.01; at (0.63 ± 0.01, 0.72 ± 0.01); at F1.4y; between F1.4y and F2.4y."""
+    if isinstance(where, Between):
+        return f"between {where.first} and {where.second}"
+    if isinstance(where, tuple):
+        x, y = (_with_deviation(value, deviations.get(n, 0.0)) for n, value in zip("xy", where, strict=True))
+        return f"at ({x}, {y})"
+    return f"at {where}" if isinstance(where, str) else f"at x = {_with_deviation(where, deviations.get('at', 0.0))}"
 
 
 def _off_by(figures: Effect) -> str:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect, apply_all, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Follower
@@ -17,9 +17,11 @@ from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
+from workbench.structure.domain import Between, NamedPoints
 
 NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
 RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
+STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
 FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
 SPREAD = 0.5  # of the missing force's level over records: most forces of the rig's own follow the level of the inputs
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
@@ -34,7 +36,7 @@ def looks_random(evidence: Evidence) -> bool:
         return False
     if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
         return False
-    shape = evidence.rig.modes.phi(place.at)[0]
+    shape = evidence.rig.modes.phi_at(place.at)
     motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in evidence.motions]
     each = zip(forces, records, motions, strict=True)
     return max(followed(force, record.inputs, motion) for force, record, motion in each) < FOLLOWS
@@ -73,7 +75,7 @@ def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
         return [f for f in fits if beside.surely_better(f, cost, f.n_parameters)]
 
     found = fitted(evidence)
-    places = [f.effects[0].values["at"] for f in found if "at" in f.effects[0].values]
+    places = [f.effects[0].at for f in found if f.effects[0].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
     return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RIVAL]
@@ -147,7 +149,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
 def _follower(search: Search, rig: Rig, found: RandomForceFit | None = None) -> Follower:
     """What holds a rig beside the records, a random force and all."""
     data = search.data
-    force, at = (0.0, 0.0) if found is None else (found.rms, found.at)
+    force, at = (0.0, None) if found is None else (found.rms, found.at)
     return Follower.of(rig, data.noise, data.force_rms, data.records[0].sample_time, at=at, rms=force)
 
 
@@ -160,10 +162,13 @@ def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Fo
 
 
 def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
-    found = fit_random_force(evidence.rig, search.data, evidence.residuals, evidence.peaks[:2], evidence.data.force_rms)
+    domain = evidence.domain
+    most = POINTS if isinstance(domain, NamedPoints) else STARTS
+    places = [where for where in evidence.peaks if not isinstance(where, Between)][:most]
+    found = fit_random_force(evidence.rig, search.data, evidence.residuals, places, evidence.data.force_rms)
     rms, rms_std = found.seen_rms
-    effect = Effect(RANDOM_DISTURBANCE, None, {"at": found.at, "rms": rms}, {"at": found.at_std, "rms": rms_std})
-    combined = Fit(
-        (*given.effects, effect), found.cost, given.cost_by_channel, given.n_parameters + 2, "maximum likelihood"
-    )
+    spread = dict(zip(domain.coordinates, found.at_std, strict=True))
+    effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, {**spread, "rms": rms_std})
+    fitted = given.n_parameters + 1 + len(spread)
+    combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted, "maximum likelihood")
     return combined, found

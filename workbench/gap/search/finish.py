@@ -2,15 +2,17 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all, key_of
+from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of, place_values
 from workbench.gap.effects.limiting_cases import simpler_sets, with_one_simpler
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.search import Search, promise
 from workbench.rig.simulate import is_stepped
+from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
 
 FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on they are tried
 STEPPING = 1e-4  # of the gap's power: what coarser substeps may leave of it
@@ -19,7 +21,7 @@ NO_NEARER = 0.9
 AT_FIRST, TOO_FAR = 4, 30.0  # iterations of a simpler form on the quick records, and times a set's cost: it is none
 TRIED = 2  # iterations at each other place, before the likeliest are chosen
 LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
-APART = 0.02  # of the length: nearer, a place is the same valley
+APART = 0.02  # of the extent: nearer, a place is the same valley
 FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
@@ -61,7 +63,7 @@ def simplified(search: Search, candidate: Fit) -> Fit:
 def relocated(search: Search, candidate: Fit) -> Fit:
     """The set with its places tried elsewhere: a symmetric structure has a twin valley at the mirrored place."""
     for i, effect in enumerate(candidate.effects):
-        if "at" not in effect.values or effect.kind.path not in ("structure", "environment"):
+        if effect.at is None or effect.kind.path not in ("structure", "environment"):
             continue
         here = fit(search.rig, candidate.effects, search.quick, iterations=6)
         for moved in _elsewhere(search, candidate.effects, i):
@@ -76,25 +78,46 @@ def relocated(search: Search, candidate: Fit) -> Fit:
 
 def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tuple[Effect, ...]]:
     """The set with effect i at the two likeliest other places, and mirrored."""
-    effect, length = effects[i], search.rig.modes.length
+    effect, domain = effects[i], search.rig.modes.domain
 
-    def moved(at: float, factor: float = 1.0) -> tuple[Effect, ...]:
-        values = {**effect.values, "at": float(at)}
+    def moved(where: Where, factor: float = 1.0) -> tuple[Effect, ...]:
+        values = {**effect.values, **place_values(where)}
         if strength is not None:
             values[strength.name] = float(np.clip(factor * values[strength.name], strength.low, strength.high))
         return (*effects[:i], replace(effect, values=values), *effects[i + 1 :])
 
-    strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name != "at"), None)
+    strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name not in COORDINATES), None)
     # where the structure moves less, the same effect takes more strength
     factors = FACTORS if strength is not None else (1.0,)
     tried = []
-    for at in length * np.linspace(0.04, 0.96, 13):
-        likeliest = min((moved(at, factor) for factor in factors), key=lambda s: cost_of(search.rig, s, search.first))
+    for where in _other_places(effect, domain):
+        there = [moved(where, factor) for factor in factors]
+        likeliest = min(there, key=lambda s: cost_of(search.rig, s, search.first))
         tried.append(fit(search.rig, likeliest, search.first, iterations=TRIED))
     tried.sort(key=lambda f: f.cost)
-    elsewhere = [f for f in tried if abs(f.effects[i].values["at"] - effect.values["at"]) > APART * length]
-    # the mirrored place is always worth a fit of its own, whatever its cost before it
-    return [*(f.effects for f in elsewhere[:2]), moved(length - effect.values["at"])]
+    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > APART]
+    # the mirrored places are always worth a fit of their own, whatever their cost before it
+    return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
+
+
+def _other_places(effect: Effect, domain: Domain) -> Sequence[Where]:
+    """Along an interval or over a rectangle some all over it; named points; pairs of them with either point kept."""
+    if isinstance(domain, Interval):
+        return [float(x) for x in domain.length * np.linspace(0.04, 0.96, 13)]
+    if isinstance(domain, Rectangle):
+        return domain.grid(6)
+    if isinstance(effect.at, Between):
+        return [pair for pair in domain.pairs() if pair != effect.at and {*pair} & {*effect.at}]
+    return [name for name in domain.grid() if name != effect.at]
+
+
+def _mirrored(where: Any, domain: Domain) -> list[Where]:
+    if isinstance(domain, Interval):
+        return [domain.length - where]
+    if isinstance(domain, Rectangle):
+        (a, b), (x, y) = domain.length, where
+        return [(a - x, y), (x, b - y), (a - x, b - y)]
+    return []
 
 
 def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list[Fit]:

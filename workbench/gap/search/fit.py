@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Parameter, apply_all, key_of
+from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all, key_of
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
@@ -75,7 +75,7 @@ class _Problem:
             self.parameters += [(i, p) for p in effect.parameters(base)]
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
         floor = [
-            1e-2 if p.logarithmic or p.name == "at" else 1e-3 * abs(z) + 1e-9
+            1e-2 if p.logarithmic or p.name in COORDINATES else 1e-3 * abs(z) + 1e-9
             for (_, p), z in zip(self.parameters, self.start, strict=True)
         ]
         self.steps = np.array(floor)
@@ -116,7 +116,7 @@ class _Problem:
         """Differences from the residual that `near` gives."""
         columns = []
         for j, (_, parameter) in enumerate(self.parameters):
-            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name == "at" else self.steps[j]
+            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
             moved = free.copy()
             moved[j] += step
             if self.high[j] < moved[j]:
@@ -250,7 +250,7 @@ def _reach(problem: _Problem) -> np.ndarray:
     """Longest step of each free coordinate: a factor e, a tenth of the length, or its own size."""
     return np.array(
         [
-            1.0 if p.logarithmic else 10.0 if p.name == "at" else 3.0 * abs(z) + 10.0
+            1.0 if p.logarithmic else 10.0 if p.name in COORDINATES else 3.0 * abs(z) + 10.0
             for (_, p), z in zip(problem.parameters, problem.start, strict=True)
         ]
     )

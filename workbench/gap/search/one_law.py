@@ -35,10 +35,10 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
     if decision.outcome != "explained" or len(best.effects) != 1:
         return decision
     (effect,) = best.effects
-    if not effect.kind.nonlinear or "at" not in effect.values:
+    if not effect.kind.nonlinear or effect.at is None:
         return decision
     search.report("one force of another law", 0.9)
-    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.values["at"])
+    beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
     as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
     hopeful = [f for f in one_more(beyond, (), there) if f.cost < as_near]
     fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)

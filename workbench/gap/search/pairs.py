@@ -15,6 +15,7 @@ from workbench.gap.search.outcome import Decision, unexplained
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import Search, apart, in_one_valley, spread_over_kinds
+from workbench.structure.domain import Between
 
 FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
 SINGLES = 8  # that are fitted to whole records before they are gone through
@@ -142,9 +143,9 @@ class Pairs:
 
     def _explained_by(self, ahead: Sequence[Fit]) -> bool:
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
-        length = self.search.rig.modes.length
+        domain = self.search.rig.modes.domain
         hopeful = [f for f in ahead if f.cost < HOPEFUL]
-        fresh = [f for f in hopeful if not any(in_one_valley(f, other, length) for other in self.followed)]
+        fresh = [f for f in hopeful if not any(in_one_valley(f, other, domain) for other in self.followed)]
         most = MORE if self.found else FINALISTS
         self.followed += fresh[:most]
         self._add(on_whole_records(self.search, fresh, most))
@@ -210,12 +211,15 @@ def _alike(one: Effect, other: Effect, search: Search) -> bool:
     """Whether two effects are the same but for their numbers."""
     if one.label != other.label:
         return False
-    return "at" not in one.values or not apart(one, other, search.rig.modes.length)
+    return one.at is None or not apart(one, other, search.rig.modes.domain)
 
 
 def _unmoved(one: Effect, other: Effect) -> bool:
     """Whether two effects are the same, with nearly the same numbers."""
-    return one.label == other.label and all(np.isclose(one.values[n], other.values[n], rtol=MOVED) for n in one.values)
+    if one.label != other.label or (isinstance(one.at, str | Between) and one.at != other.at):
+        return False
+    numbers = [name for name, value in one.values.items() if isinstance(value, float)]
+    return all(np.isclose(one.values[n], other.values[n], rtol=MOVED) for n in numbers)
 
 
 def _done(pair: Fit, ended: Sequence[Fit]) -> bool:

@@ -74,7 +74,7 @@ def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits without those that came to where a better one of the same set came."""
     distinct: list[Fit] = []
     for candidate in fits:
-        if not any(in_one_valley(candidate, other, search.rig.modes.length) for other in distinct):
+        if not any(in_one_valley(candidate, other, search.rig.modes.domain) for other in distinct):
             distinct.append(candidate)
     return distinct
 

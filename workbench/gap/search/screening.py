@@ -13,6 +13,7 @@ from workbench.gap.prediction.workers import shared_array
 from workbench.gap.search.fit import finite_residual, slopes
 from workbench.gap.search.search import ELSEWHERE, Search, apart
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Domain, NamedPoints
 
 WEAKER, STRONGER = 0.03, 30.0  # than at its start: what an effect may turn out to be
 RUNAWAY = 1e10  # mean square, in noise units, of errors that tell nothing
@@ -33,7 +34,7 @@ class Weighed:
         moves: (n_starts, n_values); what the numbers of effects given before can make up for is taken away.
         left: (n_values,) the errors, likewise.
         least, most: (n_starts,) bounds of a strength, in units of the start's.
-        length: of the structure, m.
+        domain: the places of the structure.
     """
 
     starts: tuple[Effect, ...]
@@ -41,7 +42,7 @@ class Weighed:
     left: np.ndarray
     least: np.ndarray
     most: np.ndarray
-    length: float
+    domain: Domain
 
     @classmethod
     def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Weighed":
@@ -53,7 +54,7 @@ class Weighed:
         data = search.first_ahead
         before = finite_residual(search.rig, (*given, *search.held), data)
         if before is None:
-            return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.length)
+            return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
         thin = slice(None, None, max(1, before.size // MOST_VALUES))
 
         tasks = _starts(search, given, evidence)
@@ -81,7 +82,7 @@ class Weighed:
             for row in moves:
                 row -= basis @ (basis.T @ row)
         least, most = np.array([bounds[i] for i in telling]).reshape(-1, 2).T
-        return cls(tuple(starts[i] for i in telling), moves, left, least, most, search.rig.modes.length)
+        return cls(tuple(starts[i] for i in telling), moves, left, least, most, search.rig.modes.domain)
 
     def likeliest(self) -> list[Effect]:
         """The best start of every kind and target, and the best elsewhere, in the order of what they can come to."""
@@ -93,7 +94,7 @@ class Weighed:
         for i in np.argsort(costs, kind="stable"):
             start = self.starts[i]
             alike = [other for other in chosen if other.label == start.label]
-            if not alike or (len(alike) == 1 and apart(start, alike[0], self.length) and "at" in start.values):
+            if not alike or (len(alike) == 1 and apart(start, alike[0], self.domain) and start.at is not None):
                 chosen.append(start)
         return chosen
 
@@ -105,8 +106,7 @@ class Weighed:
         labels = [start.label for start in self.starts]
         begins = [i for i, label in enumerate(labels) if i == 0 or label != labels[i - 1]]
         blocks = [slice(*ends) for ends in pairwise((*begins, len(labels)))]
-        at = np.array([start.values.get("at", 0.0) for start in self.starts])
-        beside = np.abs(np.subtract.outer(at, at)) <= ELSEWHERE * self.length
+        beside = self._beside
         for one in blocks:
             for other in blocks:
                 if one.start > other.start or _repeats(self.starts[one.start], self.starts[other.start]):
@@ -124,6 +124,15 @@ class Weighed:
                     found.append((costs[i, j], (self.starts[i], self.starts[j])))
                     block = np.where(beside[i, blocks[p]][:, None] & beside[j, blocks[q]], np.inf, block)
         return [pair for _, pair in sorted(found, key=lambda entry: entry[0])[:most]]
+
+    @property
+    def _beside(self) -> np.ndarray:
+        """Whether two starts of one kind are in one valley: (n_starts, n_starts)."""
+        if isinstance(self.domain, NamedPoints):
+            names = np.array([str(start.at) for start in self.starts])
+            return names[:, None] == names
+        at = np.array([[start.values.get(name, 0.0) for name in self.domain.coordinates] for start in self.starts])
+        return np.linalg.norm(at[:, None] - at, axis=2) <= ELSEWHERE * self.domain.size
 
     def _of_pairs(self) -> np.ndarray:
         """min |left + a m_i + b m_j|² - |left|² over a and b within their bounds: (n_starts, n_starts)."""
@@ -175,6 +184,6 @@ def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple:
 def _repeats(one: Effect, other: Effect) -> bool:
     """Whether two effects are the same figure of the same thing, which twice says nothing new."""
     kind = one.kind
-    if other.kind is not kind or not (kind.path in ("actuator", "sensor") or "at" not in other.values):
+    if other.kind is not kind or not (kind.path in ("actuator", "sensor") or other.at is None):
         return False
     return one.target == other.target or ALL in (one.target, other.target) or kind.name == "truncated_modes"

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -15,13 +16,14 @@ from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import HOPELESS, Fit, sensitivity
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Domain
 
 SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
 INTEGRATION_SHARE = 2e-6  # of the gap's power: errors of stepping
 SURE = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
 WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect model
-ELSEWHERE = 0.1  # of the length: nearer, two places are in one valley of the cost at first
-SAME_PLACE = 0.02  # of the length: nearer, fits go on to the same end
+ELSEWHERE = 0.1  # of the extent: nearer, two places are in one valley of the cost at first
+SAME_PLACE = 0.02  # of the extent: nearer, fits go on to the same end
 RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
 FURTHER = 100  # iterations like the last: a cost that they leave too high comes no lower in time
 COARSE = 2.0  # times the noise: below, rounding errors are all but white and of no signal
@@ -71,9 +73,9 @@ class Search:
         return float(1.0 + SLACK + INTEGRATION_SHARE * self.nominal.mean())
 
     def _doubled(self, effects: Sequence[Effect]) -> bool:
-        point = [effect for effect in effects if effect.kind.nonlinear and "at" in effect.values]
+        point = [effect for effect in effects if effect.kind.nonlinear and effect.at is not None]
         near = (
-            not apart(one, other, self.rig.modes.length)
+            not apart(one, other, self.rig.modes.domain)
             for one, other in combinations(point, 2)
             if one.kind is other.kind
         )
@@ -150,21 +152,26 @@ def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
     return chosen
 
 
-def apart(one: Effect, other: Effect, length: float) -> bool:
+def apart(one: Effect, other: Effect, domain: Domain) -> bool:
     """Whether two effects stand far enough apart to be in different valleys; those of no place always do."""
-    return "at" not in one.values or abs(one.values["at"] - other.values["at"]) > ELSEWHERE * length
+    return one.at is None or domain.separation(one.at, other.at) > ELSEWHERE
 
 
-def in_one_valley(one: Fit, other: Fit, length: float) -> bool:
+def in_one_valley(one: Fit, other: Fit, domain: Domain) -> bool:
     """Whether two fits are of one set, with places so near that they go on to the same end."""
 
-    def places(candidate: Fit) -> list[tuple[str, float]]:
-        return sorted((effect.label, effect.values.get("at", 0.0)) for effect in candidate.effects)
+    def in_order(candidate: Fit) -> list[Effect]:
+        return sorted(candidate.effects, key=lambda effect: (effect.label, _sorted_by(effect.at)))
 
     if one.key != other.key:
         return False
-    both = zip(places(one), places(other), strict=True)
-    return all(abs(here - there) < SAME_PLACE * length for (_, here), (_, there) in both)
+    both = ((here.at, there.at) for here, there in zip(in_order(one), in_order(other), strict=True))
+    return all(here is None or domain.separation(here, there) < SAME_PLACE for here, there in both)
+
+
+def _sorted_by(where: Any) -> tuple[Any, ...]:
+    """What places are sorted by, whatever they are."""
+    return where if isinstance(where, tuple) else () if where is None else (where,)
 
 
 def promise(candidate: Fit, iterations: int = 1) -> float:

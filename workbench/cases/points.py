@@ -1,0 +1,87 @@
+"""The table of named points of a case: where each is, how it moves, and the shape of every mode there."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+
+from workbench.cases.tables import CaseError, shown
+from workbench.structure.domain import NamedPoints
+
+MOST_POINTS = 100_000
+MOST_BYTES = 2**28
+COLUMNS = ("name", "node", "x", "y", "z", "direction")
+
+
+def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
+    """Named points, and mode shapes (n_points, n_modes) there, from a CSV table.
+
+    Its columns are name, node, x, y, z (m), direction (x, y, z, rx, ry or rz) and mode_1 to mode_n, mass-normalised.
+
+    Raises:
+        CaseError: naming the file, the line and the column, and what would be right.
+    """
+    if not path.is_file():
+        raise CaseError(f"{path}: there is no such file")
+    if path.stat().st_size > MOST_BYTES:
+        raise CaseError(f"{path} has {path.stat().st_size} bytes; a table of points has at most {MOST_BYTES}")
+    columns = (*COLUMNS, *(f"mode_{r + 1}" for r in range(n_modes)))
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            reader = csv.DictReader(file, restkey="")
+            missing = [column for column in columns if column not in (reader.fieldnames or ())]
+            if missing:
+                raise CaseError(f"{path}: column {missing[0]!r} is missing; it has {shown(reader.fieldnames)}")
+            rows = list(zip(range(MOST_POINTS + 1), reader, strict=False))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CaseError(f"{path} cannot be read as CSV: {error}") from error
+    if not 0 < len(rows) <= MOST_POINTS:
+        raise CaseError(f"{path} must list 1 to {MOST_POINTS} points")
+    values = np.array([[_number(path, i, row, c) for c in (*"xyz", *columns[len(COLUMNS) :])] for i, row in rows])
+    try:
+        points = NamedPoints(
+            names=tuple(_text(path, i, row, "name") for i, row in rows),
+            positions=values[:, :3],
+            directions=tuple(_text(path, i, row, "direction") for i, row in rows),
+            nodes=tuple(_text(path, i, row, "node") for i, row in rows),
+        )
+    except ValueError as error:
+        raise CaseError(f"{path}: {error}") from error
+    return points, values[:, 3:]
+
+
+def write_points(path: Path, points: NamedPoints, values: np.ndarray) -> None:
+    """The table that `read_points` reads; 0 for positions that are not known would be wrong, so there must be some.
+
+    Raises:
+        ValueError: points without positions.
+    """
+    if points.positions is None:
+        raise ValueError("named points without positions cannot be written: the table asks for x, y and z")
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*COLUMNS, *(f"mode_{r + 1}" for r in range(values.shape[1]))])
+        for name, node, at, direction, row in zip(
+            points.names, points.nodes, points.positions, points.directions, values, strict=True
+        ):
+            writer.writerow([name, node, *map(repr, at.tolist()), direction, *map(repr, row.tolist())])
+
+
+def _number(path: Path, line: int, row: dict, column: str) -> float:
+    try:
+        value = float(row[column])
+    except (TypeError, ValueError):
+        value = np.nan
+    if not np.isfinite(value):
+        got = shown(row[column])
+        raise CaseError(f"{path}, line {line + 2}, column {column!r}: expected a finite number; got {got}")
+    return value
+
+
+def _text(path: Path, line: int, row: dict, column: str) -> str:
+    value = row[column]
+    if not value or not value.isprintable() or len(value) > 255:
+        raise CaseError(
+            f"{path}, line {line + 2}, column {column!r}: expected up to 255 printable characters; got {shown(value)}"
+        )
+    return str(value)
