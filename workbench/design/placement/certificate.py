@@ -20,7 +20,6 @@ from workbench.design.placement.limits import Limits
 from workbench.design.placement.scan import scan
 from workbench.design.placement.task import SINGULAR_SHARE, Placement, PlacementTask
 from workbench.structure.modes import frozen
-from workbench.threads import one_blas_thread
 
 MOST_ACTUATORS = 4
 BATCH = 4_000
@@ -52,7 +51,6 @@ class Certificate:
         return 1.0 - self.lower_bound / self.placement.residual_work
 
 
-@one_blas_thread
 def certify(
     task: PlacementTask,
     placement: Placement,

@@ -17,7 +17,6 @@ from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import ProfileLike
-from workbench.threads import one_blas_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,6 @@ def filter_error(
     return float(np.sqrt((seen**2 @ e).sum() / e[index].sum()))
 
 
-@one_blas_thread
 def place_sensors(
     modes: Modes,
     controlled: int | Sequence[int],
