@@ -58,6 +58,7 @@ from .structure.domain import Interval as Interval
 from .structure.domain import NamedPoints as NamedPoints
 from .structure.domain import Rectangle as Rectangle
 from .structure.field import Field as Field
+from .structure.finite_elements import FiniteElements as FiniteElements
 from .structure.member import Bar as Bar
 from .structure.member import Beam as Beam
 from .structure.modes import Modes as Modes

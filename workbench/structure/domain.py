@@ -310,6 +310,10 @@ class NamedPoints:
         """The points that are displacements."""
         return tuple(x for x, d in zip(self.names, self.directions, strict=True) if d not in ROTATIONS) or self.names
 
+    def rotations(self) -> tuple[str, ...]:
+        """The points that are rotations; all of them where none is known to be one."""
+        return tuple(x for x, d in zip(self.names, self.directions, strict=True) if d in ROTATIONS) or self.names
+
     def pairs(self) -> Iterator[Between]:
         """Any two points of one direction, of different nodes."""
         each = list(zip(self.grid(), self.locate(self.grid()), strict=True))

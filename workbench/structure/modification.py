@@ -11,8 +11,8 @@ from workbench.structure.supports import Attachment, PointDamper, PointMass, Poi
 def attach(modes: Modes, attachments: tuple[Attachment, ...]) -> Modes:
     """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
 
-    Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes. Damping ratios stay
-    with the modes, in order. For a structure whose profiles are known, solve it anew instead.
+    Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes (`truncation_error`).
+    Damping ratios stay with the modes, in order. Where profiles or matrices are known, solve anew instead.
     """
     n = modes.n_modes
     mass, stiffness, extra_damping = np.eye(n), np.diag(modes.omega**2), []
@@ -50,6 +50,21 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...]) -> Modes:
         domain=modes.domain,
         essential=modes.essential,
     )
+
+
+def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.ndarray:
+    """What leaving out further modes costs the frequencies of `attach`: (n_modes,) relative, inf where unknown.
+
+    The change of a frequency as the upper half of the modes at hand is left out. The series of a point's receptance
+    falls at least as 1/n, so that what the modes not at hand would change is no more than that. The upper half of the
+    frequencies have no such estimate.
+    """
+    half = modes.n_modes // 2
+    error = np.full(modes.n_modes, np.inf)
+    if half:
+        whole, part = attach(modes, attachments).omega[:half], attach(modes.select(slice(half)), attachments).omega
+        error[:half] = np.abs(np.divide(part, whole, out=np.ones(half), where=whole > 0) - 1.0)
+    return error
 
 
 def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:

@@ -7,10 +7,12 @@ import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
+from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.modes import Modes, frozen
 
 SINGULAR = 1e8
 UNMOVED = 1e-9
+PER_SIDE = 24  # places along the longer side of a plate, where the most that an actuator could do is looked for
 
 
 class DesignError(ValueError):
@@ -78,11 +80,13 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
             f"{len(controlled)} controlled modes need as many actuators; there are {len(actuators)}:"
             " control fewer modes or add actuators"
         )
+    text = modes.domain.text
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
-            if first.kind == second.kind and abs(first.at - second.at) <= 1e-6 * modes.length:
+            alike = (first.kind, first.direction) == (second.kind, second.direction)
+            if alike and modes.domain.separation(first.at, second.at) <= 1e-6:
                 raise DesignError(
-                    f"actuators {first.name} and {second.name} both stand at x = {first.at:g}, so B is singular;"
+                    f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
                     " move one by more than 1e-6 of the length"
                 )
     b = moved(modes, controlled, actuators)
@@ -90,7 +94,7 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     if condition > SINGULAR:
         raise DesignError(
             f"B of the controlled modes is singular (condition {condition:.2g}): the actuators at"
-            f" {', '.join(f'{a.at:g}' for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
+            f" {', '.join(text(a.at) for a in actuators)} cannot act on modes {[r + 1 for r in controlled]} one by one"
         )
     return b
 
@@ -113,9 +117,14 @@ def moved(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]
 
 def _largest_participation(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """The most that the best of the actuators could do for each mode from any place, (n_modes,)."""
-    grid = np.linspace(0.0, modes.length, 8 * modes.n_modes + 9)
     most = np.zeros(modes.n_modes)
     for actuator in actuators:
-        shapes = modes.phi(grid, 1 if actuator.kind == "moment" else 0)
+        turns = actuator.kind == "moment"
+        if isinstance(modes.domain, NamedPoints):
+            shapes = modes.phi(modes.domain.rotations() if turns else modes.domain.grid())
+        elif isinstance(modes.domain, Rectangle):
+            shapes = modes.phi(modes.domain.grid(PER_SIDE), int(turns), direction=actuator.direction)
+        else:
+            shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(turns))
         most = np.maximum(most, abs(actuator.gain) * np.abs(shapes).max(axis=0))
     return most

@@ -1,0 +1,242 @@
+"""Models known by their matrices, M ẍ + C ẋ + K x = f, one degree of freedom a named point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array, csc_array, sparray, spmatrix
+from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
+
+from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
+from workbench.structure.domain import ROTATIONS, Between, NamedPoints, Where
+from workbench.structure.modes import Modes
+from workbench.structure.supports import Attachment, PointMass, PointSpring
+
+SYMMETRIC = 1e-9  # of the largest entry: more is no rounding of the program that wrote the matrix
+SINGULAR = 1e-12  # smallest pivot of K over the largest: below it the structure can move as a rigid body
+SHIFT = 1e-11  # of the highest ω², by which K is shifted where it is singular
+ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot be told from zero
+
+Matrix: TypeAlias = sparray | spmatrix | np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FiniteElements:
+    """A structure of finite elements, known by its matrices.
+
+    Attributes:
+        mass, stiffness: M (kg, kg m²) and K (N/m, N m/rad), (n, n) symmetric, sparse or not, supports eliminated.
+        nodes: the degrees of freedom in the order of the matrices, as `NamedPoints`; or coordinates (n_nodes, 3), m,
+            each node having all `directions` in turn: its points are then named 1x, 1y, ..., 2x, ...
+        damping: C (n, n), or `ModalDamping` or `ProportionalDamping`.
+        directions: of each node, where coordinates are given.
+
+    Raises:
+        ValueError: matrices that are not symmetric, of other sizes than the nodes, or not positive.
+    """
+
+    mass: csc_array
+    stiffness: csc_array
+    nodes: NamedPoints
+    damping: csc_array | Damping
+
+    def __init__(
+        self,
+        mass: Matrix,
+        stiffness: Matrix,
+        *,
+        nodes: NamedPoints | ArrayLike,
+        damping: Matrix | Damping | None = None,
+        directions: Sequence[str] = ("x", "y", "z"),
+    ) -> None:
+        points = nodes if isinstance(nodes, NamedPoints) else _points(nodes, tuple(directions))
+        n = len(points.names)
+        object.__setattr__(self, "nodes", points)
+        object.__setattr__(self, "mass", _symmetric("mass", mass, n))
+        object.__setattr__(self, "stiffness", _symmetric("stiffness", stiffness, n))
+        if isinstance(damping, ViscousDamping):
+            raise ValueError("a coefficient per length means nothing to matrices; give a damping matrix C")
+        if damping is None or isinstance(damping, Damping):
+            object.__setattr__(self, "damping", damping or ModalDamping())
+        else:
+            object.__setattr__(self, "damping", _symmetric("damping", damping, n))
+        if (self.mass.diagonal() < 0).any():
+            i = int(np.argmin(self.mass.diagonal()))
+            raise ValueError(f"the mass matrix is not positive: point {points.names[i]!r} has {self.mass[i, i]:.3g} kg")
+
+    @property
+    def domain(self) -> NamedPoints:
+        """The places of the structure: its degrees of freedom."""
+        return self.nodes
+
+    def modes(self, n_modes: int) -> Modes:
+        """The lowest `n_modes` modes, mass-normalised, by shift-invert Lanczos (ARPACK).
+
+        Raises:
+            ValueError: more modes than degrees of freedom, or matrices that are not positive.
+        """
+        n = len(self.nodes.names)
+        if not 1 <= n_modes < n:
+            raise ValueError(f"from 1 to {n - 1} modes can be asked of {n} degrees of freedom; got {n_modes}")
+        if _negative_pivots(self.mass):
+            raise ValueError("the mass matrix is not positive: some motion would have negative kinetic energy")
+        shift, factor = self._factor()
+        inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
+        start = np.random.default_rng(0).standard_normal(n)
+        _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
+        sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
+        if (sizes <= 0).any():
+            raise ValueError("the mass matrix is not positive: a mode has no kinetic energy")
+        shapes = shapes / np.sqrt(sizes)
+        values = np.sum(shapes * (self.stiffness @ shapes), axis=0)
+        floor = ROUNDING * np.sum(np.abs(shapes) * (abs(self.stiffness) @ np.abs(shapes)), axis=0)
+        if (values < -floor).any():
+            raise ValueError(
+                f"the stiffness matrix is not positive: an eigenvalue ω² is {values.min():.3g}; is its sign right, and"
+                " are all elements stable?"
+            )
+        values = np.where(values < floor, 0.0, values)
+        order = np.argsort(values, kind="stable")
+        shapes, omega = shapes[:, order], np.sqrt(values[order])
+        first = (np.abs(shapes) > 1e-6 * np.abs(shapes).max(axis=0)).argmax(axis=0)
+        shapes = np.ascontiguousarray(shapes * np.where(shapes[first, np.arange(n_modes)] < 0, -1.0, 1.0))
+        shapes.flags.writeable = False
+        if isinstance(self.damping, csc_array):
+            damping = shapes.T @ (self.damping @ shapes)
+        else:
+            damping = self.damping.matrix(omega)  # type: ignore[union-attr]
+        return Modes(omega=omega, damping=damping, shapes=lambda index, _: shapes[index], domain=self.nodes)
+
+    def attached(self, parts: Sequence[Attachment]) -> "FiniteElements":
+        """The structure with masses, springs and dampers at its points, or between two of them, in its matrices.
+
+        A mass moves in every direction of its node; a spring or damper acts in the direction of its point. Rotary
+        inertia and rotational springs and dampers act at a point that is a rotation.
+
+        Raises:
+            ValueError: a point that is not there, a mass between two points, dampers where no damping matrix is given.
+        """
+        n = len(self.nodes.names)
+        added: dict[str, list[tuple[np.ndarray, float]]] = {"mass": [], "stiffness": [], "damping": []}
+        for part in parts:
+            if isinstance(part, PointMass):
+                if isinstance(part.at, Between):
+                    raise ValueError(f"{part}: a mass stands at one point; give it at each of the two")
+                added["mass"] += [(self._row(name), part.mass) for name in self.nodes.translations(str(part.at))]
+                turning, kind = part.rotary_inertia, "mass"
+            elif isinstance(part, PointSpring):
+                added["stiffness"].append((self._row(part.at), part.stiffness))
+                turning, kind = part.rotational_stiffness, "stiffness"
+            else:
+                added["damping"].append((self._row(part.at), part.coefficient))
+                turning, kind = part.rotational_coefficient, "damping"
+            if turning:
+                added[kind].append((self._rotation(part), turning))
+        damping: Any = self.damping
+        if added["damping"]:
+            if not isinstance(damping, csc_array):
+                raise ValueError(
+                    "dampers are added to a damping matrix, and this structure has modal damping; give damping=C, or"
+                    " attach the dampers to its modes: attach(model.modes(n), parts), which is exact for them"
+                )
+            damping = damping + _outer_sum(added["damping"], n)
+        return FiniteElements(
+            self.mass + _outer_sum(added["mass"], n),
+            self.stiffness + _outer_sum(added["stiffness"], n),
+            nodes=self.nodes,
+            damping=damping,
+        )
+
+    def _row(self, where: Where) -> np.ndarray:
+        """(k, 2) degrees of freedom and factors of what an attachment is stretched by."""
+        if isinstance(where, Between):
+            first, second = self.nodes.locate(list(where))
+            return np.array([(first, 1.0), (second, -1.0)])
+        return np.array([(self.nodes.locate(where)[0], 1.0)])
+
+    def _rotation(self, part: Attachment) -> np.ndarray:
+        if isinstance(part.at, Between) or self.nodes.directions[self.nodes.locate(part.at)[0]] not in ROTATIONS:
+            raise ValueError(f"{part}: give it at a point that is a rotation: rx, ry or rz of the node")
+        return self._row(part.at)
+
+    def _factor(self) -> tuple[float, SuperLU]:
+        """A shift σ ≤ 0 and the factors of K - σ M: no shift unless the structure can move as a rigid body."""
+        try:
+            factor = _factor(self.stiffness)
+            pivots = factor.U.diagonal()
+            if np.abs(pivots).min() > SINGULAR * np.abs(pivots).max():
+                negative = _negative(factor)
+                if negative:
+                    raise ValueError(
+                        f"the stiffness matrix is not positive: {negative} of its eigenvalues are negative; is its"
+                        " sign right, and are all elements stable?"
+                    )
+                return 0.0, factor
+        except RuntimeError:  # a pivot of exactly zero
+            pass
+        massive = self.mass.diagonal() > 0
+        shift = -SHIFT * float((self.stiffness.diagonal()[massive] / self.mass.diagonal()[massive]).max())
+        return shift, _factor((self.stiffness - shift * self.mass).tocsc())
+
+
+def _factor(matrix: csc_array) -> SuperLU:
+    return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _negative(factor: SuperLU) -> int:
+    """Number of negative eigenvalues of a factored symmetric matrix, by Sylvester's law of inertia."""
+    return int((factor.U.diagonal() < 0).sum()) if (factor.perm_r == factor.perm_c).all() else 0
+
+
+def _negative_pivots(matrix: csc_array) -> int:
+    """Number of negative eigenvalues of a matrix, of which massless degrees of freedom are left out."""
+    massive = np.flatnonzero(matrix.diagonal() > 0)
+    try:
+        return _negative(_factor(matrix[:, massive][massive].tocsc()))
+    except RuntimeError:  # singular, which a mass matrix may be
+        return 0
+
+
+def _symmetric(name: str, matrix: Matrix, n: int) -> csc_array:
+    found = csc_array(matrix, dtype=float)
+    if found.shape != (n, n):
+        raise ValueError(f"the {name} matrix has shape {found.shape}; {n} degrees of freedom need ({n}, {n})")
+    if not np.isfinite(found.data).all():
+        raise ValueError(f"the {name} matrix holds numbers that are not finite")
+    largest = float(np.abs(found.data).max(initial=0.0))
+    skew = (found - found.T).tocoo()
+    if skew.nnz and np.abs(skew.data).max() > SYMMETRIC * largest:
+        i = int(np.abs(skew.data).argmax())
+        row, column = skew.coords[0][i], skew.coords[1][i]
+        raise ValueError(
+            f"the {name} matrix is not symmetric: entries ({row}, {column}) and ({column}, {row}) differ by"
+            f" {abs(skew.data[i]):.3g}; give the whole matrix, not one triangle"
+        )
+    return csc_array((found + found.T) * 0.5)
+
+
+def _outer_sum(parts: list[tuple[np.ndarray, float]], n: int) -> csc_array:
+    """Σ value r rᵀ of sparse rows r."""
+    rows, columns, values = [0], [0], [0.0]
+    for row, value in parts:
+        for i, a in row:
+            for j, b in row:
+                rows.append(int(i))
+                columns.append(int(j))
+                values.append(value * a * b)
+    return csc_array(coo_array((values, (rows, columns)), shape=(n, n)))
+
+
+def _points(coordinates: ArrayLike, directions: tuple[str, ...]) -> NamedPoints:
+    positions = np.asarray(coordinates, float)
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"coordinates of nodes are (n_nodes, 3), m; got {positions.shape}")
+    nodes = [str(i + 1) for i in range(positions.shape[0])]
+    return NamedPoints(
+        tuple(node + direction for node in nodes for direction in directions),
+        np.repeat(positions, len(directions), axis=0),
+        directions * len(nodes),
+        tuple(node for node in nodes for _ in directions),
+    )
