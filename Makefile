@@ -14,7 +14,7 @@ study: $(BIN)/workbench  ## the main job: a beam from measured response to contr
 	$(BIN)/workbench study beam
 
 test: $(BIN)/workbench  ## the default test run; it says what it skips and why
-	$(BIN)/python -m pytest -q -rs -n auto --dist loadfile
+	$(BIN)/python -m pytest -q -rs -n auto --dist worksteal
 
 test-slow: $(BIN)/workbench  ## the longer trials
 	$(BIN)/python -m pytest -q -m slow

@@ -64,6 +64,7 @@ def test_hard_pairs_are_named_and_placed(seed, kinds):
     assert told == {e["kind"]: pytest.approx(e["at"], abs=0.005 * case.rig.modes.length) for e in label["effects"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "exponent"), [("quadratic_spring", 2.0), ("cubic_damper", 3.0)])
 def test_a_law_beyond_the_catalogue_is_unknown_and_shown(kind, exponent):
     case, _ = make_trial(401, kinds=(kind,))
@@ -94,6 +95,7 @@ def quadratic(w, v, p):
     return -p[0] * w * abs(w)
 
 
+@pytest.mark.slow  # the example in README.md is another, shorter one
 def test_an_effect_of_the_users_own_joins_the_catalogue():
     mine = Kind(
         name="quadratic_spring",

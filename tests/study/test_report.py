@@ -28,7 +28,12 @@ STUDIED = {
     "front": [{"x": 1.0, "y": "<b>"}, {"x": 2.0, "z": [1, 2]}],
     "checks": [{"name": "c", "value": 0.5, "limit": 1.0, "holds": True, "at_least": False}], "found": ["a line"],
 }  # fmt: skip
-KINDS = {"verdict": VERDICT, "identified": IDENTIFIED, "designed": DESIGNED, "studied": STUDIED}
+PLACED = {
+    "length": 10.0, "controlled": [0, 1], "lower_bound": 0.2,
+    "placements": [{"positions": [2.0, 6.0], "residual_work": 0.25, "by_mode": [0.1, 0.15], "effort": 1.0,
+                    "peak_force": 0.5, "condition": 2.0, "status": "Solve_Succeeded"}],
+}  # fmt: skip
+KINDS = {"placed": PLACED, "verdict": VERDICT, "identified": IDENTIFIED, "designed": DESIGNED, "studied": STUDIED}
 
 
 def written(tmp_path, content, name="file.json"):
@@ -41,7 +46,7 @@ def test_a_verdict_tells_its_story(tmp_path):
     story = story_in(written(tmp_path, VERDICT))
     assert story.title == "Diagnosis of arm" and story.lead == "A spring explains it."
     assert story.lines == ["a note", "Strike it."]
-    assert story.tables[0][2] == [["ground_spring", "stiffness", 2.0, 0.1, 3.0]]
+    assert story.tables[0][2] == [["ground spring", "stiffness", "2.00", "0.10", 3.0]] and story.standing == "good"
     assert story.tables[1][2] == [["r", 0.5, 0.02, 0.01]]
     boxes = [mark["boxes"][0][3] for mark in story.blocks[0]["figure"]["panels"][0]["marks"]]
     assert boxes == [0.5, 0.02, 0.01]
@@ -56,9 +61,33 @@ def test_identified_modes_swing(tmp_path):
 
 def test_a_design_shows_what_it_spills(tmp_path):
     story = story_in(written(tmp_path, DESIGNED))
-    assert story.tables == [("Laws", ("law", "cost", "effort", "peak force", "W_R"), [["IMSC", 1.0, 2.0, 3.0, 0.75]])]
+    heads = ("law", "cost", "effort", "peak force", "W_R", "loop")
+    assert story.tables == [("Laws", heads, [["IMSC", 1.0, 2.0, 3.0, 0.75, "stable"]])]
     [bars] = [m for m in story.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "bars"]
     assert [box[3] for box in bars["boxes"]] == [0.25, 0.5]
+
+
+def test_a_design_says_which_loops_are_unstable(tmp_path):
+    sensed = [{"design": name, "margin": margin, "stable": margin > 0, "robustness": None}
+              for name, margin in (("IMSC, filter", 0.1), ("IMSC, observer", -0.2))]  # fmt: skip
+    story = story_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
+    assert story.lead.startswith("Unstable on the full plant: IMSC, observer.") and story.standing == "part"
+    page = write_page(tmp_path / "p.html", story).read_text(encoding="utf-8")
+    assert '<p class="lead part">' in page
+
+
+def test_a_placement_shows_where_and_how_surely(tmp_path):
+    story = story_in(written(tmp_path, PLACED))
+    assert story.lead == "Actuators at 2, 6 m spill W_R = 0.25. No placement within the limits has W_R below 0.2."
+    [places] = [m for m in story.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "line"]
+    assert places["x"] == [2.0, 6.0]
+
+
+def test_one_sensor_has_no_shape_and_remarks_are_kept(tmp_path):
+    one = {**IDENTIFIED, "positions": [None], "shapes_real": [[1.0]], "shapes_imag": [[0.0]]}
+    story = story_in(written(tmp_path, {**one, "heading": "1 sensor", "lines": ["mode 1: mains hum?"]}))
+    assert story.lead == "1 sensor" and story.lines == ["mode 1: mains hum?"]
+    assert all("motion" not in one for one in story.blocks)
 
 
 def test_whole_numbers_of_a_design_make_a_page(tmp_path):

@@ -9,21 +9,22 @@ from workbench.rig.rig import Rig
 
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
-    Path, typer.Argument(help=r"TOML file with \[structure], \[\[input]] and \[\[output]], as in a case folder.")
+    Path,
+    typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one."),
 ]
 ImpulseAt = Annotated[float | None, typer.Option(help="Place of a unit impulse, m; that of the hammer unless given.")]
 Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]
 
 
 def read_structure_rig(path: Path) -> Rig:
-    """The rig of a TOML file.
+    """The rig of a TOML file or a case folder.
 
     Raises:
         ValueError: a rig of plain modal data, which has no shape between its points.
     """
     from workbench.cases.case import read_rig
 
-    found = read_rig(path)
+    found = read_rig(path / "case.toml" if path.is_dir() else path)
     if found.structure is None:
         raise ValueError(f"{path}: plain modal data have no shapes between points; describe a beam or a rod instead")
     return found

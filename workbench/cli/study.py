@@ -18,7 +18,10 @@ def study(
         str | None, typer.Argument(help="Name of a study, or path of its script; without it, a list.")
     ] = None,
     data: Annotated[Path | None, typer.Option(help="File or folder that the study works on.")] = None,
-    every: Annotated[bool, typer.Option("--all", help="Run every study that makes its own data.")] = False,
+    every: Annotated[
+        bool,
+        typer.Option("--all", help="Run every study in studies/ here, or every built-in one, that makes its own data."),
+    ] = False,
     scheduler: Annotated[str | None, typer.Option(help="Dask scheduler that runs the cases: tcp://HOST:PORT.")] = None,
 ) -> None:
     """Run a study, or list them.
@@ -36,7 +39,7 @@ def study(
             say(f"{entry.name:<{width}}  {about}")
         return
     if name is None or every:
-        chosen = [entry for entry in list_studies() if not entry.needs_data]
+        chosen = [entry for entry in list_studies(here_first=True) if not entry.needs_data]
     else:
         chosen = [find_study(name)]
     # of several, one that fails does not stop the others
@@ -55,14 +58,14 @@ def _run_one_of_several(found: "StudyFile", data: Path | None, scheduler: str | 
 
 def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
     """Whether every case ran and every check holds."""
-    from workbench.study.catalogue import run_study
+    from workbench.study.catalogue import output_root, run_study
     from workbench.study.outcome import Outcome
 
     if found.fault:
         complain(found.fault)
         return False
 
-    root = found.path.resolve().parent.parent
+    root = output_root(found)
     with progress_bar() as progress:
         cases = progress.add_task("cases", total=1.0, visible=False)
 

@@ -31,3 +31,28 @@ def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: S
     ax.set(ylabel=label)
     ax.legend()
     return figure
+
+
+def plot_mac(values: np.ndarray) -> Figure:
+    """Modal assurance criterion (n_modes, n_modes) of modes with one another, from 0 to 1."""
+    figure, ax = new_figure(width=5.5, height=4.8)
+    modes = np.arange(1, len(values) + 1)
+    image = ax.imshow(values, cmap="Blues", vmin=0.0, vmax=1.0, origin="lower")
+    ax.set_xticks(modes - 1, [str(mode) for mode in modes])
+    ax.set_yticks(modes - 1, [str(mode) for mode in modes])
+    ax.set(xlabel="mode", ylabel="mode", title="modal assurance criterion")
+    ax.grid(False)
+    figure.colorbar(image, ax=ax, label="MAC")
+    return figure
+
+
+def plot_places(places: Mapping[str, np.ndarray], length: float | None = None) -> Figure:
+    """Places (m) of each placement along a structure."""
+    figure, ax = new_figure(width=9, height=1.4 + 0.5 * len(places))
+    for row, (positions, colour) in enumerate(zip(places.values(), COLOURS)):
+        ax.plot(positions, np.full(len(positions), row), "^", color=colour, markersize=9)
+    if length is not None:
+        ax.set_xlim(-0.02 * length, 1.02 * length)
+    ax.set_yticks(range(len(places)), list(places))
+    ax.set(xlabel="x [m]", ylim=(len(places) - 0.5, -0.5), title="places of the actuators")
+    return figure

@@ -25,6 +25,7 @@ from workbench.identification.signal.standard_errors import StandardErrors
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen, mac
+from workbench.threads import one_blas_thread
 
 MOST_REFERENCES = 4
 # A record is so many times as long as its longest lag, twice.
@@ -88,6 +89,7 @@ def ambient_decays(
     return _as_records(record, blocks.sum(axis=0) / record.n_samples, rows)
 
 
+@one_blas_thread
 def identify_ambient(
     record: Record,
     *,

@@ -22,6 +22,7 @@ from workbench.identification.signal.standard_errors import StandardErrors
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
+from workbench.threads import one_blas_thread
 
 # Modes by which the noise is first told, and how often it is learnt: it and the modes settle together.
 STRONGEST, LEARNT = 8, 4
@@ -110,6 +111,7 @@ class Driven(StandardErrors):
         return np.stack([z.real, z.imag], axis=1).ravel()
 
 
+@one_blas_thread
 def identify_driven(
     records: Record | Sequence[Record],
     *,

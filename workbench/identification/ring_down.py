@@ -21,6 +21,7 @@ from workbench.identification.signal.decay import decay_start
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
+from workbench.threads import one_blas_thread
 
 MOST_MODES = 20
 DRIFT_ROUNDS = 3
@@ -66,6 +67,7 @@ class RingDown:
         return self.refined.modes
 
 
+@one_blas_thread
 def ring_down(
     records: Record | Sequence[Record], *, start: float | None = None, n_modes: int | None = None
 ) -> RingDown:

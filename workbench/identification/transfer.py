@@ -26,6 +26,7 @@ from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
+from workbench.threads import one_blas_thread
 
 # Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
 MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
@@ -91,6 +92,7 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
     return np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages))
 
 
+@one_blas_thread
 def identify_transfer(
     transfer: ArrayLike,
     frequencies_hz: ArrayLike,

@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 
 from workbench.structure.domain import Place
 from workbench.structure.modes import frozen
+
+if TYPE_CHECKING:
+    import control  # takes seconds to import: most who read a record never need it
 
 QUANTITIES = {
     "displacement": "m",
@@ -183,8 +186,10 @@ class Record:
             name=self.name,
         )
 
-    def to_control(self) -> control.TimeResponseData:
+    def to_control(self) -> "control.TimeResponseData":
         """The same signals as python-control's `TimeResponseData`."""
+        import control
+
         return control.TimeResponseData(
             self.time,
             self.outputs,
@@ -196,7 +201,7 @@ class Record:
         )
 
     @classmethod
-    def from_control(cls, response: control.TimeResponseData, *, name: str = "record") -> "Record":
+    def from_control(cls, response: "control.TimeResponseData", *, name: str = "record") -> "Record":
         """A record from python-control's `TimeResponseData` (one trace, uniform time).
 
         Raises:

@@ -9,17 +9,23 @@ from workbench.structure.domain import Place, same_place
 
 @dataclass(frozen=True)
 class Actuator:
-    """A point force or moment commanded through an actuator: gain, dead zone, saturation, delay, lag, in that order.
+    """A point force or moment commanded through an actuator.
+
+    On its way a command u passes hysteresis, gain, dead zone, saturation, rate limit, delay, lag, bias, in that order.
 
     Attributes:
         name: of the input.
         at: its place on the structure: x (m), (x, y), or the name of a point.
         kind: "force" (N) or "moment" (N m).
+        hysteresis_share: of u that goes through z: (1 - share) u + share z, z' = u' - (|u'| z + u' |z|) / (2 width).
+        hysteresis_width: the z that large commands come to.
         gain: force per command.
         dead_zone: command (after the gain) below which nothing happens; sign(u) max(|u| - width, 0).
         limit: the force cannot exceed ± this.
+        rate_limit: the force cannot change faster than ± this, N/s.
         delay: s.
         time_constant: of a first-order lag, s.
+        bias: constant force beside, N.
         direct: a measured force applied without an actuator, such as a hammer; changes of the drive leave it alone.
         direction: of the force, or the axis of the moment, where the structure has more than one at a place.
     """
@@ -33,6 +39,10 @@ class Actuator:
     delay: float = 0.0
     time_constant: float = 0.0
     direct: bool = False
+    hysteresis_share: float = 0.0
+    hysteresis_width: float = 1.0
+    rate_limit: float = np.inf
+    bias: float = 0.0
     direction: str | None = None
 
     def __post_init__(self) -> None:
@@ -42,10 +52,12 @@ class Actuator:
         for quantity in ("dead_zone", "delay", "time_constant"):
             if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
                 raise ValueError(f"actuator {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
-        if not self.limit > 0:
-            raise ValueError(f"actuator {self.name}: limit must be positive; got {self.limit}")
+        for quantity in ("limit", "rate_limit", "hysteresis_width"):
+            if not getattr(self, quantity) > 0:
+                raise ValueError(f"actuator {self.name}: {quantity} must be positive; got {getattr(self, quantity)}")
 
     @property
     def linear(self) -> bool:
         """Whether the force is a linear function of the command (a delay is not a finite state)."""
-        return self.dead_zone == 0 and np.isinf(self.limit) and self.delay == 0
+        unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
+        return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))

@@ -92,11 +92,15 @@ class OneSidedStop(_AtPlace):
 
 @dataclass(frozen=True)
 class CoulombFriction(_AtPlace):
-    """-F tanh(v / v_s) at x: force F in N, smoothing speed v_s in m/s."""
+    """-F tanh(v / v_s) - F_0 at x: force F and offset F_0 in N, smoothing speed v_s in m/s.
+
+    Friction of two directions, F_+ forward and F_- backward, has F = (F_+ + F_-) / 2 and F_0 = (F_+ - F_-) / 2.
+    """
 
     at: Where
     force: float
     smoothing_speed: float
+    offset: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -42,10 +42,10 @@ class Sensor:
     gain: float = 1.0
     bias: float = 0.0
     drift: float = 0.0
-    delay: float = 0.0
     time_constant: float = 0.0
     limit: float = np.inf
     step: float = 0.0
+    delay: float = 0.0
     direction: str | None = None
 
     def __post_init__(self) -> None:
@@ -61,4 +61,4 @@ class Sensor:
     @property
     def linear(self) -> bool:
         """Whether a reading is a linear function of the truth (a time constant adds a state)."""
-        return self.bias == 0 and self.drift == 0 and np.isinf(self.limit) and self.step == 0
+        return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay))

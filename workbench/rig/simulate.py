@@ -10,6 +10,7 @@ from scipy.signal import lfilter
 
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
+from workbench.rig.between_samples import BetweenSamples
 from workbench.rig.elements import (
     AirDrag,
     BoucWen,
@@ -43,7 +44,9 @@ from workbench.rig.stepping import (
     POWER_DAMPER,
     POWER_SPRING,
     USER,
+    hysteresis,
     make_stepper,
+    ramped,
     step_record,
 )
 
@@ -56,7 +59,7 @@ LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     PowerDamper: (POWER_DAMPER, lambda e: (e.force, e.reference, e.exponent)),
     Clearance: (CLEARANCE, lambda e: (e.stiffness, e.gap)),
     OneSidedStop: (ONE_SIDED, lambda e: (e.stiffness, e.gap)),
-    CoulombFriction: (FRICTION, lambda e: (e.force, e.smoothing_speed)),
+    CoulombFriction: (FRICTION, lambda e: (e.force, e.smoothing_speed, e.offset)),
     BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
     UserLaw: (USER, lambda e: e.parameters),
 }
@@ -80,6 +83,11 @@ class Motion:
     forces: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+
+    def between_samples(self, sample_time: float) -> BetweenSamples:
+        """The motion at any time, s."""
+        q, v, forces = self.displacement, self.velocity, self.forces
+        return BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time)
 
     @cached_property
     def acceleration(self) -> np.ndarray:
@@ -132,7 +140,9 @@ def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8)
 
 def is_stepped(rig: Rig) -> bool:
     """Whether the motion has no closed form and is stepped through time."""
-    return rig.stiffness_rate != 0 or any(not isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
+    if rig.stiffness_rate != 0 or any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators):
+        return True
+    return any(not isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
 
 
 def steps_exactly(rig: Rig) -> bool:
@@ -144,8 +154,12 @@ def steps_exactly(rig: Rig) -> bool:
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
+    late = motion.between_samples(sample_time) if any(sensor.delay for sensor in rig.sensors) else None
     for order, here, shapes in _shapes_at_sensors(rig):
         outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
+        for j, shape in zip(here, shapes, strict=True):
+            if late is not None and rig.sensors[j].delay:
+                outputs[j] = late.earlier(order, shape, rig.sensors[j].delay)
     for j, sensor in enumerate(rig.sensors):
         outputs[j] = sensor_reading(sensor, outputs[j], sample_time)
     return outputs
@@ -168,7 +182,10 @@ def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.
 
 
 def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
-    """The force that an actuator heads for, before its delay and lag: gain, dead zone, saturation."""
+    """The force that an actuator heads for: hysteresis, gain, dead zone, saturation, before what takes its time."""
+    if actuator.hysteresis_share:
+        share = actuator.hysteresis_share
+        command = (1.0 - share) * command + share * hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
     force = command if actuator.gain == 1 else actuator.gain * command
     if actuator.dead_zone > 0:
         force = np.sign(force) * np.maximum(np.abs(force) - actuator.dead_zone, 0.0)
@@ -201,6 +218,11 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
         )
         response += share
         acting += participation[:, group] @ at_samples
+    bias = np.array([actuator.bias for actuator in rig.actuators])
+    if bias.any():
+        constant = np.outer(bias, np.ones(n_samples))
+        response += held_response(system, constant, participation, sample_time)[0]
+        acting += participation @ constant
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
         if not isinstance(element, PeriodicForce):
@@ -368,28 +390,38 @@ def _forces_on_substeps(
     now = np.empty_like(inputs)
     for j, actuator in enumerate(rig.actuators):
         held = np.repeat(actuator_force(actuator, inputs[j]), substeps)
-        fine[j], at_start = _delayed_and_lagged(held, actuator, sample_time / substeps)
-        now[j] = at_start[::substeps]
+        start = held
+        if np.isfinite(actuator.rate_limit):
+            held, start = ramped(held, actuator.rate_limit * sample_time / substeps)
+        fine[j], at_start = _delayed_and_lagged(held, start, actuator, sample_time / substeps)
+        fine[j] += actuator.bias
+        now[j] = at_start[::substeps] + actuator.bias
     return fine, now
 
 
-def _delayed_and_lagged(held: np.ndarray, actuator: Actuator, h: float) -> tuple[np.ndarray, np.ndarray]:
+def _delayed_and_lagged(
+    held: np.ndarray, at_start: np.ndarray, actuator: Actuator, h: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mean force over each substep and force at its start, of forces that are these before delay and lag."""
     if actuator.delay == 0 and actuator.time_constant == 0:
-        return held, held
+        return held, at_start
     shift, rest = divmod(actuator.delay, h)
-    padded = np.r_[np.zeros(int(shift) + 1), held][: held.size + 1]
-    older, newer = padded[:-1], padded[1:]
-    if int(shift) + 1 > held.size:
-        older = newer = np.zeros_like(held)
     share = rest / h
+    older, newer = _shifted(held, int(shift))
     command = share * older + (1.0 - share) * newer
-    start = newer if rest == 0 else older
+    start = _shifted(at_start, int(shift))[1 if rest == 0 else 0]
     if actuator.time_constant == 0:
         return command, start
     fade = np.exp(-h / actuator.time_constant)
     acting = np.r_[0.0, lfilter([1.0 - fade], [1.0, -fade], command)[:-1]]
     mean = command + (acting - command) * (1.0 - fade) * actuator.time_constant / h
     return mean, acting
+
+
+def _shifted(values: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """Values one step more than so many steps later, and so many steps later; zero before the first."""
+    padded = np.r_[np.zeros(steps + 1), values][: values.size + 1]
+    return padded[:-1], padded[1:]
 
 
 def _sinusoid_on_substeps(

@@ -76,6 +76,32 @@ def yield_update(z, dw, limit):
 
 
 @njit(cache=True, nogil=True)
+def hysteresis(path, limit):
+    """Bouc-Wen z (n_samples,) along a path (n_samples,) that is monotone between its samples, from 0."""
+    z = np.zeros_like(path)
+    for k in range(1, path.size):
+        z[k], _ = yield_update(z[k - 1], path[k] - path[k - 1], limit)
+    return z
+
+
+@njit(cache=True, nogil=True)
+def ramped(targets, most):
+    """Mean over each step, and value at its start, of what heads for targets (n_steps,) by at most `most` a step."""
+    mean, start = np.empty_like(targets), np.empty_like(targets)
+    value = 0.0
+    for k in range(targets.size):
+        start[k] = value
+        away = targets[k] - value
+        if abs(away) >= most:
+            value += math.copysign(most, away)
+            mean[k] = 0.5 * (start[k] + value)
+        else:
+            value = targets[k]
+            mean[k] = value - 0.5 * away * abs(away) / most
+    return mean, start
+
+
+@njit(cache=True, nogil=True)
 def _power(w, p):
     """-F |w / w_r|^e against w, with (F, w_r, e) = p, and its slope."""
     level = abs(w) / p[1]
@@ -103,7 +129,7 @@ def element_force(kind, parameters, i, w, v, z, w_old):
         return (-a * (w - b), -a, 0.0) if w > b else (0.0, 0.0, 0.0)
     if kind == FRICTION:
         level = math.tanh(v / b)
-        return -a * level, 0.0, -a / b * (1.0 - level * level)
+        return -a * level - parameters[i, 2], 0.0, -a / b * (1.0 - level * level)
     if kind == BOUC_WEN:
         pulled, slope = yield_update(z, w - w_old, b)
         return -a * pulled, -a * slope, 0.0

@@ -15,6 +15,7 @@ from workbench.structure.modes import Modes
 from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring, as_end
+from workbench.threads import one_blas_thread
 
 HIGHEST_DEGREE = 60
 EVERY = 3  # degrees are multiples of it, so that few bases are made
@@ -126,6 +127,7 @@ class _Member:
         lever = (at - node) * segments.evaluation(node, 1) if derivative == 0 else 0.0
         return segments.evaluation(node, derivative) + lever
 
+    @one_blas_thread
     def _solve(self, n_modes: int, stiffness: Profile, continuity: int, tension: float, tolerance: float) -> Modes:
         if n_modes < 1:
             raise ValueError(f"at least one mode must be asked for; got {n_modes}")

@@ -3,6 +3,7 @@
 import ast
 import hashlib
 import importlib.util
+import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,15 +31,30 @@ class StudyFile:
     fault: str | None = None
 
 
-def studies_folder() -> Path:
-    """`studies/` here, or beside the package in a checkout."""
-    here = Path.cwd() / "studies"
-    if here.is_dir():
-        return here
-    beside = Path(__file__).resolve().parents[2] / "studies"
-    if beside.is_dir():
-        return beside
-    raise StudyError("there is no folder studies/ here; run the command in a checkout of the project")
+def study_scripts(*, here_first: bool = False) -> dict[str, Path]:
+    """The scripts by name: those in `studies/` here, and those that came with the package.
+
+    Args:
+        here_first: only those here, where there are any.
+    """
+    package = Path(__file__).resolve().parents[2] / "studies"
+    installed = Path(sysconfig.get_path("data")) / "share" / "workbench" / "studies"
+    folders = [Path.cwd() / "studies", package if package.is_dir() else installed]
+    scripts: dict[str, Path] = {}
+    for folder in folders:
+        if here_first and scripts:
+            break
+        for path in sorted(folder.glob("*.py")):
+            scripts.setdefault(path.stem, path)
+    if not scripts:
+        raise StudyError("there are no studies: none came with the package, and no folder studies/ is here")
+    return dict(sorted(scripts.items()))
+
+
+def output_root(study: StudyFile) -> Path:
+    """The folder that takes a study's figures, pages and results: its project, where we are in that, else this one."""
+    project, here = study.path.resolve().parent.parent, Path.cwd()
+    return project if here.is_relative_to(project) and study.path.resolve().parent.name == "studies" else here
 
 
 def describe(path: Path) -> StudyFile:
@@ -60,9 +76,9 @@ def describe(path: Path) -> StudyFile:
     return StudyFile(path, path.stem, question[0] if question else "", needs)
 
 
-def list_studies() -> list[StudyFile]:
+def list_studies(*, here_first: bool = False) -> list[StudyFile]:
     """All studies, by name; one that is unfinished has a fault and keeps no other from running."""
-    return [_described(path) for path in sorted(studies_folder().glob("*.py"))]
+    return [_described(path) for path in study_scripts(here_first=here_first).values()]
 
 
 def _described(path: Path) -> StudyFile:
@@ -83,14 +99,14 @@ def find_study(name: str) -> StudyFile:
         if not path.is_file():
             raise StudyError(f"there is no file {path}")
         return describe(path)
-    found = {path.stem: path for path in sorted(studies_folder().glob("*.py"))}
+    found = study_scripts()
     if name not in found:
         raise StudyError(f"no study is called {name!r}; there are {', '.join(found)}")
     return describe(found[name])
 
 
 def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path) -> tuple[Path, Path]:
-    """Run a study; write its JSON (studies/results), its page and the tables of its runs (out).
+    """Run a study; write its JSON (studies/results of its project, else out/results), its page and its tables (out).
 
     Returns:
         The paths of the JSON and of the page.
@@ -111,7 +127,8 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
     outcome.write_runs(root / "out")
     made_by = f"workbench study {study.name}" + (f" --data {data}" if data else "")
     page = study_page(outcome, root / "out", inputs=_inputs(study, data), made_by=made_by)
-    return outcome.write(study.path.parent / "results"), page
+    owned = study.path.resolve().parent == root / "studies"
+    return outcome.write(study.path.parent / "results" if owned else root / "out" / "results"), page
 
 
 def _inputs(study: StudyFile, data: Path | None) -> dict[str, str]:

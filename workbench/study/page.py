@@ -1,6 +1,7 @@
 """One self-contained page per study or diagnosis: figures that zoom, motion that moves, text escaped, no network."""
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,6 +19,7 @@ ASSETS = Path(__file__).with_name("assets")
 SCRIPTS = ("figure.js", "motion.js", "table.js")
 FORMAT = "workbench page 1"
 MOST_ROWS = 2000
+STANDINGS = ("", "good", "part", "bad")
 
 
 @dataclass(frozen=True)
@@ -30,6 +32,7 @@ class Story:
         tables: (title, heads, rows); a cell of True or False reads "holds" or "does not hold".
         inputs: what the page was made from, text by name.
         made_by: the command that makes it again.
+        standing: of the lead: one of `STANDINGS`, "" where it is neither good nor bad.
         versions: of what computed it.
     """
 
@@ -40,6 +43,7 @@ class Story:
     tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence]]] = ()
     inputs: Mapping[str, str] = field(default_factory=dict)
     made_by: str = ""
+    standing: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)
 
     def to_json(self) -> dict:
@@ -60,7 +64,8 @@ def story_of(content: dict) -> Story:
     bad += ["blocks"] * (not bad and not all(isinstance(block, dict) for block in content["blocks"]))
     if content.get("format") != FORMAT or bad:
         raise StudyError(f"this is no {FORMAT!r}: its {bad[0] if bad else 'format'} is missing or damaged")
-    return Story(**{name: content[name] for name in shape})
+    standing = content.get("standing", "")  # pages of earlier versions have none
+    return Story(**{name: content[name] for name in shape}, standing=standing if standing in STANDINGS else "")
 
 
 def _is_table(table) -> bool:
@@ -82,7 +87,8 @@ def write_page(path: Path, story: Story) -> Path:
     moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in story.blocks]
     html = template.render(
         **{
-            name: getattr(story, name) for name in ("title", "lead", "lines", "blocks", "inputs", "made_by", "versions")
+            name: getattr(story, name)
+            for name in ("title", "lead", "lines", "blocks", "inputs", "made_by", "standing", "versions")
         },
         tables=[
             {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
@@ -147,6 +153,16 @@ def _table_of(rows: Sequence[Mapping]) -> tuple[tuple, list]:
 
 def _shown(value):
     return "" if value is None else value if isinstance(value, bool) else _cell(value)
+
+
+def to_its_error(value, error) -> tuple[str, str]:
+    """A value and its standard error, both to the second digit of the error; "" where there is no error."""
+    if not isinstance(value, int | float) or not isinstance(error, int | float) or not error > 0:
+        return _cell(value), "" if error is None else _cell(error)
+    digits = 1 - math.floor(math.log10(error))
+    if 0 <= digits <= 6 and abs(value) < 1e6:
+        return f"{value:.{digits}f}", f"{error:.{digits}f}"
+    return f"{value:.{max(1, 2 + math.floor(math.log10(max(abs(value), error) / error)))}g}", f"{error:.2g}"
 
 
 def _cell(value):

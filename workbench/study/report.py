@@ -11,15 +11,16 @@ from workbench.cases.case import read_case
 from workbench.draw.beam import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.motion import mode_motion
-from workbench.draw.tables import plot_deviations, plot_poles
-from workbench.structure.modes import SampledModes
+from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_poles
+from workbench.structure.modes import SampledModes, mac
 from workbench.study.cases import StudyError
-from workbench.study.catalogue import find_study
-from workbench.study.page import FORMAT, Story, block, story_of, tables_of
-from workbench.study.verdict_page import MOVING, case_inputs
+from workbench.study.catalogue import find_study, output_root
+from workbench.study.page import FORMAT, Story, block, story_of, tables_of, to_its_error
+from workbench.study.verdict_page import MOVING, STANDING_OF, case_inputs
 
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000
+ON_AXIS = 1e-9  # rad/s from the imaginary axis within which a pole is undamped
 
 
 def story_about(what: str) -> tuple[str, Story]:
@@ -34,7 +35,7 @@ def story_about(what: str) -> tuple[str, Story]:
     if path.suffix == ".json":
         return path.name.removesuffix(".json").removesuffix(".page"), story_in(path)
     study = find_study(what)
-    kept = study.path.resolve().parent.parent / "out" / f"{study.name}.page.json"
+    kept = output_root(study) / "out" / f"{study.name}.page.json"
     if not kept.is_file():
         raise StudyError(f"study {study.name} has left no page here; run it: workbench study {what}")
     return study.name, story_in(kept)
@@ -122,20 +123,26 @@ def _verdict(content: dict) -> dict:
     """A verdict."""
     gap = {name: dict(values) for name, values in content["gap"].items()}
     effects = [
-        [effect["kind"], name, value, effect.get("parameters_std", {}).get(name, ""), effect.get("at", "")]
+        [
+            effect["kind"].replace("_", " "),
+            name.replace("_", " "),
+            *to_its_error(value, effect.get("parameters_std", {}).get(name)),
+            effect.get("at", ""),
+        ]
         for effect in [*content["effects"], *content.get("nearest", [])]
         for name, value in effect["parameters"].items()
     ]
-    rivals = [[rival["kind"], rival["probability"]] for rival in content["alternatives"]]
+    rivals = [[rival["kind"].replace("_", " "), rival["probability"]] for rival in content["alternatives"]]
     gaps = [[record, *(gap[name].get(record) for name in ("before", "after", "floor"))] for record in gap["before"]]
     tables = [
-        ("Effects", ("effect", "parameter", "value", "standard deviation", "x"), effects),
+        ("Effects", ("effect", "parameter", "value", "standard error", "x [m]"), effects),
         ("Gap on records kept out of the fit", ("record", "before", "after", "floor"), gaps),
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
     return {
         "title": f"Diagnosis of {content['case']}",
         "lead": _words([content["sentence"]])[0],
+        "standing": STANDING_OF.get(content.get("outcome"), ""),
         "lines": _words([*content.get("notes", []), *filter(None, [content.get("next_experiment")])]),
         "blocks": [block(plot_gaps(gap), "The gap before and after, over the noise floor.")] if gaps else [],
         "tables": [table for table in tables if table[2]],
@@ -153,14 +160,19 @@ def _identified(content: dict) -> dict:
     columns = [content[n] for n in ("frequencies_hz", "frequencies_std_hz", "damping_ratios", "damping_std")]
     names = [f"mode {r + 1}" for r in range(hertz.size)]
     damping = plot_deviations(names, columns[2], columns[3], "damping ratio")
-    heads = ("mode", "frequency [Hz]", "standard deviation", "damping ratio", "standard deviation ")
+    heads = ("mode", "frequency [Hz]", "standard error", "damping ratio", "standard error ")
+    blocks = [block(damping, "Damping ratio of each mode with its standard error.")]
+    if len(shapes) > 1:  # one sensor knows no shape
+        moving = mode_motion({"identified": modes})
+        blocks.insert(0, block(moving, "The shapes identified, at the sensors, with the phase of each."))
+    if len(shapes) > 1 and hertz.size > 1:
+        blocks.append(
+            block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")
+        )
     return {
-        "blocks": [
-            block(
-                mode_motion({"identified": modes}), "The shapes found, at the sensors, with the phase that each has."
-            ),
-            block(damping, "Damping of each mode, and how well the record tells it."),
-        ],
+        "lead": _words([content.get("heading", "")])[0],
+        "lines": _words(content.get("lines", [])),
+        "blocks": blocks,
         "tables": [("Modes", heads, [[r + 1, *row] for r, row in enumerate(zip(*columns, strict=True))])],
     }
 
@@ -171,14 +183,88 @@ def _designed(content: dict) -> dict:
     controlled = set(content.get("controlled", ()))
     works = {law["law"]: np.array([w for r, w in enumerate(law["work"]) if r not in controlled], float) for law in laws}
     poles = {law["law"]: np.array(law["poles_real"], float) + 1j * np.array(law["poles_imag"], float) for law in laws}
-    rows = [[law["law"], law["cost"], law["effort"], law["peak_force"], float(works[law["law"]].sum())] for law in laws]
+    rows = [
+        [
+            law["law"],
+            law["cost"],
+            law["effort"],
+            law["peak_force"],
+            float(works[law["law"]].sum()),
+            _loop(poles[law["law"]]),
+        ]
+        for law in laws
+    ]
+    sensed = [
+        [one["design"], one["margin"], one["stable"], "" if one.get("robustness") is None else one["robustness"]]
+        for one in content.get("through_sensors", ())
+        if "stable" in one
+    ]
+    unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if not row[2]]
+    loops = [row[0] for row in (*rows, *sensed)]
     return {
+        "lead": "" if not sensed else _stability(loops, unstable),
+        "standing": "" if not sensed else "bad" if len(unstable) == len(loops) else "part" if unstable else "good",
         "blocks": [
-            block(plot_two_works(works, first=len(controlled)), "Work that each law puts into each mode."),
+            block(plot_two_works(works, first=len(controlled)), "Work that each law puts into each residual mode."),
             block(plot_poles(poles), "Closed-loop poles."),
         ],
-        "tables": [("Laws", ("law", "cost", "effort", "peak force", "W_R"), rows)],
+        "tables": [
+            ("Laws", ("law", "cost", "effort", "peak force", "W_R", "loop"), rows),
+            *(
+                [("With sensors", ("controller", "margin [1/s]", "stable", "share of perturbed models stable"), sensed)]
+                if sensed
+                else []
+            ),
+        ],
     }
+
+
+def _loop(poles: np.ndarray) -> str:
+    """Stable, undamped or unstable, by the rightmost pole."""
+    rightmost = float(poles.real.max())
+    return "stable" if rightmost < -ON_AXIS else "undamped poles" if rightmost <= ON_AXIS else "unstable"
+
+
+def _stability(loops: list[str], unstable: list[str]) -> str:
+    if not unstable:
+        return "Every closed loop is stable on the full plant."
+    if len(unstable) == len(loops):
+        return "Every closed loop is unstable on the full plant: spillover destabilises residual modes."
+    return (
+        f"Unstable on the full plant: {', '.join(unstable)}. The other {len(loops) - len(unstable)} loops are stable."
+    )
+
+
+def _placed(content: dict) -> dict:
+    """Actuator placements."""
+    placements = content["placements"]
+    names = ["optimum", *(str(one["status"]) for one in placements[1:])]
+    places = [np.array(one["positions"], float) for one in placements]
+    works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
+    rows = [
+        [name, *(one[key] for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
+        for name, one, at in zip(names, placements, places, strict=True)
+    ]
+    first, bound = placements[0]["residual_work"], content.get("lower_bound")
+    proof = "" if bound is None else f" No placement within the limits has W_R below {float(bound):.4g}."
+    n = len(content.get("controlled", ()))
+    return {
+        "title": "Actuator placement",
+        "lead": f"Actuators at {_between(places[0])} m spill W_R = {float(first):.4g}.{proof}",
+        "standing": "good" if bound is not None else "",
+        "lines": [f"The search ended with: {placements[0]['status']}."],
+        "blocks": [
+            block(
+                plot_places(dict(zip(names, places, strict=True)), content.get("length")), "Where the actuators stand."
+            ),
+            block(plot_two_works(works, first=n), "Work that each placement spills into each residual mode."),
+        ],
+        "tables": [("Placements", ("placement", "W_R", "effort", "peak force", "condition of B", "places [m]"), rows)],
+    }
+
+
+def _between(places: np.ndarray) -> str:
+    return ", ".join(f"{x:.4g}" for x in places)
 
 
 def _studied(content: dict) -> dict:
@@ -205,5 +291,6 @@ KINDS: dict[str, Callable[[dict], dict]] = {
     "sentence": _verdict,
     "shapes_real": _identified,
     "laws": _designed,
+    "placements": _placed,
     "checks": _studied,
 }

@@ -23,6 +23,7 @@ LAWS = ("IMSC", "coupled LQR")
 MOST_PORTS = 40
 LARGEST = 1e100
 N_TIMES, N_FRAMES, N_PLACES = 2001, 251, 121
+ON_AXIS = 1e-9  # damping ratio below which a pole stands on the imaginary axis
 MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
 
 
@@ -165,6 +166,7 @@ def shown(rig: Rig, design: Design) -> dict:
         "effort": _plain(tried.effort),
         "peak_force": _plain(np.abs(tried.response.forces).max()),
         "stable": tried.loop.stable,
+        "undamped": int(np.sum(np.abs(poles.real) <= ON_AXIS * np.abs(poles)) // 2),
         "rightmost": _plain(poles.real.max()),
         "poles": [[_plain(p.real), _plain(p.imag)] for p in poles if p.imag >= 0],
         "time": _plain(tried.response.time[::step]),

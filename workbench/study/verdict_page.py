@@ -9,9 +9,11 @@ from workbench.cases.case import Case
 from workbench.draw.gap import plot_missing_force, plot_responses, plot_rivals, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.gap.report.verdict import Verdict
-from workbench.study.page import Story, block, write_page
+from workbench.study.page import Story, block, to_its_error, write_page
 
 MOVING = "How the nominal model swings, and the corrected one where it differs; circles are sensors, triangles inputs."
+
+STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
 
 def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None) -> Path:
@@ -26,30 +28,43 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
     shown = verdict.to_json()
+    records = (*case.fit, *case.validation)
+    better = verdict.shrinkage is None or verdict.shrinkage.overall > 0
+    rigs = {"nominal": verdict.nominal}
+    if verdict.outcome != "none" and better:  # what makes the gap larger corrects nothing
+        rigs["corrected" if verdict.outcome == "explained" else "nearest"] = verdict.corrected
     figures = [
         (
-            plot_responses({"nominal": verdict.nominal, "corrected": verdict.corrected}, (*case.fit, *case.validation)),
-            "Measured, nominal and corrected response where they"
-            " differ most. Validation records were not seen by any fit.",
+            plot_responses(rigs, records),
+            f"Measured and simulated response ({', '.join(rigs)}) where they differ most. No fit has seen the"
+            " validation records.",
         ),
-        (
-            plot_where(verdict),
-            "Where the gap is. Its squared size above the noise, shared out; and how likely a single"
-            " unknown force at each place would explain it, before any effect is guessed.",
-        ),
-        (plot_missing_force(verdict), "The missing force as the records tell it, against the motion at its place."),
-        (plot_rivals(verdict), "What each effect alone leaves of the gap: at the noise floor, it explains all of it."),
     ]
+    if verdict.outcome != "none":  # there is nothing to take apart in noise
+        figures += [
+            (
+                plot_where(verdict),
+                "Where the gap is. Its squared size above the noise, shared out; and how likely a single"
+                " unknown force at each place would explain it, before any effect is guessed.",
+            ),
+            (
+                plot_missing_force(verdict),
+                "The unmodelled force reconstructed from the records, over the motion at its place.",
+            ),
+            (
+                plot_rivals(verdict),
+                "What each effect alone leaves of the gap: at the noise floor, it explains all of it.",
+            ),
+        ]
     gaps = [
         (name, before, shown["gap"]["after"][name], shown["gap"]["floor"][name], shown["shrinkage"].get(name))
         for name, before in shown["gap"]["before"].items()
     ]
     effects = [
         (
-            effect["kind"],
-            name,
-            value,
-            effect.get("parameters_std", {}).get(name, ""),
+            effect["kind"].replace("_", " "),
+            name.replace("_", " "),
+            *to_its_error(value, effect.get("parameters_std", {}).get(name)),
             effect.get("at", ""),
             effect.get("input", effect.get("output", "")),
         )
@@ -58,10 +73,10 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         )
         for name, value in effect["parameters"].items()
     ]
-    rivals = [(r["kind"], r["probability"]) for r in shown["alternatives"]]
+    rivals = [(r["kind"].replace("_", " "), r["probability"]) for r in shown["alternatives"]]
     tables: list[tuple[str, tuple[str, ...], list]] = [
         ("Gap on records kept out of the fit", ("record", "before", "after", "floor", "share closed"), gaps),
-        ("Effects", ("effect", "parameter", "value", "standard deviation", "x", "input or output"), effects),
+        ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
     moving = mode_motion(
@@ -72,10 +87,11 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     story = Story(
         title=f"Diagnosis of {verdict.case}",
         lead=verdict.sentence,
+        standing=STANDING_OF[verdict.outcome],
         lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
         blocks=[
             *(block(figure, caption) for figure, caption in figures),
-            *([block(moving, MOVING)] if verdict.nominal.structure is not None else []),
+            *([block(moving, MOVING)] if verdict.nominal.structure is not None and verdict.outcome != "none" else []),
         ],
         tables=[table for table in tables if table[2]],
         inputs={} if folder is None else case_inputs(folder),
@@ -99,8 +115,9 @@ def _could_show(verdict: Verdict) -> str:
         f"Before any fit: these records could show all but {len(hidden)} of {len(verdict.readiness.strengths)} effects"
     )
     if hidden:
-        text += f" (not {', '.join(hidden[:6])}{', …' if len(hidden) > 6 else ''})"
+        named = ", ".join(label.replace("_", " ") for label in hidden[:6])
+        text += f" (not {named}{', …' if len(hidden) > 6 else ''})"
     if alike:
-        text += f"; at small strength they could not tell {alike[0][0]} from {alike[0][1]}"
+        text += f"; at small strength they could not tell {alike[0][0]} from {alike[0][1]}".replace("_", " ")
         text += f", nor {len(alike) - 1} pairs more" if len(alike) > 1 else ""
     return text + "."

@@ -7,6 +7,7 @@ coordinates and rates, the lags of actuators, the hysteretic variables of laws a
 import numpy as np
 from numba import njit
 
+HYSTERESIS_STEPS = 200  # of a command's change over one sample
 DAMPER, CUBIC, CLEARANCE, STOP, FRICTION, BOUC_WEN, QUADRATIC, QUINTIC, CUBIC_DAMPER, SQUEEZE, MAGNET = range(11)
 
 
@@ -37,9 +38,40 @@ def law_force(code, p, w, v, z):
 
 
 @njit(cache=True)
-def _rates(t, y, dy, system, targets, held):
-    """dy/dt under the forces that the actuators head for and the modal forces held over the interval."""
-    structure, (lags, shapes), (tones, tone_shapes), (laws, law_shapes), (drag, field) = system
+def headed(target, before, rate, time):
+    """What an actuator gives that heads for a target for some time, from what it gave before, no faster than a rate."""
+    if np.isinf(rate):
+        return target
+    most = rate * time
+    return before + min(max(target - before, -most), most)
+
+
+@njit(cache=True)
+def hysteretic(z, change, width):
+    """z after a command has changed, z' = u' - (|u'| z + u' |z|) / (2 width), in small steps of the command."""
+    h = change / HYSTERESIS_STEPS
+    for _ in range(HYSTERESIS_STEPS):
+        k1 = _hysteretic_rate(z, h, width)
+        k2 = _hysteretic_rate(z + 0.5 * k1, h, width)
+        k3 = _hysteretic_rate(z + 0.5 * k2, h, width)
+        k4 = _hysteretic_rate(z + k3, h, width)
+        z += (k1 + 2.0 * k2 + 2.0 * k3 + k4) / 6.0
+    return z
+
+
+@njit(cache=True)
+def _hysteretic_rate(z, change, width):
+    return change - (abs(change) * z + change * abs(z)) / (2.0 * width)
+
+
+@njit(cache=True)
+def _rates(t, y, dy, system, drive, held):
+    """dy/dt under the forces that the actuators head for and the modal forces held over the interval.
+
+    drive: targets (m,), what each actuator gave when it began to head for them (m,), and that time, s.
+    """
+    structure, (lags, shapes, rates, biases), (tones, tone_shapes), (laws, law_shapes), (drag, field) = system
+    targets, before, begun = drive
     omega2, damping, gram, stretching, rate = structure
     m, n = shapes.shape
     factor = 1.0 + rate * t
@@ -47,10 +79,11 @@ def _rates(t, y, dy, system, targets, held):
         dy[i] = y[n + i]
         dy[n + i] = -factor * omega2[i] * y[i] - damping[i] * y[n + i] + held[i]
     for j in range(m):
-        force = targets[j]
+        force = headed(targets[j], before[j], rates[j], t - begun)
         if lags[j] > 0.0:
+            dy[2 * n + j] = (force - y[2 * n + j]) / lags[j]
             force = y[2 * n + j]
-            dy[2 * n + j] = (targets[j] - force) / lags[j]
+        force += biases[j]
         if force != 0.0:
             for i in range(n):
                 dy[n + i] += shapes[j, i] * force
@@ -90,10 +123,11 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
 
     Args:
         system: the structure (omega2 (n,), damping (n,), gram (n, n), stretching, stiffness rate); the actuators
-            (lags (m,), shapes (m, n)); tones (n_tones, 3) of amplitude, rad/s, phase, and shapes; laws (n_laws, 4)
-            of code and parameters, and shapes; air drag: coefficient, and shapes and weights (n_points, n + 1).
-        drive: mix (m, m), what each actuator gets of every command, and a table (m, 5): gain, dead zone, limit, delay,
-            curvature (u + curvature u |u| of the command, before the gain).
+            (lags (m,), shapes (m, n), rate limits (m,), biases (m,)); tones (n_tones, 3) of amplitude, rad/s, phase,
+            and shapes; laws (n_laws, 4) of code and parameters, and shapes; air drag: coefficient, and shapes and
+            weights (n_points, n + 1).
+        drive: mix (m, m), what each actuator gets of every command, and a table (m, 7): gain, dead zone, limit, delay,
+            curvature (u + curvature u |u| of the command, before the gain), share and width of hysteresis.
         commands: (m, n_samples); lowered by the feedback, in place.
         feedback: (m, n) command taken away per modal rate at each sample.
         held: (n_samples, n) unmeasured modal forces, over each interval.
@@ -114,7 +148,9 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
     k1, k2, k3, k4 = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     out = np.zeros((3, edges.size, n_samples, n))
     aims = np.zeros((m, n_samples))
-    targets = np.zeros(m)
+    targets, before, begun = np.zeros(m), np.zeros(m), 0.0
+    earlier, z = np.zeros(m), np.zeros(m)
+    rates = system[1][2]
     for k in range(n_samples):
         for j in range(m):
             for i in range(n):
@@ -124,30 +160,37 @@ def integrate(system, drive, commands, feedback, held, sample_time, edges, steps
             for i in range(m):
                 u += mix[j, i] * commands[i, k]
             u += table[j, 4] * u * abs(u)
+            if table[j, 5] > 0.0:
+                z[j] = hysteretic(z[j], u - earlier[j], table[j, 6])
+                earlier[j] = u
+                u = (1.0 - table[j, 5]) * u + table[j, 5] * z[j]
             u *= table[j, 0]
             u = np.sign(u) * max(abs(u) - table[j, 1], 0.0)
             aims[j, k] = min(max(u, -table[j, 2]), table[j, 2])
         start = 0.0
         for piece in range(edges.size):
             middle = k + 0.5 * (start + edges[piece])
+            now = (k + start) * dt
             for j in range(m):
+                before[j] = headed(targets[j], before[j], rates[j], now - begun)
                 index = int(np.floor(middle - table[j, 3] / dt))
                 targets[j] = aims[j, index] if index >= 0 else 0.0
+            begun = now
             h = (edges[piece] - start) * dt / steps[piece]
             for step in range(steps[piece]):
                 t = (k + start) * dt + step * h
-                _rates(t, y, k1, system, targets, held[k])
+                _rates(t, y, k1, system, (targets, before, begun), held[k])
                 if step == 0:
                     out[0, piece, k], out[1, piece, k], out[2, piece, k] = y[:n], y[n : 2 * n], k1[n : 2 * n]
                 for i in range(size):
                     trial[i] = y[i] + 0.5 * h * k1[i]
-                _rates(t + 0.5 * h, trial, k2, system, targets, held[k])
+                _rates(t + 0.5 * h, trial, k2, system, (targets, before, begun), held[k])
                 for i in range(size):
                     trial[i] = y[i] + 0.5 * h * k2[i]
-                _rates(t + 0.5 * h, trial, k3, system, targets, held[k])
+                _rates(t + 0.5 * h, trial, k3, system, (targets, before, begun), held[k])
                 for i in range(size):
                     trial[i] = y[i] + h * k3[i]
-                _rates(t + h, trial, k4, system, targets, held[k])
+                _rates(t + h, trial, k4, system, (targets, before, begun), held[k])
                 for i in range(size):
                     y[i] += h * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]) / 6.0
             start = edges[piece]

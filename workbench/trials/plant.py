@@ -136,6 +136,7 @@ class RootedPlant:
         n, zeta = plant.n_modes, _damping_ratios(plant)
         m = len(plant.actuators)
         drives = np.array([[a.gain, a.dead_zone, a.limit, a.delay] for a in plant.actuators])
+        hysteresis = np.array([[a.hysteresis_share, a.hysteresis_width] for a in plant.actuators])
         curvature = np.zeros(m) if plant.curvature is None else plant.curvature
         mix = np.eye(m) if plant.mix is None else plant.mix
         late = [a.delay / sample_time for a in plant.actuators] + [-s.delay / sample_time for s in plant.sensors]
@@ -154,14 +155,19 @@ class RootedPlant:
         damping = 2.0 * zeta * modes.omega
         system = (
             (modes.omega**2, damping, modes.gram, float(plant.stretching), float(plant.stiffness_rate)),
-            (np.array([a.time_constant for a in plant.actuators]), np.ascontiguousarray(self.at_actuators)),
+            (
+                np.array([a.time_constant for a in plant.actuators]),
+                np.ascontiguousarray(self.at_actuators),
+                np.array([a.rate_limit for a in plant.actuators]),
+                np.array([a.bias for a in plant.actuators]),
+            ),
             (tones, np.ascontiguousarray(self.at_tones)),
             (laws, np.ascontiguousarray(self.at_laws)),
             (float(plant.drag), np.ascontiguousarray(self.field)),
         )
         pieces = motion.integrate(
             system,
-            (mix, np.c_[drives, curvature]),
+            (mix, np.c_[drives, curvature, hysteresis]),
             sent,
             feedback * acting[:, None] * self.at_actuators,
             held,

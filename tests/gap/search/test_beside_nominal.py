@@ -85,6 +85,7 @@ def test_friction_beside_figures_a_little_off(rig, measured, records):
     assert verdict.shrinkage.overall > 0.99
 
 
+@pytest.mark.slow
 def test_nobody_has_to_say_that_figures_are_off(rig, records):
     real = off(replace(rig, elements=(CoulombFriction(1.37, 0.004, 1e-3),)))
     verdict = diagnose(rig, records(real))

@@ -20,6 +20,7 @@ from workbench.design.placement.limits import Limits
 from workbench.design.placement.scan import scan
 from workbench.design.placement.task import SINGULAR_SHARE, Placement, PlacementTask
 from workbench.structure.modes import frozen
+from workbench.threads import one_blas_thread
 
 MOST_ACTUATORS = 4
 BATCH = 4_000
@@ -51,6 +52,7 @@ class Certificate:
         return 1.0 - self.lower_bound / self.placement.residual_work
 
 
+@one_blas_thread
 def certify(
     task: PlacementTask,
     placement: Placement,

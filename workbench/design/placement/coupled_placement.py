@@ -8,10 +8,12 @@ from workbench.design.placement.coupled_spillover import coupled_batch, coupled_
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
+from workbench.threads import one_blas_thread
 
 DRAWN, LOOKED_AT = 2_000, 300
 
 
+@one_blas_thread
 def place_coupled(
     modes: Modes,
     n_controlled: int,

@@ -10,6 +10,7 @@ from workbench.design.placement.coupled_spillover import coupled_batch, coupled_
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
+from workbench.threads import one_blas_thread
 
 BATCH = 2_000
 
@@ -30,6 +31,7 @@ class CoupledScan:
     lower_bound: float
 
 
+@one_blas_thread
 def scan_coupled(
     modes: Modes,
     n_controlled: int,

@@ -21,6 +21,7 @@ from workbench.design.placement.scan import scan
 from workbench.design.placement.task import Placement, PlacementTask, placement_task
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes
+from workbench.threads import one_blas_thread
 
 __all__ = ["Limits", "Placement", "PlacementTask", "law_at", "nodes_of_mode", "place", "placement_task", "scan"]
 
@@ -37,6 +38,7 @@ def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
     return np.array([*roots, *x[values == 0.0]]).round(14)
 
 
+@one_blas_thread
 def place(
     task: PlacementTask,
     *,

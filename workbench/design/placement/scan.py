@@ -10,11 +10,13 @@ from numpy.typing import ArrayLike
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.limits import KEPT, Limits, conflict
 from workbench.design.placement.task import Placement, PlacementTask, batch_figures
+from workbench.threads import one_blas_thread
 
 BATCH = 20_000
 MOST_TRIED = 5_000_000
 
 
+@one_blas_thread
 def scan(
     task: PlacementTask,
     *,

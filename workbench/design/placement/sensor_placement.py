@@ -17,6 +17,7 @@ from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import ProfileLike
+from workbench.threads import one_blas_thread
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,7 @@ def filter_error(
     return float(np.sqrt((seen**2 @ e).sum() / e[index].sum()))
 
 
+@one_blas_thread
 def place_sensors(
     modes: Modes,
     controlled: int | Sequence[int],

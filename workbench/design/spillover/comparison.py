@@ -18,6 +18,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import ProfileLike
+from workbench.threads import one_blas_thread
 
 # as fast as the mode that is watched, and damped enough to forget where it started within two periods
 OBSERVER_POLES = -0.3 + 1j
@@ -77,6 +78,7 @@ def laws_of(
     return [make() for make in coupled], [why]
 
 
+@one_blas_thread
 def compare(
     modes: Modes, laws: Sequence[Law], state: np.ndarray, *, weight: float, final_time: float
 ) -> tuple[Compared, ...]:

@@ -14,6 +14,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_with
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes
+from workbench.threads import one_blas_thread
 
 # redesign(actuators, places of the sensors, share of the gain) gives the controller anew
 Redesign = Callable[[Sequence[Actuator], Sequence[float], float], Controller]
@@ -48,6 +49,7 @@ class _Setting:
     share: float = 1.0
 
 
+@one_blas_thread
 def remedies(
     modes: Modes,
     redesign: Redesign,

@@ -15,6 +15,7 @@ from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.structure.modes import Modes, frozen
+from workbench.threads import one_blas_thread
 
 LEAST_OMEGA = 1e-3
 
@@ -131,6 +132,7 @@ def survival_of(possible: list[Modes], design: Controller | Law) -> float:
     return float(np.mean([close_with(modes, design).stable for modes in possible]))
 
 
+@one_blas_thread
 def survive(
     possible: list[Modes], designs: Mapping[str, Controller | Law], *, state: np.ndarray, final_time: float
 ) -> dict[str, Survival]:

@@ -10,6 +10,7 @@ from scipy.optimize import minimize, minimize_scalar
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
+from workbench.threads import one_blas_thread
 
 VALLEYS = 3  # of the misfit that are gone into
 ROUNDS = 3  # in each: where the force is, which lines tell of it
@@ -43,6 +44,7 @@ class Placed:
     holds: bool | None
 
 
+@one_blas_thread
 def placed(evidence: Evidence) -> Placed:
     """Where one force, of any law, would make the simulation agree with the test.
 

@@ -56,7 +56,7 @@ class Follower:
     def errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
 
-        What sensors lose by lag or clipping is not followed: it is made up for as the whole record has it.
+        What sensors lose by delay, lag or clipping is not followed: it is made up for as the whole record has it.
         """
         return self.whitening @ self._followed(rig, record, substeps)
 
@@ -113,7 +113,8 @@ def _unrounded(rig: Rig) -> Rig:
 
 
 def _at_once(rig: Rig) -> Rig:
-    """The rig itself where no sensor lags or clips."""
-    if not any(sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors):
+    """The rig itself where no sensor is late, lags or clips."""
+    if not any(sensor.delay or sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors):
         return rig
-    return replace(rig, sensors=tuple(replace(sensor, time_constant=0.0, limit=np.inf) for sensor in rig.sensors))
+    sensors = tuple(replace(sensor, delay=0.0, time_constant=0.0, limit=np.inf) for sensor in rig.sensors)
+    return replace(rig, sensors=sensors)

@@ -14,6 +14,7 @@ from workbench.identification.free_decay.coloured_noise import in_its_noise
 from workbench.identification.free_decay.refinement import Refined, refine
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
+from workbench.threads import one_blas_thread
 
 STRETCHES = 4
 # Amplitude that a mode must have in a stretch, and cycles, for its frequency there to mean something.
@@ -54,6 +55,7 @@ class AmplitudeDependence:
         return np.any(self.probability < SURE / self.probability.size, axis=0)
 
 
+@one_blas_thread
 def amplitude_dependence(
     records: Record | Sequence[Record], refined: Refined, *, stretches: int = STRETCHES
 ) -> AmplitudeDependence:

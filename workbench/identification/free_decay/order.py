@@ -29,6 +29,7 @@ from workbench.identification.signal.noise_levels import differ, variances
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
+from workbench.threads import one_blas_thread
 
 # Values in all from which modes are taken in many at a time.
 LONG = 100_000
@@ -50,6 +51,7 @@ ROUND_OFF = 1e-26
 BESIDE = 50
 
 
+@one_blas_thread
 def identify(
     records: Record | Sequence[Record],
     *,

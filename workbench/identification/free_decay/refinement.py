@@ -25,6 +25,7 @@ from workbench.identification.signal.standard_errors import StandardErrors
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
+from workbench.threads import one_blas_thread
 
 MOST_STEPS = 60
 # A step is small once it moves the estimate by less than a thousandth of its standard error.
@@ -70,6 +71,7 @@ class Refined(StandardErrors):
         return self._within(float(ndtri(0.5 * (1.0 + level))))
 
 
+@one_blas_thread
 def refine(records: Record | Sequence[Record], start: SampledModes, *, offset: bool = False) -> Refined:
     """The most likely modes near `start`, with the Cramér-Rao covariance of frequencies, damping and shapes.
 

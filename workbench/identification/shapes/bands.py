@@ -25,6 +25,7 @@ from workbench.identification.shapes.interpolation_error import Foretold, missed
 from workbench.structure.modes import frozen
 from workbench.structure.profile import ProfileLike
 from workbench.structure.supports import PointMass
+from workbench.threads import one_blas_thread
 
 DRAWS = 4000
 # Of the largest standard error; below it an end holds the curve and there is nothing to be unsure of.
@@ -64,6 +65,7 @@ class Bands:
         return self.phi - width * self.std, self.phi + width * self.std
 
 
+@one_blas_thread
 def eigenfunction_bands(
     refined: Refined,
     x: Sequence[float] | np.ndarray,

@@ -17,6 +17,7 @@ from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import PointMass
+from workbench.threads import one_blas_thread
 
 # In section 4.4 each two degrees more cut the error of the lowest eigenfunctions by ten, and that of the highest, which
 # swing too fast for their sensors, is made worse at the ends. So every mode takes the degree that best foretells each
@@ -135,6 +136,7 @@ def interpolating_spline(
     return Spline(frozen(knots), degree, frozen(weights), tuple(conditions), frozen(inverse[:, read.sum() :] * powers))
 
 
+@one_blas_thread
 def eigenfunctions(
     sampled: SampledModes,
     *,

@@ -21,6 +21,7 @@ from scipy.linalg import null_space
 
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
+from workbench.threads import one_blas_thread
 
 KNOWN_TOLERANCE = 1e-8
 
@@ -107,6 +108,7 @@ class Distributions:
     scales: np.ndarray
 
 
+@one_blas_thread
 def mass_and_stiffness(
     modes: Modes,
     *,

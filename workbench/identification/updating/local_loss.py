@@ -27,6 +27,7 @@ from workbench.identification.updating.structure_fit import MOST_TERMS, choose, 
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import Task
 from workbench.structure.member import Bar, Beam
+from workbench.threads import one_blas_thread
 
 FALSE_ALARM = 0.01
 N_PLACES = 60
@@ -82,6 +83,7 @@ class LossFound:
         return np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T
 
 
+@one_blas_thread
 def find_loss(
     measured: Refined,
     nominal: Bar | Beam,

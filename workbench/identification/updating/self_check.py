@@ -10,6 +10,7 @@ from workbench.identification.updating.distributions import Basis, Distributions
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import Modes, mac
 from workbench.structure.supports import End
+from workbench.threads import one_blas_thread
 
 N_POINTS = 101
 
@@ -56,6 +57,7 @@ def structure_of(found: Distributions, *, kind: str, length: float, left: str | 
     return Beam(bending_stiffness=found.stiffness.profile, **where)
 
 
+@one_blas_thread
 def self_check(
     found: Distributions, measured: Modes, *, kind: str, left: str | End, right: str | End, first_mode: int = 0
 ) -> SelfCheck:

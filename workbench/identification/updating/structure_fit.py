@@ -15,11 +15,13 @@ from workbench.identification.updating.fitted_structure import FittedStructure
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import GaussianPrior, Task
 from workbench.structure.member import Bar, Beam
+from workbench.threads import one_blas_thread
 
 MOST_TERMS = 8
 SPARE = 2
 
 
+@one_blas_thread
 def fit_structure(
     measured: Refined,
     nominal: Bar | Beam,
@@ -53,6 +55,7 @@ def fit_structure(
     return Problem.of(task, mass, stiffness).fit()
 
 
+@one_blas_thread
 def choose_structure(
     measured: Refined,
     nominal: Bar | Beam,

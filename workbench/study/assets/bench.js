@@ -155,9 +155,12 @@
   // what is found
   function present() {
     ["residual", "effort", "peak_force"].forEach(function (name) { cards[name].textContent = answer[name] === null ? "∞" : answer[name].toExponential(3).replace("e+0", "").replace("e-", "e−"); });
-    cards.stable.textContent = answer.stable ? "stable" : "unstable";
-    cards.stable.nextSibling.textContent = "closed loop; rightmost pole at " + (answer.stable ? "0 or less" : shown(answer.rightmost) + " rad/s");
-    cards.stable.className = answer.stable ? "good" : "bad";
+    var undamped = answer.stable && answer.undamped > 0;
+    cards.stable.textContent = undamped ? "undamped" : answer.stable ? "stable" : "unstable";
+    cards.stable.nextSibling.textContent = "closed loop; " + (undamped ?
+      answer.undamped + (answer.undamped > 1 ? " pairs of poles" : " pair of poles") + " on the imaginary axis" :
+      "rightmost pole at " + shown(answer.rightmost) + " rad/s");
+    cards.stable.className = undamped ? "" : answer.stable ? "good" : "bad";
     reach = 1e-12;
     for (var k = 0; k < answer.time.length; k += 5) displaced(k).concat(idle(k)).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
     swing();

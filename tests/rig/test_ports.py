@@ -1,0 +1,156 @@
+"""What actuators and sensors do to a signal, against finer simulation, scipy's integrator and closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CoulombFriction, CubicSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import actuator_force, move, read, simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.modes import Modes
+from workbench.structure.supports import PointDamper
+
+DT = 0.1
+SENSORS = (Sensor("d", 3.1), Sensor("v", 4.4, "velocity"), Sensor("a", 7.0, "acceleration"))
+
+
+def modes_of(**options) -> Modes:
+    beam = Beam(
+        length=10.0,
+        mass_per_length=1.0,
+        bending_stiffness=1.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+        **options,
+    )
+    return beam.modes(6)
+
+
+def rig(*actuators: Actuator, **options) -> Rig:
+    both = actuators or (Actuator("F1", 2.0), Actuator("F2", 6.3))
+    return Rig(**{"modes": modes_of(), "actuators": both, "sensors": SENSORS, **options})
+
+
+def drive(n: int = 300, n_inputs: int = 2) -> np.ndarray:
+    return np.random.default_rng(0).standard_normal((n_inputs, n))
+
+
+def late(r: Rig, delay: float) -> Rig:
+    return replace(r, sensors=tuple(replace(s, delay=delay) for s in r.sensors))
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.1, 0.27])
+@pytest.mark.parametrize("damped", [False, True])
+def test_a_late_sensor_of_a_linear_rig_reads_what_was(delay, damped):
+    modes = modes_of(attachments=(PointDamper(3.0, 0.2),)) if damped else modes_of()
+    r, inputs, fine = rig(modes=modes), drive(120), 100
+    shift = round(delay * fine / DT)
+    peer = simulate(r, np.repeat(inputs, fine, axis=1), sample_time=DT / fine).outputs
+    peer = np.c_[np.zeros((3, shift)), peer][:, : peer.shape[1]][:, ::fine]
+    mine = simulate(late(r, delay), inputs, sample_time=DT).outputs
+    limit = 5e-5 if damped else 1e-9  # what couples the modes is taken as linear over a sample
+    assert np.abs(mine - peer).max() < limit * np.abs(peer).max()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"elements": (CubicSpring(4.0, 0.3),)}, {"stiffness_rate": 0.02}],
+    ids=["cubic spring", "stiffness drift"],
+)
+def test_a_late_sensor_of_a_rig_without_closed_form_reads_what_was(options):
+    r, inputs, fine = rig(**options), 0.3 * drive(150), 20
+    peer = simulate(r, np.repeat(inputs, fine, axis=1), sample_time=DT / fine).outputs
+    peer = np.c_[np.zeros((3, 6)), peer][:, : peer.shape[1]][:, ::fine]
+    mine = simulate(late(r, 0.03), inputs, sample_time=DT, substeps=32).outputs
+    at_once = simulate(r, inputs, sample_time=DT, substeps=32).outputs
+    off, moved = np.abs(mine - peer).max(axis=1), np.abs(at_once - peer).max(axis=1)
+    assert (off < 0.02 * moved).all(), off / moved
+
+
+def test_a_late_sensor_of_a_record_cut_at_its_start_goes_on_from_there():
+    r, inputs = late(rig(), 0.04), drive()
+    whole = move(r, inputs, sample_time=DT)
+    cut = read(r, whole.after(50), sample_time=DT)
+    np.testing.assert_allclose(cut[:, 1:], read(r, whole, sample_time=DT)[:, 51:], atol=1e-12)
+    first = read(r, whole, sample_time=DT)[0, 50]  # a velocity shows that the force before the cut was another one
+    assert cut[0, 0] == pytest.approx(first, rel=0.01)
+
+
+def test_a_bias_is_one_more_command_that_never_ends():
+    inputs = drive()
+    for extra in ({}, {"elements": (CubicSpring(4.0, 0.3),)}):
+        biased = rig(Actuator("F1", 2.0, bias=0.4), Actuator("F2", 6.3), **extra)
+        pushed = inputs + np.array([[0.4], [0.0]])
+        mine, peer = (simulate(r, u, sample_time=DT).outputs for r, u in ((biased, inputs), (rig(**extra), pushed)))
+        np.testing.assert_allclose(mine, peer, atol=1e-12 * np.abs(peer).max())
+    lagging = rig(Actuator("F1", 2.0, bias=0.4, delay=0.07, time_constant=0.2), Actuator("F2", 6.3))
+    still = simulate(lagging, 0.0 * inputs, sample_time=DT).outputs
+    plain = simulate(rig(), 0.0 * inputs + np.array([[0.4], [0.0]]), sample_time=DT).outputs
+    np.testing.assert_allclose(still, plain, atol=1e-12)
+
+
+def test_a_rate_limit_lets_the_force_ramp():
+    command = drive(150, 1)
+    fine, rate = 400, 8.0
+    force, now = np.zeros(150 * fine), 0.0
+    for k in range(force.size):
+        force[k] = now
+        now += np.clip(command[0, k // fine] - now, -rate * DT / fine, rate * DT / fine)
+    peer = simulate(rig(Actuator("F1", 2.0)), force[None], sample_time=DT / fine).outputs[:, ::fine]
+    limited = rig(Actuator("F1", 2.0, rate_limit=rate))
+    errors = [
+        np.abs(simulate(limited, command, sample_time=DT, substeps=k).outputs - peer).max(axis=1) for k in (8, 32)
+    ]
+    unlimited = np.abs(simulate(rig(Actuator("F1", 2.0)), command, sample_time=DT).outputs - peer).max(axis=1)
+    assert (errors[0] < 0.05 * unlimited).all() and (errors[1] < 0.02 * unlimited).all()
+    never = replace(limited, actuators=(replace(limited.actuators[0], rate_limit=1e6),))
+    np.testing.assert_allclose(
+        simulate(never, command, sample_time=DT).outputs[:2],
+        simulate(rig(Actuator("F1", 2.0)), command, sample_time=DT).outputs[:2],
+        atol=1e-4 * np.abs(peer).max(),
+    )
+
+
+def test_a_command_passes_its_hysteresis_as_an_adaptive_integrator_has_it():
+    command = np.cumsum(drive(60, 1)[0])
+    z, before, expected = 0.0, 0.0, []
+    for u in command:
+        change = u - before
+        if change:
+            found = solve_ivp(
+                lambda s, z, du=change: du - (abs(du) * z + du * abs(z)) / 1.4, (0, 1), [z], rtol=1e-10, atol=1e-12
+            )
+            z = found.y[0, -1]
+        before = u
+        expected.append(0.7 * u + 0.3 * z)
+    hysteretic = Actuator("F1", 2.0, hysteresis_share=0.3, hysteresis_width=0.7)
+    np.testing.assert_allclose(actuator_force(hysteretic, command), expected, atol=1e-8)
+    np.testing.assert_array_equal(actuator_force(replace(hysteretic, hysteresis_share=0.0), command), command)
+
+
+def test_friction_of_two_directions_is_friction_and_an_offset():
+    """Forward -(F + F0), backward -(F - F0): the offset does what a constant force at that place does."""
+    inputs = drive(150)
+    offset = rig(elements=(CoulombFriction(6.3, 0.1, 0.05, 0.04),))
+    pushed = rig(Actuator("F1", 2.0), Actuator("F2", 6.3, bias=-0.04), elements=(CoulombFriction(6.3, 0.1, 0.05),))
+    mine, peer = (simulate(r, inputs, sample_time=DT, substeps=32).outputs for r in (offset, pushed))
+    np.testing.assert_allclose(mine[:2], peer[:2], atol=2e-3 * np.abs(peer).max())
+
+
+@pytest.mark.parametrize("field", ["rate_limit", "hysteresis_width", "limit"])
+def test_limits_that_are_not_positive_are_refused(field):
+    with pytest.raises(ValueError, match=field):
+        Actuator("F1", 2.0, **{field: 0.0})
+
+
+def test_a_late_or_biased_port_has_no_state_space():
+    assert Actuator("F1", 2.0).linear and Sensor("d", 1.0).linear
+    assert not Actuator("F1", 2.0, bias=1.0).linear and not Actuator("F1", 2.0, rate_limit=1.0).linear
+    assert not Actuator("F1", 2.0, hysteresis_share=0.1).linear and not Sensor("d", 1.0, delay=0.1).linear

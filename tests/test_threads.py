@@ -1,0 +1,47 @@
+"""The library keeps linear algebra to one thread while it works, and gives back what it found."""
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import workbench as wb
+from workbench.threads import one_blas_thread
+
+
+def threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+@pytest.fixture
+def two():
+    with threadpool_limits(2, user_api="blas"):
+        if threads() != {2}:
+            pytest.skip("this BLAS has no threads to limit")
+        yield
+
+
+def test_one_inside_and_as_before_outside(two):
+    assert one_blas_thread(threads)() == {1}
+    assert threads() == {2}
+
+
+def test_an_error_gives_them_back_too(two):
+    with pytest.raises(ZeroDivisionError):
+        one_blas_thread(lambda: 1 / 0)()
+    assert threads() == {2}
+
+
+def test_one_inside_another(two):
+    outer = one_blas_thread(lambda: (one_blas_thread(threads)(), threads()))
+    assert outer() == ({1}, {1})
+    assert threads() == {2}
+
+
+def test_a_structure_is_solved_by_one(two, monkeypatch):
+    from workbench.structure import member
+
+    seen = []
+    monkeypatch.setattr(member, "eigh", lambda *a, _eigh=member.eigh, **k: seen.append(threads()) or _eigh(*a, **k))
+    beam = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    np.testing.assert_allclose(beam.modes(3).omega, (np.pi * np.arange(1, 4)) ** 2, rtol=1e-9)
+    assert seen and all(each == {1} for each in seen)
