@@ -8,6 +8,8 @@ from workbench.cli.bench import bench
 from workbench.cli.design import design
 from workbench.cli.diagnose import diagnose
 from workbench.cli.identify import identify
+from workbench.cli.look import look
+from workbench.cli.new import new
 from workbench.cli.place import place
 from workbench.cli.report import report
 from workbench.cli.study import study
@@ -40,7 +42,7 @@ def _options(
     """Options of the command itself."""
 
 
-for command in (study, identify, design, place, diagnose, trial, report, bench):
+for command in (look, identify, design, place, diagnose, trial, study, report, bench, new):
     app.command()(command)
 
 

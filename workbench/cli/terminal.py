@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import warnings
 from collections.abc import Callable, Mapping
 from functools import wraps
@@ -13,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 FAILURE, BAD_INPUT = 1, 2
+OPTIONS = {"sample_rate_hz": "--sample-rate-hz", "n_modes": "--modes", "band_hz": "--band-hz"}  # by argument
 WIDE = 150  # columns of a table that goes to a file or a pipe
 
 JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
@@ -49,7 +51,9 @@ def guarded(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def complain(fault: str) -> None:
-    """Print an error in one line."""
+    """Print an error in one line, with options where the library names arguments."""
+    for argument, option in OPTIONS.items():
+        fault = re.sub(rf"\b{argument}\b", option, fault)
     errors.print(f"workbench: {_one_line(fault)}", style="red", markup=False)
 
 

@@ -1,0 +1,64 @@
+"""`workbench look`: what a stranger's file holds, and a command that then works."""
+
+import shlex
+
+import numpy as np
+
+RATE, N = 1000.0, 4000
+OMEGA, ZETA = 2.0 * np.pi * 40.0, 0.01
+
+
+def decay(rng):
+    time = np.arange(N) / RATE
+    return time, np.exp(-ZETA * OMEGA * time) * np.cos(OMEGA * time) + 1e-3 * rng.standard_normal(N)
+
+
+def write(path, names, columns):
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=",".join(names), comments="")
+    return path
+
+
+def test_a_free_decay_is_shown_and_identified_by_the_command_it_offers(run, tmp_path):
+    time, tip = decay(np.random.default_rng(0))
+    path = write(tmp_path / "tip.csv", ["time", "tip", "spare"], [time, tip, np.full(N, 2.5)])
+    seen = run("look", path, "--page", tmp_path / "p.html")
+    assert seen.exit_code == 0, seen.output
+    assert "2 outputs and 0 inputs, 4000 samples at 1000 Hz, 4 s from 0 s on" in seen.output
+    [row] = [line.split() for line in seen.output.splitlines() if line.startswith("tip ")]
+    assert abs(float(row[-1]) - 40.0) <= 1.0  # a line
+    assert "'spare' stays at 2.5" in seen.output and (tmp_path / "p.html").is_file()
+    [command] = [line.split("go on")[1] for line in seen.output.splitlines() if "go on" in line]
+    words = shlex.split(command)
+    assert words == ["workbench", "identify", str(path), "--outputs", "tip"]
+    found = run(*words[1:])
+    assert found.exit_code == 0 and "40.0" in found.output
+
+
+def test_an_input_is_known_by_its_name_and_steady_motion_is_ambient(run, tmp_path):
+    rng = np.random.default_rng(1)
+    force, moves = rng.standard_normal((2, N))
+    time = np.arange(N) / RATE
+    driven = write(tmp_path / "driven.csv", ["t", "shaker force", "a1"], [time, force, moves])
+    assert "--inputs 'shaker force'" in run("look", driven, "--page", tmp_path / "p.html").output
+    ambient = write(tmp_path / "ambient.csv", ["t", "a1", "a2"], [time, moves, force])
+    assert "--ambient" in run("look", ambient, "--page", tmp_path / "p.html").output
+
+
+def test_transfer_functions_are_shown(run, tmp_path):
+    lines = np.linspace(1.0, 100.0, 400)
+    h = 1.0 / (OMEGA**2 - (2.0 * np.pi * lines) ** 2 + 2j * ZETA * OMEGA * 2.0 * np.pi * lines)
+    np.savez(tmp_path / "frf.npz", frequency_hz=lines, H=h)
+    seen = run("look", tmp_path / "frf.npz", "--page", tmp_path / "p.html")
+    assert seen.exit_code == 0, seen.output
+    assert "transfer functions of 1 output and 1 input, 400 lines from 1 to 100 Hz" in seen.output
+    [row] = [line.split() for line in seen.output.splitlines() if line.startswith("H")]
+    assert abs(float(row[-1]) - 40.0) < 0.3
+
+
+def test_what_cannot_be_read_ends_in_one_line(run, tmp_path):
+    np.savez(tmp_path / "bare.npz", a=np.random.default_rng(0).standard_normal(100))
+    bare = run("look", tmp_path / "bare.npz")
+    assert bare.exit_code == 2 and "--sample-rate-hz" in bare.output and "sample_rate_hz" not in bare.output
+    (tmp_path / "note.csv").write_text("hello\n")
+    refused = run("look", tmp_path / "note.csv")
+    assert refused.exit_code == 2 and len(refused.output.strip().splitlines()) == 1

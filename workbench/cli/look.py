@@ -1,0 +1,42 @@
+"""`workbench look`: what a measured file holds."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from workbench.cli.terminal import PagePath, console, guarded, names_in, say, short
+
+
+@guarded
+def look(
+    file: Annotated[Path, typer.Argument(help="Measured file: .csv, .txt, .npz, .mat, .h5, .uff, ...")],
+    sample_rate_hz: Annotated[
+        float | None, typer.Option(help="Sampling rate, where the file has no time axis.")
+    ] = None,
+    inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Channels that are inputs.")] = "",
+    page: PagePath = None,
+) -> None:
+    """Show what a measured file holds: channels, rate, length, levels, spectrum, faults, and the command to go on with.
+
+    Example: workbench look ringdown.csv
+    """
+    from workbench.records.files import read_measured
+    from workbench.study.look import HEADINGS, look_at
+    from workbench.study.page import write_page
+
+    measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs))
+    seen = look_at(measured, file)
+    table = Table(box=None, pad_edge=False)
+    for heading in HEADINGS:
+        table.add_column(heading, justify="left" if heading in HEADINGS[:2] else "right", no_wrap=True)
+    for row in seen.rows:
+        table.add_row(*row)
+    say(seen.heading, bold=True)
+    console.print(table)
+    for remark in seen.remarks:
+        say(f"  {remark}")
+    say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', seen.story))}")
+    command = seen.command + (f" --sample-rate-hz {sample_rate_hz:g}" if sample_rate_hz else "")
+    say(f"  go on    {command}")

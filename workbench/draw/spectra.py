@@ -1,0 +1,44 @@
+"""Figures of measured signals over frequency."""
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.signal import welch
+
+from workbench.draw.style import COLOURS, new_figure
+from workbench.records.record import Record
+from workbench.records.transfer_functions import TransferFunctions
+
+LINES = 4096  # samples of a segment
+SEGMENTS = 4  # of the record at least
+MOST_PANELS = 12
+
+
+def plot_spectra(record: Record) -> Figure:
+    """Power spectral density of each signal, inputs first, by Welch's method."""
+    rows = [*zip(record.input_channels, record.inputs), *zip(record.output_channels, record.outputs)][:MOST_PANELS]
+    figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.6 * len(rows), sharex=True, squeeze=False)
+    for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
+        lines, power = welch(
+            values - values.mean(), record.sample_rate_hz, nperseg=min(LINES, max(values.size // SEGMENTS, 1))
+        )
+        if power[1:].max(initial=0.0) > 0:
+            ax.semilogy(lines[1:], power[1:], color=COLOURS[1] if i < record.n_inputs else COLOURS[0], linewidth=0.9)
+        ax.set_ylabel(f"{channel.name}\n[{f'({channel.unit})²/Hz' if channel.unit else '1/Hz'}]")
+    axes[0, 0].set_title("power spectral density")
+    axes[-1, 0].set_xlabel("frequency [Hz]")
+    return figure
+
+
+def plot_transfer(measured: TransferFunctions) -> Figure:
+    """Magnitude of each output's transfer functions, all inputs in one panel."""
+    rows = list(zip(measured.output_channels, np.abs(measured.values)))[:MOST_PANELS]
+    figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.6 * len(rows), sharex=True, squeeze=False)
+    for ax, (channel, values) in zip(axes[:, 0], rows):
+        for reference, row in zip(measured.references, values):
+            ax.semilogy(measured.frequencies_hz, np.where(row > 0, row, np.nan), linewidth=0.9, label=reference)
+        ax.set_ylabel(f"|{channel.name}|")
+    if len(measured.references) > 1:
+        axes[0, 0].legend(fontsize=8)
+    axes[0, 0].set_title("magnitude of the transfer functions, output per input")
+    axes[-1, 0].set_xlabel("frequency [Hz]")
+    return figure

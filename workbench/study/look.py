@@ -1,0 +1,152 @@
+"""What a measured file holds, before anything is identified: channels, levels, spectrum, faults, and how to go on."""
+
+import re
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.signal import find_peaks, welch
+
+from workbench.draw.plot import plot
+from workbench.draw.spectra import plot_spectra, plot_transfer
+from workbench.identification.signal.data_quality import ailments
+from workbench.identification.signal.decay import decay_start
+from workbench.records.record import Channel, Record
+from workbench.records.transfer_functions import TransferFunctions
+from workbench.study.page import Story, block
+
+HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
+FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
+DECAYED = 0.1  # rms of the last tenth over the largest of any tenth, below which a record is a free decay
+LINES = 4096  # samples of a segment of the spectrum
+PEAKS = 4  # shown of each channel
+PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of its surroundings; these as a part of the lines
+SEGMENTS = 4  # of the record at least, so that single lines of noise are no peaks
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a file holds.
+
+    Attributes:
+        heading: number of channels and samples, rate, length.
+        rows: one a channel, under `HEADINGS`.
+        remarks: faults of the data and what else to know.
+        command: the command to go on with.
+        story: the page of it.
+    """
+
+    heading: str
+    rows: tuple[tuple[str, ...], ...]
+    remarks: tuple[str, ...]
+    command: str
+    story: Story
+
+
+def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
+    """What a measured file holds, and the command to go on with."""
+    if isinstance(measured, TransferFunctions):
+        return _transfer(measured, path)
+    return _record(measured, path)
+
+
+def _record(record: Record, path: Path) -> Look:
+    channels = (*record.input_channels, *record.output_channels)
+    signals = (*record.inputs, *record.outputs)
+    rows = tuple(_row(channel, row, record.sample_rate_hz) for channel, row in zip(channels, signals, strict=True))
+    inputs, outputs = record.n_inputs, record.n_outputs
+    seconds = record.n_samples * record.sample_time
+    heading = (
+        f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
+        f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
+    )
+    faults = ailments(record)
+    faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
+    remarks = [fault.message for fault in faults]
+    untold = [channel.name for channel in channels if not channel.quantity]
+    if untold:
+        remarks.append(f"the file states no quantity for {', '.join(untold)}: their units are as recorded")
+    forces = [] if inputs else [n for n in record.output_names if n not in faulty and FORCES.search(n)]
+    options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
+    if forces:
+        remarks.append(f"{', '.join(forces)}: an input by its name; leave --inputs out if it is not")
+    kept = [name for name in record.output_names if name not in faulty | set(forces)]
+    if not options:
+        decays = _decays(record.only(kept)) if kept else False
+        start = decay_start(record.only(kept)) if decays else record.start_time
+        if decays and start > record.start_time:
+            remarks.append(f"the free decay begins at {start:.6g} s")
+        options += [] if decays else ["--ambient"]
+    if faulty and kept:
+        options += ["--outputs", ",".join(kept)]
+    story = Story(
+        title=f"What {path.name} holds",
+        lead=heading,
+        lines=remarks,
+        blocks=[
+            block(plot(record), "The signals as recorded."),
+            block(plot_spectra(record), "Power spectral density, by Welch's method."),
+        ],
+        tables=[("Channels", HEADINGS, rows)],
+        made_by=f"workbench look {path}",
+    )
+    return Look(heading, rows, tuple(remarks), _command(path, options), story)
+
+
+def _transfer(measured: TransferFunctions, path: Path) -> Look:
+    lines = measured.frequencies_hz
+    rows = []
+    for channel, row in zip(measured.output_channels, np.abs(measured.values), strict=True):
+        largest = row.max(axis=0)
+        at = ", ".join(f"{f:.5g}" for f in _strongest(lines, largest**2))
+        rms = float(np.sqrt((row**2).mean()))
+        rows.append((channel.name, "magnitude", *(f"{v:.4g}" for v in (row.min(), row.max(), row.mean(), rms)), at))
+    n, m = len(measured.output_channels), len(measured.references)
+    heading = (
+        f"transfer functions of {n} output{'s' * (n > 1)} and {m} input{'s' * (m > 1)}, {lines.size} lines from"
+        f" {lines[0]:.6g} to {lines[-1]:.6g} Hz"
+    )
+    story = Story(
+        title=f"What {path.name} holds",
+        lead=heading,
+        blocks=[block(plot_transfer(measured), "Magnitude of the transfer functions.")],
+        tables=[("Channels", HEADINGS, rows)],
+        made_by=f"workbench look {path}",
+    )
+    return Look(heading, tuple(rows), (), _command(path, []), story)
+
+
+def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
+    quantity = channel.quantity or "not stated"
+    quantity += f" [{channel.unit}]" if channel.unit else ""
+    about = row - row.mean()
+    numbers = (f"{value:.4g}" for value in (row.min(), row.max(), row.mean(), np.sqrt((about**2).mean())))
+    if row.size < 16 * SEGMENTS:
+        return channel.name, quantity, *numbers, ""
+    lines, power = welch(about, rate_hz, nperseg=min(LINES, row.size // SEGMENTS))
+    return channel.name, quantity, *numbers, ", ".join(f"{f:.4g}" for f in _strongest(lines, power))
+
+
+def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
+    """Frequencies of the highest peaks that stand out, in rising order."""
+    if lines.size < 3 or not power.max() > 0:
+        return []
+    about = median_filter(power, size=max(lines.size // SURROUNDINGS, 3), mode="nearest")
+    peaks, _ = find_peaks(power)
+    peaks = peaks[power[peaks] > PROMINENT * about[peaks]]
+    best = peaks[np.argsort(-power[peaks])[:PEAKS]]
+    return sorted(float(lines[i]) for i in best)
+
+
+def _decays(record: Record) -> bool:
+    """Whether the outputs die away towards the end."""
+    about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
+    tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
+    return tenths[-1] < DECAYED**2 * max(tenths)
+
+
+def _command(path: Path, options: Sequence[str]) -> str:
+    return shlex.join(["workbench", "identify", str(path), *options])
