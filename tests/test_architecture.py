@@ -29,7 +29,7 @@ INSIDE = {
 ENGINES = {
     "casadi": {"design/placement/placement.py"},
     "matplotlib": {"draw/"},
-    "pyuff": {"records/uff_file.py"},
+    "pyuff": {"records/uff_file.py", "records/uff_modes.py"},
     "h5py": {"records/hdf5_file.py"},
     "typer": {"cli/"},
     "rich": {"cli/"},

@@ -41,6 +41,7 @@ from .identification.updating.structure_fit import fit_structure as fit_structur
 from .records.files import read_measured as read_measured
 from .records.files import read_record as read_record
 from .records.files import write_record as write_record
+from .records.modes_file import read_modes as read_modes
 from .records.record import Channel as Channel
 from .records.record import Record as Record
 from .records.transfer_functions import TransferFunctions as TransferFunctions

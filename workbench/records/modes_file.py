@@ -1,0 +1,138 @@
+"""Modes of a finite-element model or a modal test, from files of other programs."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.records import hdf5_file, mat_file, npz_file, uff_modes
+from workbench.records.file_error import RecordFileError, unreadable
+from workbench.records.limits import check_size
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes
+
+FORMATS = {
+    ".uff": uff_modes,
+    ".unv": uff_modes,
+    ".npz": npz_file,
+    ".mat": mat_file,
+    ".h5": hdf5_file,
+    ".hdf5": hdf5_file,
+}
+ORTHOGONAL = 1e-3  # of unit modal mass: products of different modes beyond it are no rounding
+NO_OP2 = (
+    "Nastran's OP2 is not read: pyNastran 1.4 needs NumPy below 2. Export the modes as a universal file (data set"
+    " 2414), or read the OP2 where pyNastran runs and save its arrays as an NPZ"
+)
+
+
+def read_modes(
+    path: str | Path, *, modal_mass: ArrayLike | None = None, damping_ratios: ArrayLike | None = None
+) -> Modes:
+    """The mass-normalised modes that a file holds, at named points.
+
+    Universal files (.uff, .unv): data sets 55 or 2414 at nodes, with coordinates of 15 or 2411. NPZ, MAT and HDF5:
+    `shapes` (n_points, n_modes), `frequencies_hz` or `omega` (n_modes,), and where known `damping_ratios` (n_modes,),
+    `modal_mass` (n_modes,), `names`, `nodes` and `directions` (n_points,), `positions` (n_points, 3) in m, and
+    `mass_matrix` (n_points, n_points), by which the shapes are then scaled and checked.
+
+    Args:
+        modal_mass: (n_modes,) or one number, kg, in place of what the file says: φᵀ M φ of its shapes.
+        damping_ratios: (n_modes,) or one number, in place of what the file says.
+
+    Raises:
+        RecordFileError: naming the file and what would be right: no modal mass, modes that are not orthogonal, shapes
+            and frequencies that do not fit one another, complex shapes.
+    """
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending == ".op2":
+        raise RecordFileError(f"{path}: {NO_OP2}")
+    if ending not in FORMATS:
+        raise RecordFileError(
+            f"{path}: the ending {ending!r} names no format of modes; use one of {', '.join(FORMATS)}"
+        )
+    if not path.is_file():
+        raise RecordFileError(f"{path}: there is no such file")
+    check_size(path)
+    try:
+        arrays = FORMATS[ending].arrays(path)
+    except RecordFileError:
+        raise
+    except Exception as error:  # every reader of another's file has its own ways to fail
+        raise unreadable(path, error) from error
+    given = {"modal_mass": modal_mass, "damping_ratios": damping_ratios}
+    return _modes_of(path, {**arrays, **{k: np.asarray(v, float) for k, v in given.items() if v is not None}})
+
+
+def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
+    if "shapes" not in arrays or not {"frequencies_hz", "omega"} & set(arrays):
+        raise RecordFileError(
+            f"{path} needs `shapes` (n_points, n_modes) and `frequencies_hz` or `omega`; it holds"
+            f" {', '.join(sorted(arrays)) or 'nothing'}"
+        )
+    omega = np.ravel(arrays["omega"] if "omega" in arrays else 2.0 * np.pi * arrays["frequencies_hz"])
+    shapes = np.asarray(arrays["shapes"])
+    if np.iscomplexobj(shapes):
+        raise RecordFileError(f"{path}: its shapes are complex; give the real normal modes")
+    if shapes.ndim != 2 or shapes.shape[1] != omega.size:
+        raise RecordFileError(
+            f"{path}: shapes must have shape (n_points, n_modes) with {omega.size} modes; it is {shapes.shape}"
+        )
+    zeta = np.broadcast_to(np.ravel(arrays.get("damping_ratios", np.zeros(1))), omega.shape)
+    order = np.argsort(omega, kind="stable")
+    shapes = np.array(_scaled(path, shapes.astype(float), arrays)[:, order])
+    shapes.flags.writeable = False
+    return Modes(
+        omega=omega[order],
+        damping=zeta[order],
+        shapes=lambda index, _: shapes[index],
+        domain=_points(path, shapes.shape[0], arrays),
+    )
+
+
+def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Shapes of unit modal mass."""
+    n_modes = shapes.shape[1]
+    if "mass_matrix" in arrays:
+        products = shapes.T @ arrays["mass_matrix"] @ shapes
+        masses = np.diag(products)
+        between = np.abs(products - np.diag(masses)) / np.sqrt(np.outer(masses, masses))
+        if between.max(initial=0.0) > ORTHOGONAL:
+            r, s = divmod(int(between.argmax()), n_modes)
+            raise RecordFileError(
+                f"{path}: modes {r + 1} and {s + 1} are not orthogonal with its mass matrix, by {between.max():.2g} of"
+                " their modal masses; are shapes and matrix of one model, in one order of points?"
+            )
+    elif "modal_mass" in arrays:
+        masses = np.broadcast_to(np.ravel(arrays["modal_mass"]).astype(float), (n_modes,))
+    else:
+        return shapes
+    if not (masses > 0).all():
+        r = int(np.argmin(masses > 0))
+        raise RecordFileError(
+            f"{path} says no modal mass of mode {r + 1}, so its shape has no scale; give"
+            " read_modes(path, modal_mass=...), 1.0 where the shapes are mass-normalised"
+        )
+    return shapes / np.sqrt(masses)
+
+
+def _points(path: Path, n: int, arrays: Mapping[str, np.ndarray]) -> NamedPoints:
+    text = {
+        k: tuple(str(v).strip() for v in np.ravel(arrays[k])) for k in ("names", "nodes", "directions") if k in arrays
+    }
+    nodes, directions = text.get("nodes", ()), text.get("directions", ())
+    if "names" in text:
+        names = text["names"]
+    elif nodes:
+        apart = "." if any(node[-1:].isalpha() for node in nodes) else ""
+        names = tuple(node + apart + d for node, d in zip(nodes, directions or ("",) * len(nodes)))
+    else:
+        names = tuple(f"{i + 1}" for i in range(n))
+    if len(names) != n:
+        raise RecordFileError(f"{path}: {n} rows of shapes need as many points; it names {len(names)}")
+    try:
+        return NamedPoints(names, arrays.get("positions"), directions, nodes)
+    except ValueError as error:
+        raise RecordFileError(f"{path}: {error}") from error

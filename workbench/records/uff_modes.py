@@ -1,0 +1,90 @@
+"""Normal modes at nodes in universal files: data sets 55 or 2414, with the nodes of 15 or 2411, by pyuff."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyuff
+
+from workbench.records.confined import load_confined
+from workbench.records.file_error import RecordFileError
+
+NORMAL_MODE = 2  # analysis_type of both formats
+AT_NODES = 1  # dataset_location of 2414
+DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def arrays(path: Path) -> dict[str, np.ndarray]:
+    """The modes of the file, by the names that `modes_file` knows."""
+    return load_confined(__name__, path)
+
+
+def load(path: Path) -> dict[str, np.ndarray]:
+    """Frequencies, damping, modal masses and shapes at nodes; to be called in a process of its own."""
+    sets = pyuff.UFF(str(path)).read_sets()
+    sets = sets if isinstance(sets, list) else [sets]
+    modes = [_of_55(s) if s["type"] == 55 else _of_2414(s) for s in sets if _is_mode(path, s)]
+    if not modes:
+        raise RecordFileError(f"{path} holds no normal modes at nodes (data sets 55 or 2414, analysis type 2)")
+    nodes = modes[0]["nodes"]
+    width = modes[0]["shape"].shape[1]
+    for number, mode in enumerate(modes, start=1):
+        if mode["shape"].shape[1] != width or not np.array_equal(mode["nodes"], nodes):
+            raise RecordFileError(f"{path}, mode {number} is given at other nodes or directions than the first")
+    shapes = np.stack([mode["shape"].reshape(-1) for mode in modes], axis=1)
+    moving = np.abs(shapes).max(axis=1) > 0  # three directions are written even where one was measured
+    found = {
+        "shapes": shapes[moving],
+        "nodes": np.repeat(nodes, width)[moving].astype(str),
+        "directions": np.tile(DIRECTIONS[:width], nodes.size)[moving],
+    }
+    for name in ("frequencies_hz", "damping_ratios", "modal_mass"):
+        found[name] = np.array([mode[name] for mode in modes], float)
+    positions = _positions(sets)
+    if positions:
+        missing = [node for node in nodes if node not in positions]
+        if missing:
+            raise RecordFileError(f"{path}: node {missing[0]} has a shape and no coordinates in data sets 15 or 2411")
+        found["positions"] = np.repeat([positions[node] for node in nodes], width, axis=0)[moving]
+    return found
+
+
+def _is_mode(path: Path, entry: dict[str, Any]) -> bool:
+    if entry["type"] not in (55, 2414) or (entry["type"] == 2414 and entry["dataset_location"] != AT_NODES):
+        return False
+    if entry["analysis_type"] in (3, 7):
+        raise RecordFileError(f"{path} holds complex modes, which have no modal mass; export normal modes (type 2)")
+    return bool(entry["analysis_type"] == NORMAL_MODE)
+
+
+def _of_55(entry: dict[str, Any]) -> dict[str, Any]:
+    columns = [np.asarray(entry[f"r{i}"]) for i in range(1, 7) if f"r{i}" in entry]
+    return {
+        "nodes": np.asarray(entry["node_nums"], int),
+        "shape": np.stack(columns, axis=1).real,
+        "frequencies_hz": entry["freq"],
+        "damping_ratios": entry.get("modal_damp_vis") or 0.5 * (entry.get("modal_damp_his") or 0.0),
+        "modal_mass": entry.get("modal_m") or np.nan,
+    }
+
+
+def _of_2414(entry: dict[str, Any]) -> dict[str, Any]:
+    # record 12: time, frequency, eigenvalue, modal mass, viscous and hysteretic damping
+    _, frequency, _, mass, viscous, hysteretic = (entry.get(f"record12_field{i}") or 0.0 for i in range(1, 7))
+    return {
+        "nodes": np.asarray(entry["node_nums"], int),
+        "shape": np.stack(entry["data_at_node"]),
+        "frequencies_hz": frequency,
+        "damping_ratios": viscous or 0.5 * hysteretic,
+        "modal_mass": mass or np.nan,
+    }
+
+
+def _positions(sets: list[dict[str, Any]]) -> dict[int, tuple[float, float, float]]:
+    """Coordinates of each node, m."""
+    found = {}
+    for entry in sets:
+        if entry["type"] in (15, 2411):
+            for node, x, y, z in zip(entry["node_nums"], entry["x"], entry["y"], entry["z"]):
+                found[int(node)] = (float(x), float(y), float(z))
+    return found
