@@ -48,6 +48,8 @@ def test_the_examples_of_a_page_run_and_print_what_it_says(page, tmp_path, monke
         with contextlib.redirect_stdout(printed):
             exec(compile(code, f"docs/{name(page)}", "exec"), names)
         assert printed.getvalue() == (text if follows == "text" else ""), name(page)
+        for written in re.findall(r'"([\w-]+\.(?:csv|png))"', code):
+            assert (tmp_path / written).stat().st_size > 300, written
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
