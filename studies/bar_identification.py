@@ -12,7 +12,7 @@ from workbench.draw.identification import distribution_errors, eigenfunction, ei
 from workbench.identification.free_decay.ibrahim import two_delays
 from workbench.identification.free_decay.order import identify
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.identification.updating.distributions import Basis, mass_and_stiffness
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.member import Bar
@@ -75,7 +75,7 @@ def study(outcome, data: Path | None = None) -> None:
 
 def ring_down(exact, m: int):
     """Accelerations at i/m (4.31) after a unit blow at 0.63."""
-    decay = struck(exact, at=0.63, positions=np.arange(1, m + 1) / m)
+    decay = impulse_response_modes(exact, at=0.63, positions=np.arange(1, m + 1) / m)
     return free_decay(decay, sample_time=0.01, n_samples=1500, quantity="acceleration")
 
 

@@ -18,7 +18,7 @@ from workbench.draw.motion import response_motion
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
@@ -47,7 +47,7 @@ def measured():
         damping=ModalDamping(0.002),
     )
     modes = beam.modes(N_MODES)
-    decay = struck(modes, at=HAMMER_AT, positions=SENSORS)
+    decay = impulse_response_modes(modes, at=HAMMER_AT, positions=SENSORS)
     sampling = {"sample_time": 0.2, "n_samples": 3000, "quantity": "velocity"}
     noise = 0.01 * free_decay(decay, **sampling).outputs.std()
     return modes, free_decay(decay, **sampling, noise_std=noise, seed=1)

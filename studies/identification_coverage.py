@@ -13,10 +13,11 @@ from scipy.special import ndtri
 
 from workbench.draw.accuracy import plot_bands
 from workbench.identification.free_decay.ibrahim import stacked_delays
-from workbench.identification.free_decay.refinement import Refined, bound, refine
+from workbench.identification.free_decay.refined import Refined
+from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.shapes.bands import eigenfunction_bands
 from workbench.identification.shapes.eigenfunctions import KnownEnds
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
 
@@ -45,7 +46,7 @@ def drawn(truth: SampledModes, *, sample_time: float, n_samples: int, level_db: 
     noisy = clean.outputs + noise * np.random.default_rng(seed).standard_normal(clean.outputs.shape)
     record = replace(clean, outputs=noisy)
     refined = refine(record, stacked_delays(record, n_modes=truth.n_modes, delays=60))
-    return refined, bound(truth, clean, noise_std=noise)
+    return refined, cramer_rao_bound(truth, clean, noise_std=noise)
 
 
 def errors(refined: Refined, limit: Refined) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -67,7 +68,7 @@ def errors(refined: Refined, limit: Refined) -> dict[str, tuple[np.ndarray, np.n
 
 def study(outcome, data: Path | None = None) -> None:
     beam = hinged_beam()
-    decay = struck(beam, at=3.7, positions=SENSORS)
+    decay = impulse_response_modes(beam, at=3.7, positions=SENSORS)
     setups = {
         "beam": (decay, {"sample_time": 0.2, "n_samples": 1000, "level_db": 40.0}),
         "close pair": (close_pair(), {"sample_time": 0.01, "n_samples": 500, "level_db": 30.0}),

@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from workbench.draw.identification import order_found
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound
+from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.modes import SampledModes
 
@@ -48,7 +48,7 @@ def random_structure(seed: int):
 def told(seed: int) -> dict:
     """How many modes count, are found, are reported, and are reported without being there."""
     truth, record, noise, level = random_structure(seed)
-    std = bound(truth, record, noise_std=noise).omega_std
+    std = cramer_rao_bound(truth, record, noise_std=noise).omega_std
     counts = std < COUNTS_BELOW * truth.omega
     start = perf_counter()
     modes = identify(record).modes

@@ -31,7 +31,8 @@ from scipy.optimize import linear_sum_assignment
 from workbench.draw.accuracy import peers_errors
 from workbench.identification.free_decay.ibrahim import two_delays
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound, project
+from workbench.identification.free_decay.refinement import cramer_rao_bound
+from workbench.identification.signal.projection import project
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Record
 from workbench.records.resample import decimate
@@ -175,7 +176,7 @@ def trial(methods: dict, seed: int, level: int) -> tuple[dict[str, dict], float]
     clean = free_decay(truth, sample_time=SAMPLE_TIME, n_samples=SAMPLES)
     noise = float(np.sqrt((clean.outputs**2).mean()) * 10 ** (-level / 20))
     record = free_decay(truth, sample_time=SAMPLE_TIME, n_samples=SAMPLES, noise_std=noise, seed=rng)
-    limit = bound(truth, record, noise_std=noise)
+    limit = cramer_rao_bound(truth, record, noise_std=noise)
     scores = {}
     for name, method in methods.items():
         omega, zeta, took = quiet(method, record)

@@ -18,7 +18,7 @@ from scipy.optimize import linear_sum_assignment
 
 from workbench.draw.accuracy import size_and_errors
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound
+from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
@@ -56,7 +56,7 @@ def told(truth: SampledModes, record: Record, noise: float) -> tuple[dict, np.nd
     start, own = perf_counter(), process_time()
     found = identify(record)
     took, own = perf_counter() - start, process_time() - own
-    limit = bound(truth, record, noise_std=noise)
+    limit = cramer_rao_bound(truth, record, noise_std=noise)
     counts = limit.omega_std < COUNTS_BELOW * truth.omega
     away = np.abs(found.modes.omega[:, None] - truth.omega) / limit.omega_std
     rows, columns = linear_sum_assignment(np.minimum(away, WITHIN))

@@ -15,7 +15,7 @@ from skfem.helpers import dd, ddot, dot, grad
 from workbench.draw.distributions import places_found, stiffness_found
 from workbench.identification.free_decay.order import identify
 from workbench.identification.signal.synthesis import free_decay
-from workbench.identification.updating.local_loss import LossFound, find_loss
+from workbench.identification.updating.local_loss import LocatedDamage, locate_damage
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 
@@ -104,10 +104,10 @@ def tried(kind: str, seed: int, share: float = SHARE, level_db: float = LEVEL_DB
     """The hidden structure and what was found of it."""
     hidden = Hidden(kind, seed, share)
     measured = identify(hidden.record(level_db)).refined
-    return hidden, find_loss(measured, hidden.nominal(), known_mass=[(KNOWN_AT, float(hidden.mass(KNOWN_AT)))])
+    return hidden, locate_damage(measured, hidden.nominal(), known_mass=[(KNOWN_AT, float(hidden.mass(KNOWN_AT)))])
 
 
-def row(hidden: Hidden, found: LossFound, level_db: float) -> dict:
+def row(hidden: Hidden, found: LocatedDamage, level_db: float) -> dict:
     """What was found beside what is there."""
     x = CHECKED[np.abs(np.abs(CHECKED - hidden.centre) - 0.5 * WIDTH) > 0.01]
     low, high = found.best.stiffness.band(x)

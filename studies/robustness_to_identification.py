@@ -15,7 +15,7 @@ from workbench.draw.design import plot_drift, plot_survival
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -43,7 +43,7 @@ def beam(stiffness=1.0):
 
 def identified():
     """Modes and their errors from a ring-down with noise of 3 %."""
-    decay = struck(beam(), at=7.3, positions=SENSORS)
+    decay = impulse_response_modes(beam(), at=7.3, positions=SENSORS)
     sampling = {"sample_time": 0.2, "n_samples": 1500, "quantity": "velocity"}
     noise = 0.03 * free_decay(decay, **sampling).outputs.std()
     record = free_decay(decay, **sampling, noise_std=noise, seed=3)

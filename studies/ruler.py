@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 from workbench.design.placement.placement import nodes_of_mode, place, placement_task
 from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.identification.free_decay.refinement import amplitudes
-from workbench.identification.free_decay.stabilisation import real_modes, stabilise
+from workbench.identification.free_decay.refinement import modal_amplitudes
+from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.shapes.mode_pairing import tell_apart
+from workbench.identification.shapes.mode_pairing import pair_modes
 from workbench.records.resample import decimate
 from workbench.records.transfer_file import read_transfer
 from workbench.rig.rig import Rig
@@ -41,11 +41,11 @@ SHIFTING = ("point_mass", "local_stiffness_loss", "axial_load", "ground_spring")
 def study(outcome, data: Path | None = None) -> None:
     record = decimate(read_transfer(data, positions=POSITIONS, quantity="acceleration"), DECIMATION)
     diagram = stabilise(record, orders=ORDERS, delays=DELAYS)
-    stayed = amplitudes(record, real_modes(diagram).modes)
+    stayed = modal_amplitudes(record, stable_modes(diagram).modes)
     stayed = stayed.select(np.flatnonzero(stayed.frequencies_hz < BAND_HZ))
 
     beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(8)
-    told = tell_apart(stayed, beam.select(range(2, 8)))
+    told = pair_modes(stayed, beam.select(range(2, 8)))
     bending = stayed.select(told.matched)
     others = stayed.select(told.others)
     report_modes(outcome, bending, others, told)

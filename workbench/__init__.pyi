@@ -35,7 +35,7 @@ from .identification.shapes.eigenfunctions import eigenfunctions as eigenfunctio
 from .identification.signal.aliases import aliases as aliases
 from .identification.transfer import identify_transfer as identify_transfer
 from .identification.updating.distributions import mass_and_stiffness as mass_and_stiffness
-from .identification.updating.local_loss import find_loss as find_loss
+from .identification.updating.local_loss import locate_damage as locate_damage
 from .identification.updating.structure_fit import choose_structure as choose_structure
 from .identification.updating.structure_fit import fit_structure as fit_structure
 from .records.files import read_measured as read_measured

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 from workbench.cli.app import app
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.files import write_record
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ModalDamping
@@ -66,7 +66,7 @@ def run(*arguments):
 def test_identify_finds_the_modes_and_their_number(tmp_path):
     beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
                 damping=ModalDamping(0.01))  # fmt: skip
-    decay = struck(beam.modes(4), at=7.3, positions=[1.0, 3.0, 5.5, 8.0])
+    decay = impulse_response_modes(beam.modes(4), at=7.3, positions=[1.0, 3.0, 5.5, 8.0])
     record = free_decay(decay, sample_time=0.5, n_samples=1000, quantity="velocity", noise_std=0.003, seed=3)
     path, found = write_record(record, tmp_path / "ring.csv"), tmp_path / "found.json"
     result = run("identify", path, "--json", found)
@@ -305,7 +305,7 @@ def test_help_shows_what_stands_in_brackets_and_how_many_values_an_option_takes(
 def test_identify_cuts_a_record_to_its_decay_and_says_what_it_did(tmp_path):
     beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged",
                 damping=ModalDamping(0.01))  # fmt: skip
-    decay = struck(beam.modes(2), at=7.3, positions=[1.0, 3.0])
+    decay = impulse_response_modes(beam.modes(2), at=7.3, positions=[1.0, 3.0])
     record = free_decay(decay, sample_time=0.5, n_samples=1000, quantity="velocity", noise_std=0.003, seed=3)
     quiet = 0.003 * np.random.default_rng(0).standard_normal((2, 400))
     columns = np.vstack([0.5 * np.arange(1400), np.hstack([quiet, record.outputs]), np.arange(1400)]).T

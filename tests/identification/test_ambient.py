@@ -7,8 +7,8 @@ import pytest
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from workbench.identification.ambient import ambient_decays, identify_ambient
-from workbench.identification.output_only.whittle import Spectrum, Swing, posed, started
+from workbench.identification.ambient import correlation_functions, identify_ambient
+from workbench.identification.output_only.whittle import SpectralMode, Spectrum, initial_mode, posed
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import mac
 
@@ -50,7 +50,7 @@ def test_correlations_are_those_of_the_closed_form():
 
     covariance = solve_continuous_lyapunov(A, -np.diag(np.r_[np.zeros(N), np.ones(N)]))
     record = driven(1, n_samples=60_000, noise=0.3)
-    [decay] = ambient_decays(record, longest=4.0, references=["y2"])
+    [decay] = correlation_functions(record, longest=4.0, references=["y2"])
     exact = np.array([(expm(A * tau) @ covariance)[N:, N + 1] for tau in decay.time]).T / record.outputs[1].std()
     assert decay.time[0] == record.sample_time
     assert np.abs(decay.outputs - exact).max() < 0.08 * np.abs(exact).max()
@@ -68,33 +68,33 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 
 
 def test_a_spectrum_all_but_singular_at_one_line_is_not_likely():
-    """Of one line only one direction is seen, so that a swing that cancels the rest there would win without end."""
+    """Of one line only one direction is seen, so that a mode that cancels the rest there would win without end."""
     rng = np.random.default_rng(0)
     spectrum = Spectrum(rng.standard_normal((2, 300)) + 1j * rng.standard_normal((2, 300)), 0.01, 0.5, 1.0)
-    swing = Swing(-0.05 + 1.5j, np.array([1.0, 0.0]), np.array([-1.0, 0.0]))
-    task, [swing] = posed(spectrum, [swing], [], [swing])
+    mode = SpectralMode(-0.05 + 1.5j, np.array([1.0, 0.0]), np.array([-1.0, 0.0]))
+    likelihood, [mode] = posed(spectrum, [mode], [], [mode])
     background = np.array([2.0 * np.eye(2), np.zeros((2, 2))])
-    deepest = -swing.spectrum(task.z, task.dt)[:, 0, 0].real.min()
+    deepest = -mode.spectrum(likelihood.z, likelihood.dt)[:, 0, 0].real.min()
     for left, likely in ((1.0, True), (1e-9, False)):
-        cancelling = replace(swing, drive=swing.drive * (2.0 - left) / deepest)
-        assert np.linalg.eigvalsh(task.whole([cancelling], background)).min() == pytest.approx(left, rel=1e-5)
-        assert np.isfinite(task.cost([cancelling], background)) == likely
+        cancelling = replace(mode, excitation=mode.excitation * (2.0 - left) / deepest)
+        assert np.linalg.eigvalsh(likelihood.whole([cancelling], background)).min() == pytest.approx(left, rel=1e-5)
+        assert np.isfinite(likelihood.cost(((cancelling,), background))) == likely
 
 
 def test_too_short_a_record_is_refused():
     with pytest.raises(ValueError, match="measure longer"):
-        ambient_decays(driven(2, n_samples=1000), longest=5.0)
+        correlation_functions(driven(2, n_samples=1000), longest=5.0)
     with pytest.raises(ValueError, match="no output 'y9'"):
-        ambient_decays(driven(2, n_samples=4000), references=["y9"])
+        correlation_functions(driven(2, n_samples=4000), references=["y9"])
 
 
 def test_a_spectrum_is_the_transform_of_its_correlations():
     z = np.exp(1j * np.linspace(0.05, 3.0, 40))
-    swing = Swing(-0.2 + 0.9j, np.array([1.0, 0.5 - 0.2j]), np.array([0.3 + 0.1j, -0.2j]))
+    mode = SpectralMode(-0.2 + 0.9j, np.array([1.0, 0.5 - 0.2j]), np.array([0.3 + 0.1j, -0.2j]))
     k = np.arange(1, 400)
-    correlations = np.real(np.outer(swing.shape, swing.drive)[:, :, None] * np.exp(0.5 * swing.pole * k))
+    correlations = np.real(np.outer(mode.shape, mode.excitation)[:, :, None] * np.exp(0.5 * mode.pole * k))
     half = np.einsum("ijk,kl->lij", correlations, z[None] ** -k[:, None].astype(float))
-    assert np.allclose(swing.spectrum(z, 0.5), half + half.conj().swapaxes(1, 2), atol=1e-12)
+    assert np.allclose(mode.spectrum(z, 0.5), half + half.conj().swapaxes(1, 2), atol=1e-12)
 
 
 def test_the_slope_of_the_likelihood_is_its_difference():
@@ -102,12 +102,14 @@ def test_the_slope_of_the_likelihood_is_its_difference():
     rng = np.random.default_rng(0)
     spectrum = Spectrum(rng.standard_normal((2, 300)) + 1j * rng.standard_normal((2, 300)), 0.01, 0.5, 1.0)
     shapes = rng.standard_normal((2, 2)) + 0.1j * rng.standard_normal((2, 2))
-    swings = [started(spectrum, pole, shape) for pole, shape in zip((-0.06 + 1.2j, -0.09 + 1.6j), shapes, strict=True)]
-    task, swings = posed(spectrum, swings, [], swings)
-    background = task.start(swings)
-    _, slope = task.scores(swings, background)
+    modes = [
+        initial_mode(spectrum, pole, shape) for pole, shape in zip((-0.06 + 1.2j, -0.09 + 1.6j), shapes, strict=True)
+    ]
+    likelihood, modes = posed(spectrum, modes, [], modes)
+    state = modes, likelihood.start(modes)
+    _, slope = likelihood.normal_equations(state)
     for a, step in enumerate(1e-6 * np.eye(slope.size)):
-        above, below = (task.cost(*task.moved(swings, background, way * step)) for way in (1.0, -1.0))
+        above, below = (likelihood.cost(likelihood.moved(state, way * step)[0]) for way in (1.0, -1.0))
         assert slope[a] == pytest.approx((below - above) / 2e-6, rel=1e-4, abs=1e-4)
 
 
@@ -120,8 +122,8 @@ def test_errors_are_little_above_the_closed_form():
     omega, zeta, dt, n = 6.0, 0.02, 0.1, 20_000
     pole = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
     force = np.random.default_rng(0).standard_normal(n + 2000)
-    swing = lfilter([1.0], [1.0, -np.exp(pole * dt)], force + 0j)[2000:].imag
-    found = identify_ambient(Record(dt, swing[None], (Channel("y", "displacement"),)))
+    mode = lfilter([1.0], [1.0, -np.exp(pole * dt)], force + 0j)[2000:].imag
+    found = identify_ambient(Record(dt, mode[None], (Channel("y", "displacement"),)))
     least = np.sqrt(zeta * omega / (n * dt))
     assert found.modes.n_modes == 1
     assert 1.0 < found.omega_std[0] / least < 1.5 and 1.0 < found.zeta_std[0] * omega / least < 1.5
@@ -133,8 +135,8 @@ def test_a_weak_mode_beside_strong_ones_is_found():
     omega, zeta = np.array([2.0, 12.0, 31.0]), np.array([0.015, 0.015, 0.015])
     rng, n, dt = np.random.default_rng(0), 30_000, 0.05
     poles = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
-    swings = [lfilter([1.0], [1.0, -np.exp(p * dt)], rng.standard_normal(n) + 0j) for p in poles]
-    y = np.array([[0.06, 1.0, 0.8], [0.05, -0.6, 0.9], [0.03, 0.5, -1.0]]) @ np.imag(swings)
+    modes = [lfilter([1.0], [1.0, -np.exp(p * dt)], rng.standard_normal(n) + 0j) for p in poles]
+    y = np.array([[0.06, 1.0, 0.8], [0.05, -0.6, 0.9], [0.03, 0.5, -1.0]]) @ np.imag(modes)
     y = y + 0.01 * y.std() * rng.standard_normal(y.shape)
     found = identify_ambient(Record(dt, y, tuple(Channel(f"a{j}", "acceleration") for j in range(3))))
     assert found.modes.n_modes == 3

@@ -22,15 +22,15 @@ POLES = -ZETA * OMEGA + 1j * OMEGA * np.sqrt(1 - ZETA**2)
 
 
 def system(n_outputs=3, n_inputs=2, seed=1):
-    """Four modes, two of them 3 % apart, complex shapes and loads, written out in real modal form."""
+    """Four modes, two of them 3 % apart, complex shapes and participation, written out in real modal form."""
     rng = np.random.default_rng(seed)
     c = rng.standard_normal((n_outputs, 4)) + 0.1j * rng.standard_normal((n_outputs, 4))
-    loads = rng.standard_normal((4, n_inputs)) + 0.1j * rng.standard_normal((4, n_inputs))
+    participation = rng.standard_normal((4, n_inputs)) + 0.1j * rng.standard_normal((4, n_inputs))
     blocks = [np.array([[p.real, -p.imag], [p.imag, p.real]]) for p in POLES]
     a = np.zeros((8, 8))
     for r, block in enumerate(blocks):
         a[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] = block
-    b = np.stack([loads.real, loads.imag], axis=1).reshape(8, n_inputs)
+    b = np.stack([participation.real, participation.imag], axis=1).reshape(8, n_inputs)
     cc = 2 * np.stack([c.real, -c.imag], axis=2).reshape(n_outputs, 8)
     return control.ss(a, b, cc, 0.1 * rng.standard_normal((n_outputs, n_inputs)))
 
@@ -114,7 +114,7 @@ def test_covariance_is_the_cramer_rao_bound_by_brute_force():
 def normalised_errors(draws):
     plant, u = system(), excitation("noise")
     c = plant.C[:, 0::2] - 1j * plant.C[:, 1::2]
-    loads = plant.B[0::2] + 1j * plant.B[1::2]
+    participation = plant.B[0::2] + 1j * plant.B[1::2]
     figures, shapes, residues = [], [], []
     for seed in range(draws):
         found = identify_driven(measured(plant, u, fraction=0.01, start=0.3 * np.ones(8), seed=seed))
@@ -125,7 +125,7 @@ def normalised_errors(draws):
         error = (found.modes.shapes / found.modes.shapes[k, r] - c / c[k, r]).real
         std = found.shape_std
         shapes.append((error[std > 0] / std[std > 0]).ravel())
-        true = loads * (0.5 * c[k, r] / found.modes.shapes[k, r])[:, None]
+        true = participation * (0.5 * c[k, r] / found.modes.shapes[k, r])[:, None]
         residues.append(np.abs(found.participation - true) / found.participation_std)
     return np.array(figures), np.concatenate(shapes), np.array(residues)
 

@@ -48,8 +48,8 @@ def test_clipped_part_is_left_out(n, limit):
     last = record.time[np.abs(record.outputs[0]) > limit][-1]
     assert last - 0.1 < told.records[0].start_time < last + 0.5 and found_within_errors(told)
     if n == 190:
-        begins = f"read from {told.records[0].start_time:g} s on"
-        assert told.notes == (f"output 'y1' is cut off at an end of its range: {begins}",)
+        begins = f"used from {told.records[0].start_time:g} s on"
+        assert told.notes == (f"output 'y1' is clipped: {begins}",)
     with pytest.raises(ValueError, match="begin later, or measure with a larger range"):
         ring_down(replace(record, outputs=outputs), start=0.0)
 

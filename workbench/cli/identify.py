@@ -38,8 +38,9 @@ def identify(
 
     Example: workbench identify ringdown.csv --outputs a,b --json modes.json
     """
+    from workbench.identification.signal.modal_estimates import HEADINGS
     from workbench.records.files import read_measured
-    from workbench.study.identification_report import HEADINGS, told_of
+    from workbench.study.identification_report import identification_report
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -49,7 +50,7 @@ def identify(
         if outputs:
             read = [measured.only(names_in(outputs)) for measured in read]
         report("identifying modes", 0.1)
-        found = told_of(read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz)
+        found = identification_report(read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz)
     table = Table(box=None, pad_edge=False)
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)

@@ -6,10 +6,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.identification.updating.local_loss import LossFound
+from workbench.identification.updating.local_loss import LocatedDamage
+
+Case = tuple[LocatedDamage, Callable[[np.ndarray], np.ndarray], np.ndarray]
 
 
-def stiffness_found(cases: Mapping[str, tuple[LossFound, Callable[[np.ndarray], np.ndarray], np.ndarray]]) -> Figure:
+def stiffness_found(cases: Mapping[str, Case]) -> Figure:
     """Stiffness along each structure; cases[title] are (what was found, the true stiffness, places of the sensors)."""
     rows = (len(cases) + 1) // 2
     figure, axes = new_figure(rows, 2, width=10.0, height=0.6 + 2.9 * rows, sharex=True, sharey=True, squeeze=False)

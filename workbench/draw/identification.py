@@ -8,7 +8,7 @@ from matplotlib.ticker import MaxNLocator
 
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.stabilisation import Stabilisation
-from workbench.identification.shapes.mode_pairing import Told
+from workbench.identification.shapes.mode_pairing import ModePairing
 from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
@@ -69,10 +69,10 @@ def distribution_errors(x: np.ndarray, curves: Mapping, sensors: Sequence[int], 
 
 
 def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz: float) -> Figure:
-    """Frequencies found at each order; dark dots stand (phase collinearity near 1), pale ones travel."""
+    """Frequencies at each order; dark dots have real shapes (phase collinearity near 1), pale ones complex shapes."""
     figure, ax = new_figure(width=9, height=4.5)
     for line, frequency in enumerate(stayed.frequencies_hz):
-        ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stays")
+        ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stable")
     for order, modes in zip(diagram.orders, diagram.found, strict=True):
         keep = modes.frequencies_hz < band_hz
         dots = ax.scatter(
@@ -89,13 +89,13 @@ def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz:
         )
     figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
     ax.set_xlabel("frequency, Hz")
-    ax.set_ylabel("number of modes asked for")
+    ax.set_ylabel("model order (modes)")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(loc="outside upper right")
     return figure
 
 
-def measured_modes(bending: SampledModes, others: SampledModes, told: Told, model: Modes) -> Figure:
+def measured_modes(bending: SampledModes, others: SampledModes, pairing: ModePairing, model: Modes) -> Figure:
     """Measured shapes over the model's, one panel a mode; those that are not the model's last, in grey."""
     n = bending.n_modes + others.n_modes
     figure, axes = new_figure(int(np.ceil(n / 4)), 4, width=12, height=2.7 * np.ceil(n / 4), sharex=True, sharey=True)
@@ -107,11 +107,11 @@ def measured_modes(bending: SampledModes, others: SampledModes, told: Told, mode
         values = modes.shapes[:, k] * np.exp(-0.5j * np.angle((modes.shapes[:, k] ** 2).sum()))
         values = values.real / np.abs(values).max()
         if is_model:
-            shape = at_sensors[:, told.model[k]]
+            shape = at_sensors[:, pairing.model[k]]
             scale = (values @ shape) / (shape @ shape)
-            ax.plot(x, scale * model.phi(x)[:, told.model[k]], color=GREY, lw=3, alpha=0.5)
+            ax.plot(x, scale * model.phi(x)[:, pairing.model[k]], color=GREY, lw=3, alpha=0.5)
         ax.plot(modes.positions, values, "o" if is_model else "s", color=COLOURS[0] if is_model else COLOURS[1])
-        what = f"beam {told.scaled_hz[k]:.1f} Hz, MAC {told.mac[k]:.3f}" if is_model else "not bending"
+        what = f"beam {pairing.scaled_hz[k]:.1f} Hz, MAC {pairing.mac[k]:.3f}" if is_model else "not bending"
         ax.set_title(f"{modes.frequencies_hz[k]:.1f} Hz: {what}", fontsize=9.5)
     for ax in axes.ravel()[n:]:
         ax.set_visible(False)
@@ -151,26 +151,26 @@ def placement_on_shapes(modes: Modes, placements: Mapping, *, n_controlled: int)
     right.set_ylim(1e-12, None)
     right.set_xticks(number)
     right.set_xlabel("residual mode")
-    right.set_ylabel("work left in it")
+    right.set_ylabel("residual work")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 
 
 def order_found(rows: Sequence[Mapping]) -> Figure:
-    """Modes counted, missed and falsely reported over the level of each record; rows as `identification_order`."""
+    """Modes identified, missed and falsely reported over the signal-to-noise ratio; rows as `identification_order`."""
     figure, ax = new_figure(width=8, height=4.2)
     level = np.array([row["level_db"] for row in rows])
     kinds = (
-        ([row["found"] for row in rows], "found", "o", COLOURS[0]),
+        ([row["found"] for row in rows], "identified", "o", COLOURS[0]),
         ([-(row["count"] - row["found"]) for row in rows], "missed", "x", COLOURS[1]),
-        ([-row["false"] for row in rows], "not there", "+", COLOURS[3]),
+        ([-row["false"] for row in rows], "false", "+", COLOURS[3]),
     )
     for values, label, marker, colour in kinds:
         shown = np.array(values) != 0
         ax.plot(level[shown], np.array(values)[shown], marker, color=colour, label=f"{label} ({abs(sum(values))})")
     ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.set_xlabel("record above its noise [dB]")
-    ax.set_ylabel("modes of a structure\nmistakes below the line")
+    ax.set_xlabel("signal-to-noise ratio [dB]")
+    ax.set_ylabel("modes of a structure\nerrors below the line")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure

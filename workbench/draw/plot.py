@@ -17,7 +17,7 @@ from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.report.verdict import Verdict
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.free_decay.refined import Refined
 from workbench.identification.shapes.bands import Bands
 from workbench.records.record import Record
 from workbench.structure.modes import Modes, SampledModes

@@ -5,35 +5,43 @@ structure does when let go (NExT: James, Carne & Lauffer, SAND92-1666),
 
     R_ij(τ) = E y_i(t + τ) y_j(t) = Re Σ_r φ_ir c_jr e^{λ_r τ},
 
-so that all that reads free decays reads them. Their errors are neither white nor independent of lag, so they only say
-where to look: how many modes there are, and how large they are, the likelihood of the spectrum decides (`whittle`).
+so that every method for free decays applies. Their errors are neither white nor independent of lag, so they only give
+the starting poles: the order and the estimates follow from the likelihood of the spectrum (`output_only/whittle`).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.special import ndtri
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.ibrahim import normalised_shapes, stacked_delays
-from workbench.identification.free_decay.identified import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE
-from workbench.identification.free_decay.stabilisation import real_modes, stabilise
-from workbench.identification.output_only.whittle import Spectrum, Swing, bands, fit_band, fit_bands, started
+from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
+from workbench.identification.output_only.whittle import (
+    SpectralMode,
+    Spectrum,
+    bands,
+    fit_band,
+    fit_bands,
+    initial_mode,
+)
+from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
+from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Stepwise
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.standard_errors import StandardErrors
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen, mac
 from workbench.threads import one_blas_thread
 
 MOST_REFERENCES = 4
-# A record is so many times as long as its longest lag, twice.
+# A record is at least twice so many times as long as its longest lag.
 BLOCKS = 20
+# Of the stabilisation diagram.
 HIGHEST_ORDER = 20
-# Combinations of outputs whose spectrum is looked at.
+# Combinations of outputs whose spectrum is fitted.
 MOST_DIRECTIONS = 4
-# Of a search without a mode: one that ends too soon says that the mode is missed more than it is.
+# Steps of a search without a mode: one that ends too soon overstates the evidence of the mode.
 FEW_STEPS = 15
 # Lags are kept while their energy is so many times that of the errors.
 ABOVE_ERRORS = 4.0
@@ -42,16 +50,17 @@ LEAST_LAGS = 64
 LEAST_SURE = 0.01
 
 
-@dataclass(frozen=True, eq=False)
-class AmbientModes(StandardErrors):
-    """Modes of a driven structure, and how far each figure is to be trusted.
+@dataclass(frozen=True, eq=False, repr=False)
+class AmbientModes(ModalEstimates):
+    """Modes of a structure under unknown forces, with their standard errors.
 
     Attributes:
         modes: shapes of displacement, largest entry 1.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
         evidence: (n_modes,) twice the log likelihood ratio of the record with and without each mode.
         limit: what a mode fitted to noise alone exceeds with the chance of a false alarm.
-        decays: the correlation functions where they were looked for, one record a reference.
+        decays: the correlation functions that the search started from, one record a reference.
+        remarks: what was left undone, where the time was up.
     """
 
     modes: SampledModes
@@ -59,13 +68,10 @@ class AmbientModes(StandardErrors):
     evidence: np.ndarray
     limit: float
     decays: tuple[Record, ...]
-
-    def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
-        """Confidence intervals of ω and of ζ, (2, n_modes) each."""
-        return self._within(float(ndtri(0.5 * (1.0 + level))))
+    remarks: tuple[str, ...] = ()
 
 
-def ambient_decays(
+def correlation_functions(
     record: Record, *, longest: float | None = None, references: Sequence[str] | None = None
 ) -> tuple[Record, ...]:
     """Correlation functions of the outputs with each reference, as free decays.
@@ -97,52 +103,85 @@ def identify_ambient(
     longest: float | None = None,
     references: Sequence[str] | None = None,
     false_alarm: float = FALSE_ALARM,
+    seconds: float | None = SECONDS,
 ) -> AmbientModes:
     """The modes of a structure under unknown broadband forces, each with its standard error.
 
     Args:
         record: long: each twentieth of it is to be much longer than a mode takes to decay.
         n_modes: unless given, those that the likelihood misses and whose frequency is sure to 1 %.
-        longest: lag, s, as in `ambient_decays`.
-        references: names of outputs, as in `ambient_decays`.
+        longest: lag, s, as in `correlation_functions`.
+        references: names of outputs, as in `correlation_functions`.
         false_alarm: chance that noise alone is taken for a mode.
+        seconds: after which the best so far is returned, with a remark; None for no limit.
 
     Raises:
-        ValueError: as `ambient_decays`, or no mode found.
+        ValueError: as `correlation_functions`, or no mode found.
     """
+    budget = Budget(seconds)
     lags, rows = _lags(record, longest, references)
     most = lags if longest is not None else record.n_samples // (2 * BLOCKS)
     sums = _correlations(record, most, rows, 1)[0] / record.n_samples
     decays = _as_records(record, sums[:, :, :lags], rows)
-    if n_modes is None:
-        starts = [_that_stay(decays)]
-        if most > lags:
-            longer = _that_stay(_as_records(record, sums, rows))
-            away = np.abs(np.subtract.outer(longer.poles.imag, starts[0].poles.imag))
-            new = (away > np.abs(starts[0].poles.real)).all(axis=1)
-            starts.append(longer.select(list(np.flatnonzero(new))))
-        search = _Search(record, starts, false_alarm)
-        search.grow()
-        while search.poles.size and search.prune():
-            pass
-    else:
-        search = _Search(record, [stacked_delays(decays, n_modes=n_modes)], false_alarm)
-        search.settle(search.tries)
-    if search.poles.size == 0:
+    if n_modes is not None:
+        problem = _UnknownForces(record, [stacked_delays(decays, n_modes=n_modes)], false_alarm, budget)
+        return problem.report(problem.settled(problem.start), decays)
+    starts = [_stable(decays)]
+    if most > lags:
+        longer = _stable(_as_records(record, sums, rows))
+        away = np.abs(np.subtract.outer(longer.poles.imag, starts[0].poles.imag))
+        new = (away > np.abs(starts[0].poles.real)).all(axis=1)
+        starts.append(longer.select(list(np.flatnonzero(new))))
+    problem = _UnknownForces(record, starts, false_alarm, budget)
+    selection = Stepwise(problem, np.inf, np.inf, None, forgets=False, budget=budget)
+    model = selection.select(_Model())
+    if not model.modes:
         raise ValueError(f"record {record.name!r} holds no mode that rises above its noise; measure longer")
-    return search.report(decays)
+    return problem.report(model, decays)
 
 
-def _that_stay(decays: Sequence[Record]) -> SampledModes:
-    """What stays in a stabilisation diagram: of long lags, which show weak modes; of short ones, which show damped."""
-    return real_modes(stabilise(decays, orders=range(2, min(HIGHEST_ORDER, decays[0].n_samples // 8) + 1))).modes
+def _stable(decays: Sequence[Record]) -> SampledModes:
+    """Stable modes of a stabilisation diagram: long lags show weak modes, short ones damped."""
+    return stable_modes(stabilise(decays, orders=range(2, min(HIGHEST_ORDER, decays[0].n_samples // 8) + 1))).modes
 
 
-class _Search:
-    """Modes so far, by the bands of the spectrum that they are fitted in."""
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """Modes so far.
 
-    def __init__(self, record: Record, starts: Sequence[SampledModes], false_alarm: float) -> None:
-        self.record, size = record, record.outputs.std(axis=1)[:, None]
+    Attributes:
+        modes: as the spectrum holds them.
+        variance: (2, n_modes, 2, n_modes) of Re λ, then Im λ; empty until settled.
+        evidence: (n_modes,) twice the log likelihood ratio with and without each; empty until settled.
+        origin: the model that it has one mode more than.
+        gain: twice the log likelihood ratio of the larger of the two over the smaller.
+    """
+
+    modes: tuple[SpectralMode, ...] = ()
+    variance: np.ndarray = field(default_factory=lambda: np.zeros((2, 0, 2, 0)))
+    evidence: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    origin: "_Model | None" = None
+    gain: float = 0.0
+
+    @property
+    def poles(self) -> np.ndarray:
+        return np.array([mode.pole for mode in self.modes])
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of (ω, ζ): with λ = x + iy, dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
+        x, y, omega = self.poles.real, self.poles.imag, np.abs(self.poles)
+        by_omega = np.hstack([np.diag(x / omega), np.diag(y / omega)])
+        by_zeta = np.hstack([np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)])
+        jacobian = np.vstack([by_omega, by_zeta])
+        return np.asarray(jacobian @ self.variance.reshape(2 * omega.size, -1) @ jacobian.T)
+
+
+class _UnknownForces:
+    """The `order_selection.Problem` of a spectrum: modes in the bands that they are fitted in."""
+
+    def __init__(self, record: Record, starts: Sequence[SampledModes], false_alarm: float, budget: Budget) -> None:
+        self.record, self.budget, size = record, budget, record.outputs.std(axis=1)[:, None]
         spectrum = Spectrum.of(record.outputs / size, record.sample_time)
         derivative = time_derivatives(record.output_channels)[:, None]
         poles = np.concatenate([start.poles for start in starts])
@@ -152,79 +191,77 @@ class _Search:
         self.spectrum = spectrum.along(directions)
         # A mode is its pole and two vectors, of which one has no scale, chosen among all lines.
         self.limit = float(chi2.isf(false_alarm / spectrum.values.shape[1], 4 * directions.shape[1]))
-        self.tries = [started(self.spectrum, *pair) for pair in zip(poles, (directions.T @ seen).T, strict=True)]
-        self.settle([])
+        tries = [initial_mode(self.spectrum, *pair) for pair in zip(poles, (directions.T @ seen).T, strict=True)]
+        self.start = _Model(tuple(tries))
+        self.candidates = iter(sorted(tries, key=lambda mode: -mode.height))
 
-    def grow(self) -> None:
-        """Take in what makes the record more likely than noise would, the strongest first."""
-        swings: list[Swing] = []
-        for swing in sorted(self.tries, key=lambda swing: -swing.height):
-            group = next(g for g in bands(self.spectrum, [s.pole for s in [*swings, swing]]) if len(swings) in g)
-            known, others = [swings[r] for r in group if r < len(swings)], np.setdiff1d(np.arange(len(swings)), group)
-            beside = [swings[r] for r in others]
-            try:
-                found = fit_band(self.spectrum, [*known, swing], beside)
-                without = fit_band(self.spectrum, known, beside, [*known, swing], FEW_STEPS)
-            except np.linalg.LinAlgError:
-                continue
-            if 2.0 * (without.cost - found.cost) > self.limit:
-                swings = [*beside, *found.swings]
-        self.settle(swings)
+    def n_modes(self, model: _Model) -> int:
+        return len(model.modes)
 
-    def settle(self, swings: list[Swing]) -> None:
+    def strongest(self, model: _Model, rejected: list[tuple[complex, float]]) -> SpectralMode | None:
+        return next(self.candidates, None)
+
+    def pole_of(self, candidate: SpectralMode) -> complex:
+        return candidate.pole
+
+    def extended(self, model: _Model, candidate: SpectralMode) -> _Model:
+        modes, n = model.modes, len(model.modes)
+        group = next(g for g in bands(self.spectrum, [mode.pole for mode in [*modes, candidate]]) if n in g)
+        known, beside = [modes[r] for r in group if r < n], [modes[r] for r in np.setdiff1d(np.arange(n), group)]
+        found = fit_band(self.spectrum, [*known, candidate], beside, budget=self.budget)
+        without = fit_band(self.spectrum, known, beside, [*known, candidate], FEW_STEPS, self.budget)
+        return _Model((*beside, *found.modes), origin=model, gain=2.0 * (without.cost - found.cost))
+
+    def gain(self, smaller: _Model, larger: _Model) -> float:
+        return larger.gain if larger.origin is smaller else smaller.gain
+
+    def threshold(self, model: _Model, pole: complex) -> float:
+        return self.limit
+
+    def splits(self, model: _Model, trial: _Model) -> bool:
+        return False
+
+    def settled(self, model: _Model) -> _Model:
         """All bands fitted, and how much less likely the record is without each mode."""
-        self.swings, fitted = list(swings), fit_bands(self.spectrum, swings) if swings else []
-        self.variance, self.evidence = np.zeros((2, len(swings), 2, len(swings))), np.zeros(len(swings))
+        n_all, modes = len(model.modes), list(model.modes)
+        fitted = fit_bands(self.spectrum, modes, self.budget) if modes else []
+        variance, evidence = np.zeros((2, n_all, 2, n_all)), np.zeros(n_all)
         for group, band in fitted:
-            for r, swing in zip(group, band.swings, strict=True):
-                self.swings[r] = swing
+            for r, mode in zip(group, band.modes, strict=True):
+                modes[r] = mode
         for group, band in fitted:
-            n, others = len(group), [swing for r, swing in enumerate(self.swings) if r not in group]
-            self.variance[np.ix_([0, 1], group, [0, 1], group)] = band.covariance.reshape(2, n, 2, n)
+            n, others = len(group), [mode for r, mode in enumerate(modes) if r not in group]
+            variance[np.ix_([0, 1], group, [0, 1], group)] = band.covariance.reshape(2, n, 2, n)
             for k, r in enumerate(group):
-                rest = [swing for i, swing in enumerate(band.swings) if i != k]
-                without = fit_band(self.spectrum, rest, others, band.swings, FEW_STEPS)
-                self.evidence[r] = 2.0 * (without.cost - band.cost)
+                rest = [mode for i, mode in enumerate(band.modes) if i != k]
+                without = fit_band(self.spectrum, rest, others, band.modes, FEW_STEPS, self.budget)
+                evidence[r] = 2.0 * (without.cost - band.cost)
+        return _Model(tuple(modes), variance, evidence)
 
-    @property
-    def poles(self) -> np.ndarray:
-        return np.array([swing.pole for swing in self.swings])
-
-    def covariance(self) -> np.ndarray:
-        """Of (ω, ζ): with λ = x + iy, dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
-        x, y, omega = self.poles.real, self.poles.imag, np.abs(self.poles)
-        by_omega = np.hstack([np.diag(x / omega), np.diag(y / omega)])
-        by_zeta = np.hstack([np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)])
-        jacobian = np.vstack([by_omega, by_zeta])
-        return jacobian @ self.variance.reshape(2 * omega.size, -1) @ jacobian.T
-
-    def prune(self) -> bool:
-        """Put out what is no mode, the least likely first; whether any went."""
-        n, omega = self.poles.size, np.abs(self.poles)
-        std = np.sqrt(np.diag(self.covariance())[:n])
-        out = (self.evidence < self.limit) | (std > LEAST_SURE * omega) | (-self.poles.real > MOST_DAMPED * omega)
-        out |= self._split(std)
-        if not out.any():
-            return False
-        worst = int(np.argmin(np.where(out, self.evidence, np.inf)))
-        self.settle([swing for r, swing in enumerate(self.swings) if r != worst])
-        return True
-
-    def _split(self, std: np.ndarray) -> np.ndarray:
-        """Which modes have the shape of a more likely one and its band, as far as that is known."""
-        shapes = np.array([swing.shape for swing in self.swings]).T
-        band = np.abs(self.poles.real) + 3.0 * std
-        near = np.abs(np.subtract.outer(self.poles.imag, self.poles.imag)) < band[:, None] + band
+    def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
+        """The least likely of those that are no modes."""
+        poles, omega = model.poles, np.abs(model.poles)
+        std = np.sqrt(np.diag(model.covariance)[: poles.size])
+        out = (model.evidence < self.limit) | (std > LEAST_SURE * omega) | (-poles.real > MOST_DAMPED * omega)
+        # One that has the shape of a more likely one and its band, as far as that is known, splits it.
+        shapes, band = np.array([mode.shape for mode in model.modes]).T, np.abs(poles.real) + 3.0 * std
+        near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band[:, None] + band
         alike = mac(shapes, shapes) > SAME_SHAPE
-        return (near & alike & (self.evidence[:, None] < self.evidence)).any(axis=1)
+        out |= (near & alike & (model.evidence[:, None] < model.evidence)).any(axis=1)
+        if out.any():
+            worst = int(np.argmin(np.where(out, model.evidence, np.inf)))
+            rest = _Model(tuple(mode for r, mode in enumerate(model.modes) if r != worst))
+            without = replace(self.settled(rest), gain=float(model.evidence[worst]))
+            yield complex(poles[worst]), without, True
 
-    def report(self, decays: tuple[Record, ...]) -> AmbientModes:
-        order = np.argsort(np.abs(self.poles))
-        poles, both = self.poles[order], np.r_[order, order + order.size]
+    def report(self, model: _Model, decays: tuple[Record, ...]) -> AmbientModes:
+        order = np.argsort(np.abs(model.poles))
+        poles, both = model.poles[order], np.r_[order, order + order.size]
         omega = np.abs(poles)
         modes = SampledModes(omega, -poles.real / omega, _shapes(decays, poles), self.record.positions)
-        covariance = frozen(self.covariance()[np.ix_(both, both)])
-        return AmbientModes(modes, covariance, frozen(self.evidence[order]), self.limit, decays)
+        covariance = frozen(model.covariance[np.ix_(both, both)])
+        evidence = frozen(model.evidence[order])
+        return AmbientModes(modes, covariance, evidence, self.limit, decays, self.budget.remarks)
 
 
 def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:

@@ -1,38 +1,40 @@
-"""Modes from what went in and what came out, whatever the excitation.
+"""Modes from measured inputs and outputs, whatever the excitation.
 
-What each pole answers is known sample by sample (`known_inputs.py`); all of it is fitted at once as `modal_fit` says:
-output error, most likely where the noise is the sensors' and normal. How that noise runs along frequency is learnt from
-what the modes leave, and they from it in turn (`noise_course.py`).
+The response of each pole to the inputs is exact at the samples (`input_output/known_inputs.py`); all modes are fitted
+at once by output error, maximum likelihood in normal noise of the sensors (`input_output/modal_fit.py`). The spectrum
+of that noise is estimated from the residual, and the modes from it in turn (`input_output/noise_spectrum.py`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import control
 import numpy as np
 
-from workbench.identification.free_decay.ibrahim import check_alike, normalised_shapes
-from workbench.identification.free_decay.identified import FALSE_ALARM
 from workbench.identification.input_output.fit_errors import errors, fixed_std, pole_covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.model_order import Told, tell
+from workbench.identification.input_output.model_order import Selected, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
-from workbench.identification.signal.standard_errors import StandardErrors
+from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.data_quality import check_same_sensors
+from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
+from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-# Modes by which the noise is first told, and how often it is learnt: it and the modes settle together.
+# Modes for the first estimate of the noise, and how often noise and modes are estimated in turn.
 STRONGEST, LEARNT = 8, 4
-# Times the limit up to which a mode may be noise that was taken out of the noise.
+# Times the limit up to which a mode may be noise; nepers over a record above which a pole grows.
 DOUBTED, MOST_GROWTH = 4.0, 0.5
 
 
-@dataclass(frozen=True, eq=False)
-class Driven(StandardErrors):
-    """Modes with what drives them: H(s) = D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate].
+@dataclass(frozen=True, eq=False, repr=False)
+class Driven(ModalEstimates):
+    """Modes with their participation factors: H(s) = D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate].
 
     Attributes:
         modes: shapes of displacement, largest entry 1.
@@ -41,30 +43,32 @@ class Driven(StandardErrors):
         participation: (n_modes, n_inputs) complex l_r, for c_r the shape as the outputs measure it, ψ_r λ_r^k with
             k = 0, 1, 2 for displacement, velocity, acceleration.
         participation_std: (n_modes, n_inputs) its standard error, root mean square of real and imaginary part.
-        feedthrough: (n_outputs, n_inputs) D: what an acceleration feels at once, and the modes above those found.
+        feedthrough: (n_outputs, n_inputs) D: of accelerations, and of the modes above those identified.
         feedthrough_std: (n_outputs, n_inputs).
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
-        noise: (n_records, n_outputs) standard deviation of what the modes leave, in the unit of each output.
+        noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
         evidence: (n_modes,) χ² of each mode in the noise.
         limit: what a mode fitted to noise alone exceeds with the chance of a false alarm.
         converged: whether the search ended because the step was small.
+        remarks: what is doubtful, and what was left undone where the time was up.
         output_channels, input_channels: of the records.
     """
 
     modes: SampledModes
     covariance: np.ndarray
-    shape_std: np.ndarray = field(repr=False)
-    participation: np.ndarray = field(repr=False)
-    participation_std: np.ndarray = field(repr=False)
-    feedthrough: np.ndarray = field(repr=False)
-    feedthrough_std: np.ndarray = field(repr=False)
-    initial: tuple[np.ndarray, ...] = field(repr=False)
+    shape_std: np.ndarray
+    participation: np.ndarray
+    participation_std: np.ndarray
+    feedthrough: np.ndarray
+    feedthrough_std: np.ndarray
+    initial: tuple[np.ndarray, ...]
     noise: np.ndarray
     evidence: np.ndarray
     limit: float
     converged: bool
-    output_channels: tuple[Channel, ...] = field(repr=False)
-    input_channels: tuple[Channel, ...] = field(repr=False)
+    remarks: tuple[str, ...]
+    output_channels: tuple[Channel, ...]
+    input_channels: tuple[Channel, ...]
 
     @property
     def noise_std(self) -> np.ndarray:
@@ -120,10 +124,11 @@ def identify_driven(
     feedthrough: bool = True,
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
+    seconds: float | None = SECONDS,
 ) -> Driven:
-    """The modes that inputs and outputs show, as many as there are, with shapes, participation and standard errors.
+    """The modes between inputs and outputs, as many as there are, with participation factors and standard errors.
 
-    Any excitation serves that moves the modes: noise, multisine, PRBS, a blow. Each mode enters if it raises the
+    Any excitation serves that moves the modes: noise, multisine, PRBS, an impulse. Each mode enters if it raises the
     likelihood by more than noise would in one record of a thousand.
 
     Args:
@@ -131,10 +136,10 @@ def identify_driven(
         at_rest: that nothing moves at the first sample; otherwise each record has an initial state of its own.
         straight: whether inputs run straight from sample to sample, as measured signals through a filter nearly do;
             otherwise they are held over each sample interval, as a converter gives them.
-        feedthrough: whether outputs may also feel inputs at once: accelerations do, and the modes beyond the sample
-            rate look so to every sensor.
+        feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
+        seconds: after which the best so far is returned, with a remark; None for no limit.
 
     Returns:
         `Driven`. Its standard errors hold in noise of any smooth spectrum.
@@ -142,65 +147,80 @@ def identify_driven(
     Raises:
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
     """
+    budget = Budget(seconds)
     records = [records] if isinstance(records, Record) else list(records)
-    check_alike(records)
+    check_same_sensors(records)
     _check_inputs(records)
-    drive = KnownInputs(records, at_rest=at_rest, straight=straight, feedthrough=feedthrough)
-    rows, columns = drive.fixed.shape
-    if rows < columns + 4 * (drive.n_drives + 2):
+    data = KnownInputs(records, at_rest=at_rest, straight=straight, feedthrough=feedthrough)
+    rows, columns = data.fixed.shape
+    if rows < columns + 4 * (data.n_excitations + 2):
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
-    drive, told = _told(drive, most_modes=min(most_modes, (rows - columns) // 6), false_alarm=false_alarm)
-    if told.fit.poles.size == 0:
+    most = min(most_modes, (rows - columns) // 6)
+    data, selected = _selected(data, budget, most_modes=most, false_alarm=false_alarm)
+    if selected.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
             f" {', '.join(records[0].output_names)} rises above the noise; excite harder or longer, or look whether"
             " inputs and outputs belong together"
         )
-    return _report(records, drive, told)
+    return _report(records, data, selected, budget.remarks)
 
 
-def _told(drive: KnownInputs, **how) -> tuple[KnownInputs, Told]:
-    """The modes, in the noise that they leave; the strongest first, for noise that is not white passes for modes.
+def _selected(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
+    """The modes, in noise of their residual's spectrum; the strongest first, for coloured noise passes for modes.
 
-    What a false mode took out of its lines, their noise lacks, and so the mode seems true. So the noise is learnt anew
-    with all doubtful modes left in it; they stay if modes and noise are then less likely by what so many modes take.
+    A false mode explains its lines, so that their noise is underestimated and the mode seems true. The noise is thus
+    estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
     """
+    how["budget"] = budget
     few = {**how, "most_modes": min(STRONGEST, how["most_modes"])}
-    drive, told = _with_noise(drive, tell(drive, **few), few, how)
-    doubted = (told.evidence < DOUBTED * told.limit) | ~_rings(drive, told)
-    if drive.sizes is None or not doubted.any():
-        return drive, told
-    sure = settled(drive, projected(drive, told.fit.poles[~doubted], told.fit.loads[~doubted]))
-    other = drive.weighing(drive.course(sure))
-    other, fewer = _with_noise(other, tell(other, **how), how, how)
-    worth = told.limit * (told.fit.poles.size - fewer.fit.poles.size)
-    strange = (~_rings(drive, told)).sum() > (~_rings(other, fewer)).sum()
-    return (other, fewer) if strange or other.cost(fewer.fit) - drive.cost(told.fit) <= worth else (drive, told)
+    data, selected = _with_noise(data, select_modes(data, **few), few, how, budget)
+    doubtful = (selected.evidence < DOUBTED * selected.limit) | ~_oscillate(data, selected)
+    if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
+        return data, selected
+    sure = settled(
+        data, projected(data, selected.fit.poles[~doubtful], selected.fit.participation[~doubtful]), budget=budget
+    )
+    other = data.weighted_by(data.noise_spectrum(sure))
+    other, fewer = _with_noise(other, select_modes(other, **how), how, how, budget)
+    if budget.spent("check of doubtful modes"):
+        return data, selected
+    worth = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
+    strange = (~_oscillate(data, selected)).sum() > (~_oscillate(other, fewer)).sum()
+    return (other, fewer) if strange or other.cost(fewer.fit) - data.cost(selected.fit) <= worth else (data, selected)
 
 
-def _rings(drive: KnownInputs, told: Told) -> np.ndarray:
-    """Which modes swing within a record and hardly grow; what else comes in may be noise that is not white."""
-    poles, span = told.fit.poles, 2.0 * np.pi / drive.resolution
-    return (np.abs(poles) > drive.resolution) & (poles.real * span < MOST_GROWTH)
+def _oscillate(data: KnownInputs, selected: Selected) -> np.ndarray:
+    """Which modes oscillate within a record and hardly grow; others may be noise that is not white."""
+    poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
+    return (np.abs(poles) > data.resolution) & (poles.real * span < MOST_GROWTH)
 
 
-def _with_noise(drive: KnownInputs, told: Told, once: dict, how: dict) -> tuple[KnownInputs, Told]:
-    """Modes and noise that leave each other as they are; `once` is how `told` was told."""
+def _with_noise(
+    data: KnownInputs, selected: Selected, once: dict[str, Any], how: dict[str, Any], budget: Budget
+) -> tuple[KnownInputs, Selected]:
+    """Modes and noise estimated in turn until both stay the same; `once` is how `selected` was selected."""
     for _ in range(LEARNT):
-        sizes = drive.course(told.fit)
-        if alike(sizes, drive.sizes) and not (told.full and once["most_modes"] < how["most_modes"]):
+        line_std = data.noise_spectrum(selected.fit)
+        if alike(line_std, data.line_std) and not (selected.full and once["most_modes"] < how["most_modes"]):
             break
-        drive, once = drive.weighing(sizes), how
-        told = tell(drive, **how)
-    return drive, told
+        if budget.spent("estimation of the noise spectrum"):
+            break
+        weighted = data.weighted_by(line_std)
+        anew = select_modes(weighted, **how)
+        # A search that was ended early is no better than the one before.
+        if budget.spent("estimation of the noise spectrum") and anew.fit.poles.size < selected.fit.poles.size:
+            break
+        data, selected, once = weighted, anew, how
+    return data, selected
 
 
 def _check_inputs(records: Sequence[Record]) -> None:
     first = records[0]
     if first.n_inputs == 0:
-        raise ValueError(f"record {first.name!r} has no inputs; of a free decay `identify` finds the modes")
+        raise ValueError(f"record {first.name!r} has no inputs; use `identify` for a free decay")
     for record in records[1:]:
         if record.input_names != first.input_names:
             raise ValueError(
@@ -217,12 +237,12 @@ def _check_inputs(records: Sequence[Record]) -> None:
     if abs(alike[i, k]) > 1.0 - 1e-9:
         raise ValueError(
             f"inputs {first.input_names[i]!r} and {first.input_names[k]!r} are the same signal but for its size, so"
-            " what each does cannot be told; excite them one after the other, or by signals of their own"
+            " what each does cannot be selected; excite them one after the other, or by signals of their own"
         )
 
 
-def _report(records: Sequence[Record], drive: KnownInputs, told: Told) -> Driven:
-    fit: Fit = told.fit
+def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, remarks: tuple[str, ...]) -> Driven:
+    fit: Fit = selected.fit
     channels, n_inputs = records[0].output_channels, records[0].n_inputs
     derivative = time_derivatives(channels)[:, None]
     n = fit.poles.size
@@ -230,42 +250,44 @@ def _report(records: Sequence[Record], drive: KnownInputs, told: Told) -> Driven
     shapes = normalised_shapes(seen)
     largest = np.abs(seen).argmax(axis=0)
     each = np.arange(n)
-    # y = Re Σ a z and H = Σ a l / 2 (s - λ) + conjugate: what the shape loses by its normalisation the loads take up.
+    # y = Re Σ a z and H = Σ a l / 2 (s - λ) + conjugate: the participation factors take up the scale of the shape.
     scale = 0.5 * seen[largest, each] / shapes[largest, each]
-    loads = fit.loads * scale[:, None]
+    participation = fit.participation * scale[:, None]
 
-    def figures(poles, loads, amplitudes):
+    def figures(poles, participation, amplitudes):
         seen = amplitudes / poles**derivative
         relative = seen / seen[largest, each]
-        driven = (loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None])[:, :n_inputs]
+        driven = (participation * (0.5 * seen[largest, each] / shapes[largest, each])[:, None])[:, :n_inputs]
         return np.concatenate([relative.real.ravel(), driven.real.ravel(), driven.imag.ravel()])
 
-    heard, beside = drive.heard(fit)
-    std = np.sqrt(np.diag(errors(fit, figures, heard)))
+    noise_ratio, beside = data.noise_ratios(fit)
+    std = np.sqrt(np.diag(errors(fit, figures, noise_ratio)))
     m = len(channels)
     shape_std = std[: m * n].reshape(m, n)
     shape_std[largest, each] = 0.0
     real, imaginary = std[m * n :].reshape(2, n, n_inputs)
     direct = np.zeros((m, n_inputs))
     direct_std = np.zeros((m, n_inputs))
-    if drive.feedthrough:
+    if data.feedthrough:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
-        direct_std = fixed_std(fit, heard, beside)[:n_inputs].T
+        direct_std = fixed_std(fit, noise_ratio, beside)[:n_inputs].T
     return Driven(
         modes=SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, records[0].positions),
-        covariance=frozen(pole_covariance(fit, heard)),
+        covariance=frozen(pole_covariance(fit, noise_ratio)),
         shape_std=frozen(shape_std),
-        participation=frozen(loads[:, :n_inputs], complex),
+        participation=frozen(participation[:, :n_inputs], complex),
         participation_std=frozen(np.sqrt(0.5 * (real**2 + imaginary**2))),
         feedthrough=frozen(direct),
         feedthrough_std=frozen(direct_std),
         initial=tuple(
-            frozen(np.zeros(n) if drive.at_rest else loads[:, n_inputs + k], complex) for k in range(len(records))
+            frozen(np.zeros(n) if data.at_rest else participation[:, n_inputs + k], complex)
+            for k in range(len(records))
         ),
-        noise=frozen(drive.noise(fit)),
-        evidence=frozen(told.evidence),
-        limit=told.limit,
+        noise=frozen(data.noise(fit)),
+        evidence=frozen(selected.evidence),
+        limit=selected.limit,
         converged=fit.converged,
+        remarks=remarks,
         output_channels=channels,
         input_channels=records[0].input_channels,
     )

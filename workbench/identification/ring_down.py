@@ -1,23 +1,24 @@
-"""Records as a user has them to the modes in them, in one call."""
+"""Free decay from raw records to modes, in one call."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
 from workbench.identification.free_decay.amplitude import AmplitudeDependence, amplitude_dependence
-from workbench.identification.free_decay.coloured_noise import in_its_noise
 from workbench.identification.free_decay.drift import HIGHEST_DEGREE, without_drift
-from workbench.identification.free_decay.ibrahim import check_alike, stacked_delays
-from workbench.identification.free_decay.identified import Identified, unshaped
-from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.proportional import ProportionalFit, proportional_fit
-from workbench.identification.free_decay.refinement import Refined, refine
+from workbench.identification.free_decay.refined import Identified, Refined, in_coloured_noise, unshaped
+from workbench.identification.free_decay.refinement import refine
 from workbench.identification.free_decay.remarks import SURE, remarks
-from workbench.identification.free_decay.stabilisation import real_modes, stabilise
-from workbench.identification.signal.data_quality import ailments, check_fit
+from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
+from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
 from workbench.identification.signal.decay import decay_start
+from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
@@ -25,81 +26,100 @@ from workbench.threads import one_blas_thread
 
 MOST_MODES = 20
 DRIFT_ROUNDS = 3
-# Energy of the second half over that of the first, either way; such a record must know its phase after a third of it.
-AS_STRONG, REMEMBERED = 0.5, 0.5
-# Correlation of noise, times the root of its samples, is 1.
-FORGETFUL = 3.0
-# Share of the energy about the modes that they may leave standing out so far of what they leave beside; and of all, if
-# it is not white.
+# Energy of the second half over that of the first, either way; least correlation of such a record after a third of it.
+AS_STRONG, CORRELATED = 0.5, 0.5
+# Correlation of noise, times the root of its samples, is 1; more is an oscillation.
+UNCORRELATED = 3.0
+# Share of the energy about the modes that the residual may have, and how far it may stand out of the residual beside;
+# and of all, if it is not white.
 LEFT_OVER, MOST_LEFT, STANDS_OUT = 0.1, 0.25, 5.0
 # Bins about a mode, and beside.
 BAND, BESIDE = 6, 60
 
 
-@dataclass(frozen=True, eq=False)
-class RingDown:
-    """What records hold.
+@dataclass(frozen=True, eq=False, repr=False)
+class RingDown(ModalEstimates):
+    """The modes of free decays.
 
     Attributes:
-        records: what was read: each from the start of its free decay on, without drift.
+        records: as used: each from the start of its free decay on, drift removed.
         refined: their modes.
-        remarks: one a mode, empty where nothing speaks against it.
-        noise_modes: tried and taken for noise.
+        remarks: one a mode, empty where there is none.
+        noise_modes: candidates rejected as noise.
         noise_evidence: (n_noise,) theirs, below `limit`.
         limit: evidence from which on a mode counts.
-        by_amplitude: the modes stretch by stretch of the decay.
+        by_amplitude: the modes of each segment of the decay.
         proportional: g1 and g2 of the modes without remark; None where they are fewer than two.
-        notes: what was done to the records, and what is left over.
+        notes: what was done to the records, and what remains unexplained.
     """
 
-    records: tuple[Record, ...] = field(repr=False)
+    records: tuple[Record, ...]
     refined: Refined
     remarks: tuple[str, ...]
-    noise_modes: SampledModes = field(repr=False)
-    noise_evidence: np.ndarray = field(repr=False)
+    noise_modes: SampledModes
+    noise_evidence: np.ndarray
     limit: float
     by_amplitude: AmplitudeDependence
     proportional: ProportionalFit | None
     notes: tuple[str, ...]
 
     @property
-    def modes(self) -> SampledModes:
+    def modes(self) -> SampledModes:  # type: ignore[override]  # read-only here
         return self.refined.modes
+
+    @property
+    def covariance(self) -> np.ndarray:  # type: ignore[override]
+        """(2 n_modes, 2 n_modes) of (ω, ζ)."""
+        return self.refined.covariance
+
+    def _remarks(self) -> tuple[str, ...]:
+        of_modes = (f"mode {r + 1}: {remark}" for r, remark in enumerate(self.remarks) if remark)
+        return (*of_modes, *self.notes)
 
 
 @one_blas_thread
 def ring_down(
-    records: Record | Sequence[Record], *, start: float | None = None, n_modes: int | None = None
+    records: Record | Sequence[Record],
+    *,
+    start: float | None = None,
+    n_modes: int | None = None,
+    seconds: float | None = SECONDS,
 ) -> RingDown:
     """The modes of records that become free decay.
 
-    Each is cut where free decay begins and no sample is cut off any more, and a drift is taken out. Unless their number
+    Each is cut where free decay begins and no sample is clipped any more, and a drift is removed. Unless their number
     is given, the modes are those that rise above the noise of all records together.
 
     Args:
         records: of the same sensors at one rate, of any length before the decay.
         start: where the decay is free, s, in every record; found in each unless given.
-        n_modes: as many as are to be found.
+        n_modes: number of modes; selected unless given.
+        seconds: after which the best so far is returned, with a note; None for no limit.
 
     Raises:
-        ValueError: records that differ in sensors or rate; a sensor ails; too few samples; nothing that decays freely.
+        ValueError: records that differ in sensors or rate; a faulty channel; too few samples; nothing that decays
+            freely.
     """
+    budget = Budget(seconds)
     records = [records] if isinstance(records, Record) else list(records)
-    check_alike(records)
+    check_same_sensors(records)
     cut, notes = [], []
     for record in records:
-        begins, told = (start, []) if start is not None else _start(record)
+        begins, notes_here = (start, []) if start is not None else _start(record)
         cut.append(record.between(begins))
-        notes += told if len(records) == 1 else [f"{record.name}: {note}" for note in told]
-        check_fit(cut[-1])
+        notes += notes_here if len(records) == 1 else [f"{record.name}: {note}" for note in notes_here]
+        check_data_quality(cut[-1])
         _check_undriven(cut[-1])
     try:
-        found, cut, more = _without_drift(cut, n_modes)
+        found, cut, more = _without_drift(cut, n_modes, budget)
     except np.linalg.LinAlgError:
-        found, more = _by_stabilisation(cut), ["the order could not be told by likelihood: by stabilisation instead"]
+        found, more = (
+            _by_stabilisation(cut, budget),
+            ["model order by stabilisation diagram: by likelihood there is none"],
+        )
     _check_decays(cut, found.refined)
     left = [project(record, found.modes.poles, True).residual.T for record in cut]
-    coloured = _left_over(cut, left)
+    coloured = _coloured_residual(cut, left)
     doubtful = _unexplained(cut, left, found.refined, bool(coloured))
     doubts = remarks(found.refined, cut)
     sure = [r for r, doubt in enumerate(doubts) if not doubt]
@@ -112,34 +132,36 @@ def ring_down(
         found.limit,
         amplitude_dependence(cut, found.refined),
         proportional_fit(found.refined, sure) if len(sure) > 1 else None,
-        (*notes, *more, *_goes_on(found.refined, cut), *doubtful, *coloured),
+        (*notes, *more, *budget.remarks, *_goes_on(found.refined, cut), *doubtful, *coloured),
     )
 
 
 def _start(record: Record) -> tuple[float, list[str]]:
-    """Where free decay begins and nothing is clipped any more, and what to say of it."""
+    """Where free decay begins and nothing is clipped any more, with remarks."""
     start, notes = decay_start(record), []
     if start > record.start_time:
         notes.append(f"free decay from {start:.6g} s on; --start sets another time")
-    clipped = [a for a in ailments(record.between(start)) if a.until is not None]
+    clipped = [a for a in data_faults(record.between(start)) if a.until is not None]
     behind = max((a.until or start for a in clipped), default=start) + record.sample_time
     if clipped and behind - start < 0.5 * (record.time[-1] - start):
-        notes.append(f"output {clipped[0].outputs[0]!r} is cut off at an end of its range: read from {behind:.6g} s on")
+        notes.append(f"output {clipped[0].outputs[0]!r} is clipped: used from {behind:.6g} s on")
         start = behind
     return start, notes
 
 
-def _without_drift(records: list[Record], n_modes: int | None) -> tuple[Identified, list[Record], list[str]]:
-    """Modes and drifts in turn, as each hides in the other, until neither changes."""
+def _without_drift(
+    records: list[Record], n_modes: int | None, budget: Budget
+) -> tuple[Identified, list[Record], list[str]]:
+    """Modes and drifts in turn, as each disturbs the other, until neither changes."""
     cleared, size, poles = records, np.zeros((len(records), records[0].n_outputs)), np.zeros(0, complex)
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(DRIFT_ROUNDS):
-        found = _identified(cleared, n_modes)
+        found = _identified(cleared, n_modes, budget)
         before, poles = poles, found.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
         drifting = any(drift.size.any() for drift in drifts)
-        if not drifting or (poles.size == before.size and size.any()):
+        if not drifting or (poles.size == before.size and size.any()) or budget.spent("removal of drift"):
             break
         cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
     in_noise = size / found.refined.noise
@@ -147,39 +169,39 @@ def _without_drift(records: list[Record], n_modes: int | None) -> tuple[Identifi
         return found, cleared if size.any() else records, []
     i, j = np.unravel_index(int(np.argmax(in_noise)), size.shape)
     name = records[0].output_names[j]
-    return found, cleared, [f"a drift of {size[i, j]:.3g} was taken out of output {name!r}"]
+    return found, cleared, [f"a drift of {size[i, j]:.3g} was removed from output {name!r}"]
 
 
-def _identified(records: list[Record], n_modes: int | None) -> Identified:
+def _identified(records: list[Record], n_modes: int | None, budget: Budget) -> Identified:
     if n_modes is None:
-        return identify(records)
+        return identify_within(records, budget)
     if n_modes < 1:
         raise ValueError(f"at least one mode must be asked for; got {n_modes}")
-    return _as_identified(stacked_delays(records, n_modes=n_modes), records)
+    return _as_identified(stacked_delays(records, n_modes=n_modes), records, budget)
 
 
-def _by_stabilisation(records: list[Record]) -> Identified:
+def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
     highest = max(2, min(MOST_MODES, min(record.n_samples for record in records) // 8))
-    start = real_modes(stabilise(records, orders=range(2, highest + 1))).modes
+    start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
     if start.n_modes == 0:
         name = records[0].name
-        raise ValueError(f"record {name!r} holds no mode that stays from order to order: is it a free decay?")
-    return _as_identified(start, records)
+        raise ValueError(f"record {name!r} holds no mode that is stable over the model order: is it a free decay?")
+    return _as_identified(start, records, budget)
 
 
-def _as_identified(start: SampledModes, records: list[Record]) -> Identified:
-    """Modes that were asked for: no evidence, none refused."""
-    refined, none = in_its_noise(refine(records, start, offset=True), records), np.zeros(0)
+def _as_identified(start: SampledModes, records: list[Record], budget: Budget) -> Identified:
+    """Modes of given number: no evidence, none rejected."""
+    refined, none = in_coloured_noise(refine(records, start, offset=True, budget=budget), records), np.zeros(0)
     return Identified(refined, none, 0.0, unshaped(none.astype(complex), records[0]), none)
 
 
 def _check_undriven(record: Record) -> None:
-    """Refuse a record that is as strong at its end as at its beginning and has forgotten its phase meanwhile.
+    """Refuse a record that is as strong at its end as at its beginning and not correlated over its length.
 
-    A free decay that hardly decays repeats itself after any time; what random forces drive forgets. Of
-    records of twenty decay times three in four are told, of a hundred nine in ten.
+    A free decay that hardly decays stays correlated at any lag; random vibration does not. Of
+    records of twenty decay times three in four are detected, of a hundred nine in ten.
     """
-    # Drifts may be strong at both ends, and swing not at all.
+    # Drifts may be strong at both ends, and do not oscillate.
     n = record.n_samples
     slow = np.linalg.qr(legvander(np.linspace(-1.0, 1.0, n), HIGHEST_DEGREE))[0]
     about = record.outputs - (record.outputs @ slow) @ slow.T
@@ -190,12 +212,12 @@ def _check_undriven(record: Record) -> None:
     soon, late = (
         float(np.sqrt((part**2).mean())) for part in (correlation[: n // 20 + 1], correlation[n // 3 : n // 2])
     )
-    # Noise forgets at once, and holds no mode; that is said elsewhere.
-    swings = soon > FORGETFUL / np.sqrt(n)
-    if swings and AS_STRONG < energy[1] / max(energy[0], 1e-300) < 1.0 / AS_STRONG and late < REMEMBERED * soon:
+    # Noise is uncorrelated, and holds no mode; other checks say so.
+    oscillates = soon > UNCORRELATED / np.sqrt(n)
+    if oscillates and AS_STRONG < energy[1] / max(energy[0], 1e-300) < 1.0 / AS_STRONG and late < CORRELATED * soon:
         raise ValueError(
-            f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and has"
-            f" forgotten its phase. {WAY_OUT}"
+            f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
+            f" correlated over its length. {WAY_OUT}"
         )
 
 
@@ -217,9 +239,9 @@ def _check_decays(records: list[Record], refined: Refined) -> None:
 
 
 def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined, coloured: bool) -> tuple[str, ...]:
-    """What to say where modes leave much about their own frequencies: what forces drive swings there on and on.
+    """A remark where the residual is large about the modes: forces excite them throughout.
 
-    Noise of sensors leaves there no more than beside.
+    Noise of sensors is no larger there than beside.
     """
     for record, residual, noise in zip(records, left, refined.noise, strict=True):
         scaled = ((part / noise[:, None]) for part in (residual, record.outputs))
@@ -234,8 +256,8 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
         about = share > LEFT_OVER and power[inside].mean() > STANDS_OUT * level
         if about or (whole > MOST_LEFT and coloured):
             return (
-                f"in record {record.name!r} the modes leave {100 * np.sqrt(share):.0f} % of the motion about their own"
-                f" frequencies, {100 * np.sqrt(whole):.0f} % of all: it is driven, or depends strongly on amplitude."
+                f"in record {record.name!r} the residual is {100 * np.sqrt(share):.0f} % of the motion about the"
+                f" modes, {100 * np.sqrt(whole):.0f} % of all: it is driven, or depends strongly on amplitude."
                 f" {WAY_OUT}",
             )
     return ()
@@ -251,7 +273,7 @@ def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
 
 
 def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
-    """What to say where most of the motion does not decay."""
+    """A remark where most of the motion does not decay."""
     span = max(record.n_samples * record.sample_time for record in records)
     lasting = refined.modes.zeta * refined.modes.omega * span < 0.1
     energy = _energy(refined, records)
@@ -264,8 +286,8 @@ def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
     )
 
 
-def _left_over(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:
-    """What to say of what the modes leave, where it is not noise."""
+def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:
+    """A remark where the residual is not white."""
     about = sum(float(((r.outputs - r.outputs.mean(axis=1, keepdims=True)) ** 2).sum()) for r in records)
     squares = sum(float((residual**2).sum()) for residual in left)
     following = sum(float((residual[:, 1:] * residual[:, :-1]).sum()) for residual in left)
@@ -273,4 +295,6 @@ def _left_over(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]
     if squares < 1e-12 * about or abs(following) < SURE * squares / np.sqrt(size):
         return ()
     share = 100 * np.sqrt(squares / about)
-    return (f"what the modes leave, {share:.2g} % of the motion, is not white: errors by its spectrum about each mode",)
+    return (
+        f"the residual, {share:.2g} % of the motion, is not white: standard errors by its spectrum about each mode",
+    )

@@ -2,42 +2,42 @@
 
     H_ji(s) = Σ_r [c_jr l_ri / (s - λ_r) + conjugate] + s^k (D_ji + E_ji / s²)      at s = iω
 
-for outputs that are the k-th time derivative of a displacement: D is what the modes above the band still give, E the
-modes below it. Each mode is one shape and one participation of each reference, however many were struck or shaken.
+for outputs that are the k-th time derivative of a displacement: D is the residual term of the
+modes above the band, E of those below it. Each mode has one shape and one participation factor a reference.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from workbench.identification.free_decay.ibrahim import normalised_shapes
-from workbench.identification.free_decay.identified import FALSE_ALARM
 from workbench.identification.input_output.fit_errors import errors, pole_covariance
-from workbench.identification.input_output.line_noise import noise_with_size
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.mode_clusters import NARROW, parts_of
-from workbench.identification.input_output.model_order import Told, evidence_of, tell
-from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.signal.standard_errors import StandardErrors
+from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
+from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
+from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
+from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-# Lines that are fitted together; of the bands of more, how many, and how many beyond their edges; and a mode's own.
+# Lines that are fitted together; of more, the lines of a band and beyond each of its edges; and lines for each mode.
 MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
-# A mode whose frequency is known no better than this is none to report.
+# Relative standard error of a frequency from which on a mode is not reported.
 UNSURE = 0.01
-# Modes by which the noise of the lines is first told, how often it is told, and how far off it may be (rms of log).
+# Modes for the first estimate of the noise, how often it is estimated, and the tolerance (rms of log).
 STRONGEST, REWEIGHTED, ALIKE = 4, 2, 0.2
 
 
-@dataclass(frozen=True, eq=False)
-class TransferModes(StandardErrors):
+@dataclass(frozen=True, eq=False, repr=False)
+class TransferModes(ModalEstimates):
     """Modes of transfer functions.
 
     Attributes:
@@ -45,29 +45,31 @@ class TransferModes(StandardErrors):
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
         shape_std: (n_outputs, n_modes) standard error of the real part of each shape.
         participation: (n_modes, n_references) complex l_r, for c_r the shape as the outputs measure it.
-        misfit: (n_outputs,) rms of what is left: in units of the stated noise (1 where it is all there is), or, where
+        misfit: (n_outputs,) rms of the residual: in units of the stated noise (1 where it is noise alone), or, where
             none was stated, of real and imaginary part each, in the unit of the output.
-        evidence: (n_modes,) χ² of each mode in what is left.
+        evidence: (n_modes,) χ² of each mode in the noise.
         converged: whether the search ended because the step was small.
-        parts_hz: of each mode what was told beside it and is part of it (`gathering`), Hz: points measured one after
-            another disagree there, or the mode depends on amplitude.
-        full_hz: bands (lowest, highest line) in which the search stopped at the most modes it might take: what it left
-            there is no noise, and what it found is not all, or is no modes but points that disagree.
+        parts_hz: of each mode the other members of its cluster (`mode_clusters`), Hz: points measured one after
+            another are inconsistent there, or the mode drifts or depends on amplitude.
+        full_hz: bands (lowest, highest line) in which the search stopped at the most modes allowed: the residual is
+            not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
+        remarks: what was left undone, where the time was up.
     """
 
     modes: SampledModes
     covariance: np.ndarray
-    shape_std: np.ndarray = field(repr=False)
-    participation: np.ndarray = field(repr=False)
+    shape_std: np.ndarray
+    participation: np.ndarray
     misfit: np.ndarray
     evidence: np.ndarray
     converged: bool
     parts_hz: tuple[tuple[float, ...], ...]
     full_hz: tuple[tuple[float, float], ...]
-    fitted: np.ndarray = field(repr=False)
-    frequencies_hz: np.ndarray = field(repr=False)
+    fitted: np.ndarray
+    frequencies_hz: np.ndarray
+    remarks: tuple[str, ...] = ()
 
 
 def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
@@ -102,27 +104,30 @@ def identify_transfer(
     noise_std: ArrayLike | None = None,
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
+    seconds: float | None = SECONDS,
 ) -> TransferModes:
-    """The modes that measured transfer functions show, as many as there are, each with its standard error.
+    """The modes of measured transfer functions, as many as there are, each with its standard error.
 
-    More than 1500 lines are fitted a band after another, each of which looks beyond its edges.
+    More than 1500 lines are fitted band by band, with overlap.
 
     Args:
         transfer: (n_outputs, n_frequencies), or (n_outputs, n_references, n_frequencies), complex, outputs per unit
             input; of receptance, mobility or accelerance by the quantity of each channel.
         frequencies_hz: (n_frequencies,) increasing, at any spacing.
-        channels: one an output; where no quantity is told, the modes beyond the band may look like any motion.
+        channels: one an output; where no quantity is stated, the residual terms are those of any motion.
         band_hz: lowest and highest line to fit; modes beyond are held by residual terms.
         noise_std: standard error of real and imaginary part, of the shape of `transfer`: from repeated measurements,
             or by `coherence_noise`. Without it, noise is taken to be the same at all lines of an output, or to go with
-            its size in part where neighbouring lines differ so (`line_noise`), and standard errors grow with what is
-            left about each mode where that is louder than elsewhere.
+            its size in part where neighbouring lines differ so (`noise_with_size`), and standard errors grow with the
+            residual about each mode where that is larger than elsewhere.
         most_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
+        seconds: after which the best so far is returned, with a remark; None for no limit.
 
     Raises:
-        ValueError: shapes that do not fit, values that are no numbers, a band with too few lines, no mode.
+        ValueError: shapes that do not fit, values that are not finite, a band with too few lines, no mode.
     """
+    budget = Budget(seconds)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
     n_bands, each_own = (1, 3) if f.size <= MOST_LINES else (-(-f.size // BAND), LINES_A_MODE)
     found, share = [], f.size / n_bands
@@ -130,7 +135,8 @@ def identify_transfer(
         first, last = round(k * share), round((k + 1) * share)
         inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
-        told = _told(
+        selected = _selected(
+            budget.share(n_bands - k),
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
@@ -138,8 +144,8 @@ def identify_transfer(
             most_modes=min(most_modes, f[inside].size // each_own),
             false_alarm=false_alarm / n_bands,
         )
-        found.append(_modes_of(*told, channels, edges, f[first:last]))
-    whole = _together(found, channels) if n_bands > 1 else found[0]
+        found.append(_modes_of(*selected, channels, edges, f[first:last]))
+    whole = replace(_together(found, channels) if n_bands > 1 else found[0], remarks=budget.remarks)
     if whole.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
@@ -148,50 +154,56 @@ def identify_transfer(
     return whole
 
 
-def _told(h, omega, powers, noise, **how) -> tuple[Lines, Told]:
-    """The modes of a band; where no noise is told, its course along the lines by what the strongest modes leave."""
-    lines = Lines(h, omega, powers, noise)
+def _selected(
+    budget: Budget, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, **how: Any
+) -> tuple[Lines, Selected]:
+    """The modes of a band; where no noise is stated, it is estimated from the residual of the strongest modes."""
+    lines, how = Lines(h, omega, powers, noise), {**how, "budget": budget}
     if noise is not None:
-        return lines, tell(lines, **how)
-    told = tell(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
+        return lines, select_modes(lines, **how)
+    selected = select_modes(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
     before: np.ndarray | None = None
     for _ in range(REWEIGHTED):
-        guessed = noise_with_size(lines.left(told.fit), lines.fitted(told.fit))
-        if guessed is None or (before is not None and _much_as(guessed, before)):
+        guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
+        if guessed is None or (before is not None and _alike(guessed, before)):
             break
-        before = guessed
-        lines = Lines(h, omega, powers, guessed, guessed=True)
-        told = tell(lines, **how)
-    return (lines, told) if lines.guessed else (lines, tell(lines, **how))
+        if budget.spent("estimation of the noise"):
+            return lines, selected
+        before, weighted = guessed, Lines(h, omega, powers, guessed, guessed=True)
+        anew = select_modes(weighted, **how)
+        if budget.spent("estimation of the noise") and anew.fit.poles.size < selected.fit.poles.size:
+            return lines, selected
+        lines, selected = weighted, anew
+    return (lines, selected) if lines.guessed else (lines, select_modes(lines, **how))
 
 
-def _much_as(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether noise runs along the lines of each output as another does, but for its size."""
+def _alike(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two noise spectra are the same but for their size."""
     return bool(np.log(one / other).std(axis=(1, 2)).max() < ALIKE)
 
 
-def _modes_of(lines: Lines, told: Told, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
+def _modes_of(lines: Lines, selected: Selected, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
-    fit, parts_hz = _gathered(lines, told, channels)
+    fit, parts_hz = _clustered(lines, selected, channels)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
-    heard = np.tile(lines.louder_near(fit), (len(channels), 1))
-    covariance = pole_covariance(fit, heard)
+    noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
+    covariance = pole_covariance(fit, noise_ratio)
     sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < UNSURE * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     inside = np.flatnonzero(within & sure & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
     n = inside.size
     derivative = time_derivatives(channels)[:, None]
-    poles, loads = fit.poles[inside], fit.loads[inside]
+    poles, participation = fit.poles[inside], fit.participation[inside]
     seen = fit.amplitudes[:, inside] / poles**derivative
     largest, each = np.abs(seen).argmax(axis=0), np.arange(n)
 
-    def relative(poles, loads, amplitudes):
+    def relative(poles, participation, amplitudes):
         seen = amplitudes[:, inside] / poles[inside] ** derivative
         return (seen / seen[largest, each]).real.ravel()
 
     std = np.zeros((len(channels), n))
     if n:
-        std = np.sqrt(np.diag(errors(fit, relative, heard))).reshape(len(channels), n)
+        std = np.sqrt(np.diag(errors(fit, relative, noise_ratio))).reshape(len(channels), n)
         std[largest, each] = 0.0
     both = np.r_[inside, fit.poles.size + inside]
     shapes = normalised_shapes(seen) if n else seen
@@ -200,32 +212,32 @@ def _modes_of(lines: Lines, told: Told, channels, edges_hz: tuple[float, float],
         modes=SampledModes(np.abs(poles), -poles.real / np.abs(poles), shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(both, both)]),
         shape_std=frozen(std),
-        participation=frozen(loads * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
+        participation=frozen(participation * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
         misfit=frozen(lines.misfit(fit)),
         evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
         parts_hz=tuple(parts_hz[r] for r in inside),
-        full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if told.full else (),
+        full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
     )
 
 
-def _gathered(lines: Lines, told: Told, channels) -> tuple[Fit, list[tuple[float, ...]]]:
-    """The fit with one mode for every crowd of parts, and the frequencies of those of each mode, Hz."""
-    fit = told.fit
+def _clustered(lines: Lines, selected: Selected, channels) -> tuple[Fit, list[tuple[float, ...]]]:
+    """The fit with one mode a cluster, and the frequencies of its other members, Hz."""
+    fit = selected.fit
     shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
     seen = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, _places(channels))
-    parts = parts_of(fit.poles, seen.phase_collinearity, told.evidence)
+    parts = parts_of(fit.poles, seen.phase_collinearity, selected.evidence)
     kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
     parts_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]
     if not parts:
         return fit, parts_hz
     middle = fit.poles.copy()
     for r, others in parts.items():
-        crowd = [r, *(k for k in others if np.abs(fit.poles.real[k]) < NARROW * np.abs(fit.poles.real[r]))]
-        middle[r] = np.average(fit.poles[crowd], weights=told.evidence[crowd])
-    return settled(lines, projected(lines, middle[kept], fit.loads[kept])), parts_hz
+        cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < NARROW * np.abs(fit.poles.real[r]))]
+        middle[r] = np.average(fit.poles[cluster], weights=selected.evidence[cluster])
+    return settled(lines, projected(lines, middle[kept], fit.participation[kept])), parts_hz
 
 
 def _together(found: Sequence[TransferModes], channels) -> TransferModes:
@@ -254,9 +266,9 @@ def _together(found: Sequence[TransferModes], channels) -> TransferModes:
 
 
 def _residual_powers(channels) -> list[int]:
-    """Of s, with what modes above and below the band leave in it."""
-    told = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in MEASURED}
-    above = told or {0, 2}
+    """Of s, in the residual terms of modes above and below the band."""
+    measured = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in MEASURED}
+    above = measured or {0, 2}
     return sorted({int(power) for k in above for power in (k, k - 2)})
 
 
@@ -284,5 +296,5 @@ def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
     bad = np.argwhere(~np.isfinite(h[:, :, keep]))
     if len(bad):
         j, _, line = bad[0]
-        raise ValueError(f"output {channels[j].name!r} is no number at {f[keep][line]:g} Hz; leave that line out")
+        raise ValueError(f"output {channels[j].name!r} is not finite at {f[keep][line]:g} Hz; leave that line out")
     return h[:, :, keep], f[keep], None if noise is None else noise[:, :, keep]

@@ -1,6 +1,5 @@
-"""Modes found in what was measured, told in lines, a table and JSON: what `workbench identify` says."""
+"""Identified modes as a table, remarks and JSON: what `workbench identify` reports."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,28 +9,27 @@ from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.free_decay.proportional import ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
-from workbench.identification.signal.data_quality import check_fit
+from workbench.identification.signal.data_quality import check_data_quality
+from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.transfer import TransferModes, identify_transfer
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
-from workbench.structure.modes import SampledModes
 
-TURN = 2.0 * math.pi
-HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
+TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
 BROAD = 0.1  # damping ratio
 MAINS_HZ, SURE = (50.0, 60.0), 3.0
-AGREED = 0.8  # phase collinearity below which points do not swing together
+AGREED = 0.8  # phase collinearity below which points do not move in phase
 
 
 @dataclass(frozen=True)
-class ModesTold:
-    """What is to be said.
+class IdentificationReport:
+    """A report.
 
     Attributes:
-        heading: of what.
+        heading: what was identified.
         rows: one a mode, under `HEADINGS`; figures to the second digit of their standard errors.
-        lines: all else.
+        lines: remarks.
         content: for JSON.
     """
 
@@ -41,21 +39,21 @@ class ModesTold:
     content: dict
 
 
-def told_of(
+def identification_report(
     measured: Sequence[Record | TransferFunctions],
     *,
     start: float | None = None,
     n_modes: int | None = None,
     ambient: bool = False,
     band_hz: tuple[float, float] | None = None,
-) -> ModesTold:
+) -> IdentificationReport:
     """The modes of transfer functions, or of records: driven where inputs move, by unknown forces with `ambient`, else
     free decays.
 
     Args:
         measured: records of the same sensors at one rate; or transfer functions, alone.
         start: read from then on, s.
-        n_modes: as many as are to be found; in driven records and transfer functions, at most.
+        n_modes: number of modes; in driven records and transfer functions, at most.
         ambient: whether unknown broadband forces drive the record all along.
         band_hz: lowest and highest line to fit, of transfer functions.
 
@@ -82,7 +80,7 @@ def told_of(
     if start is not None:
         records = [record.between(start) for record in records]
     for record in records:
-        check_fit(record)
+        check_data_quality(record)
     if not ambient:
         most = MOST_MODES if n_modes is None else n_modes
         return of_driven(identify_driven(records, most_modes=most), records)
@@ -94,23 +92,23 @@ def told_of(
     return of_ambient(identify_ambient(records[0], n_modes=n_modes), records[0])
 
 
-def of_ring_down(told: RingDown) -> ModesTold:
+def of_ring_down(decay: RingDown) -> IdentificationReport:
     """Free decays."""
-    found = told.refined
-    lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(told.remarks) if remark]
-    lines += [*told.notes, *_proportional(told.proportional)]
-    said, by_amplitude = _by_amplitude(told)
-    lines += said
-    if told.noise_modes.n_modes:
-        refused = ", ".join(f"{f:.4g}" for f in told.noise_modes.frequencies_hz)
-        lines.append(f"tried and refused, as noise or parts of a mode found: {refused} Hz")
+    found = decay.refined
+    lines = [f"mode {r + 1}: {remark}" for r, remark in enumerate(decay.remarks) if remark]
+    lines += [*decay.notes, *_proportional(decay.proportional)]
+    more, by_amplitude = _by_amplitude(decay)
+    lines += more
+    if decay.noise_modes.n_modes:
+        rejected = ", ".join(f"{f:.4g}" for f in decay.noise_modes.frequencies_hz)
+        lines.append(f"rejected as noise or as parts of another mode: {rejected} Hz")
     if not found.converged:
-        lines.append("the refinement did not settle: ask for other --modes, or a later --start")
-    damping = told.proportional
+        lines.append("the refinement did not converge: try other --modes, or a later --start")
+    damping = decay.proportional
     content = {
-        **_content(told.records[0].output_channels, found),
-        "start": [record.start_time for record in told.records],
-        "remarks": told.remarks,
+        **_content(decay.records[0].output_channels, found),
+        "start": [record.start_time for record in decay.records],
+        "remarks": decay.remarks,
         "depends_on_amplitude": by_amplitude,
         "proportional_damping": None if damping is None else {
             "g1": damping.damping.g1,
@@ -119,17 +117,17 @@ def of_ring_down(told: RingDown) -> ModesTold:
             "left_over": damping.left_over,
             "probability": damping.probability,
         },
-        "noise_modes_hz": told.noise_modes.frequencies_hz,
+        "noise_modes_hz": decay.noise_modes.frequencies_hz,
         "noise_std": found.noise_std,
-        "notes": told.notes,
+        "notes": decay.notes,
         "converged": found.converged,
     }  # fmt: skip
-    return _told(told.records, found, lines, content)
+    return _report(decay.records, found, lines, content)
 
 
-def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
+def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     """Records with their inputs."""
-    lines = [] if found.converged else ["the search did not settle: ask for other --modes"]
+    lines = [] if found.converged else ["the search did not converge: try other --modes"]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
         **_content(records[0].output_channels, found),
@@ -138,39 +136,39 @@ def of_driven(found: Driven, records: Sequence[Record]) -> ModesTold:
         "noise_std": found.noise_std,
         "converged": found.converged,
     }
-    return _told(records, found, lines, content)
+    return _report(records, found, lines, content)
 
 
-def of_ambient(found: AmbientModes, record: Record) -> ModesTold:
+def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
     """A record under unknown broadband forces."""
     lines = ["modes and standard errors by the likelihood of the spectrum"]
-    return _told([record], found, lines, _content(record.output_channels, found))
+    return _report([record], found, lines, _content(record.output_channels, found))
 
 
-def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
+def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
     """Transfer functions."""
-    lines = [] if found.converged else ["the search did not settle: ask for other --modes, or a narrower --band-hz"]
+    lines = [] if found.converged else ["the search did not converge: try other --modes, or a narrower --band-hz"]
     broad = np.flatnonzero(found.modes.zeta > BROAD)
     if broad.size:
-        lines.append(
-            f"modes {', '.join(str(r + 1) for r in broad)}: too broad to ring; what no mode explains may look like that"
-        )
+        which = ", ".join(str(r + 1) for r in broad)
+        lines.append(f"modes {which}: too damped for modes; what the model does not explain may look like that")
     at, apart = found.modes.frequencies_hz, found.modes.phase_collinearity < AGREED
     doubtful = np.zeros(at.size, bool)
     for low, high in found.full_hz:
         here = (at >= low) & (at <= high)
         doubtful |= here & apart
         lines.append(
-            f"between {low:.6g} and {high:.6g} Hz the search stopped at its limit of modes, what is left is no noise:"
-            f" of {here.sum()} modes there {(here & apart).sum()} are not told, their points do not swing together;"
-            " points measured one after another, or on a structure that changes, disagree like that: leave that band"
-            " out by --band-hz, or take more --modes"
+            f"between {low:.6g} and {high:.6g} Hz the search stopped at its limit of modes, the residual is not noise:"
+            f" of {here.sum()} modes there {(here & apart).sum()} are not reported, their points do not move in phase;"
+            " points measured one after another, or on a structure that changes, are inconsistent like that: leave that"
+            " band out by --band-hz, or take more --modes"
         )
     for r, parts in enumerate(found.parts_hz):
         if parts:
+            others = ", ".join(f"{f:.4g}" for f in parts)
             lines.append(
-                f"mode {r + 1} stands for a crowd, others at {', '.join(f'{f:.4g}' for f in parts)} Hz: points measured"
-                " one after another disagree there, or it depends on amplitude; modes closer than that are not told"
+                f"mode {r + 1} is a cluster, its other members at {others} Hz: points measured one after another are"
+                " inconsistent there, or it drifts or depends on amplitude; closer modes are not resolved"
             )
     doubt = SURE * found.omega_std / TURN + float(np.diff(found.frequencies_hz).min())
     hums = np.zeros(at.size, bool)
@@ -181,8 +179,8 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
     uneasy = np.flatnonzero(apart & ~doubtful & ~hums)
     if uneasy.size:
         lines.append(
-            f"modes {', '.join(str(r + 1) for r in uneasy)}: their points do not swing together; either damping couples"
-            " close modes, or points measured one after another disagree and these are parts of fewer modes"
+            f"modes {', '.join(str(r + 1) for r in uneasy)}: their points do not move in phase; either damping couples"
+            " close modes, or points measured one after another are inconsistent and these are parts of fewer modes"
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.positions.size, len(measured.references)
@@ -199,30 +197,24 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> ModesTold:
         "full_hz": found.full_hz,
         "converged": found.converged,
     }
-    rows = [row for row, doubt in zip(_rows(found.modes, found.omega_std, found.zeta_std), doubtful) if not doubt]
-    return ModesTold(heading, tuple(rows), tuple(lines), content)
+    rows = [row for row, doubt in zip(rows_of(found), doubtful) if not doubt]
+    return IdentificationReport(heading, tuple(rows), tuple(lines), content)
 
 
-def _told(records: Sequence[Record], found, lines: Sequence[str], content: dict) -> ModesTold:
+def _report(
+    records: Sequence[Record], found: ModalEstimates, lines: Sequence[str], content: dict
+) -> IdentificationReport:
     first = records[0]
     samples = sum(record.n_samples for record in records)
     of = f" in {len(records)} records" if len(records) > 1 else ""
     sensors = _counted(first.n_outputs, "sensor")
     since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
     heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
-    return ModesTold(heading, tuple(_rows(found.modes, found.omega_std, found.zeta_std)), tuple(lines), content)
+    return IdentificationReport(heading, tuple(rows_of(found)), tuple(lines), content)
 
 
 def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number > 1)}"
-
-
-def _rows(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray):
-    straight = modes.phase_collinearity
-    for r in range(modes.n_modes):
-        frequency = _to_its_error(modes.frequencies_hz[r], omega_std[r] / TURN)
-        damping = _to_its_error(100 * modes.zeta[r], 100 * zeta_std[r])
-        yield str(r + 1), *frequency, *damping, f"{straight[r]:.4f}"
 
 
 def _content(channels: Sequence[Channel], found) -> dict:
@@ -244,39 +236,29 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
     if fit is None or fit.left_over.size < 3:
         return []
     if fit.probability < UNLIKELY:
-        worst = int(np.abs(fit.left_over).argmax())
-        return [
-            f"damping is not proportional: g1 and g2 miss it by up to {abs(fit.left_over[worst]):.2g} standard errors"
-        ]
+        worst = float(np.abs(fit.left_over).max())
+        return [f"damping is not proportional: it deviates from g1 and g2 by up to {worst:.2g} standard errors"]
     (g1, g1_std), (g2, g2_std) = (
-        _to_its_error(value, error)
+        rounded(value, error)
         for value, error in zip((fit.damping.g1, fit.damping.g2), fit.standard_errors, strict=True)
     )
     return [f"damping may be proportional: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
 
 
-def _by_amplitude(told: RingDown) -> tuple[list[str], dict]:
-    """The modes that depend on amplitude, stretch by stretch."""
-    stretches, lines, content = told.by_amplitude, [], {}
-    for r in np.flatnonzero(stretches.depends):
-        seen = np.flatnonzero(np.isfinite(stretches.omega[:, r]))
-        at = [(stretches.amplitude[w, r], stretches.omega[w, r] / TURN, stretches.zeta[w, r]) for w in seen]
+def _by_amplitude(decay: RingDown) -> tuple[list[str], dict]:
+    """The modes that depend on amplitude, segment by segment."""
+    segments, lines, content = decay.by_amplitude, [], {}
+    for r in np.flatnonzero(segments.depends):
+        seen = np.flatnonzero(np.isfinite(segments.omega[:, r]))
+        at = [(segments.amplitude[w, r], segments.omega[w, r] / TURN, segments.zeta[w, r]) for w in seen]
         shown = "; ".join(f"{f:.5g} Hz, {100 * zeta:.3g} % at {size:.3g}" for size, f, zeta in at)
         lines.append(f"mode {r + 1} depends on amplitude: {shown}")
         content[str(r + 1)] = {
-            "record": stretches.record[seen],
-            "amplitude": stretches.amplitude[seen, r],
-            "frequencies_hz": stretches.omega[seen, r] / TURN,
-            "frequencies_std_hz": stretches.omega_std[seen, r] / TURN,
-            "damping_ratios": stretches.zeta[seen, r],
-            "damping_std": stretches.zeta_std[seen, r],
+            "record": segments.record[seen],
+            "amplitude": segments.amplitude[seen, r],
+            "frequencies_hz": segments.omega[seen, r] / TURN,
+            "frequencies_std_hz": segments.omega_std[seen, r] / TURN,
+            "damping_ratios": segments.zeta[seen, r],
+            "damping_std": segments.zeta_std[seen, r],
         }
     return lines, content
-
-
-def _to_its_error(value: float, error: float) -> tuple[str, str]:
-    """A figure and its standard error, both to the second digit of the error."""
-    if not (math.isfinite(error) and error > 1e-9 * abs(value)):
-        return f"{value:.10g}", f"{error:.1g}"
-    digits = max(0, 1 - math.floor(math.log10(error)))
-    return f"{value:.{digits}f}", f"{error:.{digits}f}"

@@ -8,10 +8,11 @@ from scipy.signal import lfilter
 from scipy.stats import chi2
 
 from workbench.identification.driven import identify_driven
-from workbench.identification.free_decay.coloured_noise import in_its_noise, noise_near
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.refined import in_coloured_noise
 from workbench.identification.free_decay.refinement import refine
+from workbench.identification.signal.noise import noise_near
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -33,7 +34,7 @@ def shares_inside(denominator):
         noise = lfilter([1.0], denominator, rng.standard_normal((2, 1400)), axis=1)[:, 200:]
         record = replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std())
         white = refine(record, MODES, offset=True)
-        for found, kept in zip((white, in_its_noise(white, record)), inside, strict=True):
+        for found, kept in zip((white, in_coloured_noise(white, record)), inside, strict=True):
             (low, high), (low_zeta, high_zeta) = found.interval()
             own = (found.modes.shapes / found.modes.shapes[REFERENCE, each]).real
             kept.append(
@@ -62,7 +63,7 @@ def test_white_noise_keeps_the_bound():
         rng = np.random.default_rng(seed)
         record = replace(CLEAN, outputs=CLEAN.outputs + 0.02 * rng.standard_normal((2, 1200)))
         found = refine(record, MODES, offset=True)
-        kept.append(in_its_noise(found, [record]) is found)
+        kept.append(in_coloured_noise(found, [record]) is found)
     assert all(kept)
 
 

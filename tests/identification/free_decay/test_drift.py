@@ -5,7 +5,7 @@ import pytest
 
 from workbench.identification.free_decay.drift import without_drift
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound
+from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.free_decay.remarks import remarks
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.modes import SampledModes
@@ -24,7 +24,7 @@ def test_relaxing_sensor_is_put_right_without_harm_to_the_modes():
     assert found.size[0] == pytest.approx(np.ptp(drift[0]), rel=0.02) and found.size[1] < 0.1
     modes = identify(found.record).modes
     error = np.abs(modes.poles - MODES.poles)
-    assert (error < 4.0 * bound(MODES, sound, noise_std=0.01).omega_std).all()
+    assert (error < 4.0 * cramer_rao_bound(MODES, sound, noise_std=0.01).omega_std).all()
 
 
 def test_what_does_not_drift_is_left_alone():

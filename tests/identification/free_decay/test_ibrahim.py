@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.ibrahim import stacked_delays, two_delays
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.member import Bar
 from workbench.structure.modes import SampledModes, mac
@@ -22,7 +22,7 @@ def bar_modes():
 
 
 def ring_down(modes, m, **options):
-    return free_decay(struck(modes, at=0.63, positions=np.arange(1, m + 1) / m), **options)
+    return free_decay(impulse_response_modes(modes, at=0.63, positions=np.arange(1, m + 1) / m), **options)
 
 
 def test_decay_agrees_with_control(bar_modes):
@@ -36,7 +36,7 @@ def test_decay_agrees_with_control(bar_modes):
     plant = state_space(bar_modes, [Actuator("F", 0.63)], [Sensor("a", 0.5), Sensor("b", 1.0, "velocity")])
     time = 0.01 * np.arange(200)
     reference = control.impulse_response(plant, time).outputs[:, 0]
-    decay = struck(bar_modes, at=0.63, positions=[0.5, 1.0])
+    decay = impulse_response_modes(bar_modes, at=0.63, positions=[0.5, 1.0])
     displacement = free_decay(decay, sample_time=0.01, n_samples=200).outputs[0]
     velocity = free_decay(decay, sample_time=0.01, n_samples=200, quantity="velocity").outputs[1]
     assert np.abs(displacement - reference[0]).max() < 1e-9 * np.abs(reference[0]).max()

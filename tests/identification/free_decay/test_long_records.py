@@ -7,7 +7,7 @@ from scipy.signal import lfilter
 from workbench.identification.free_decay import order
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound
+from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -32,7 +32,7 @@ def record(truth):
 
 
 def test_the_modes_that_are_there_and_no_others_at_the_bound(truth, record):
-    found, limit = identify_long([record], most_modes=99), bound(truth, record, noise_std=1e-4)
+    found, limit = identify_long([record], most_modes=99), cramer_rao_bound(truth, record, noise_std=1e-4)
     assert found.modes.n_modes == truth.n_modes
     assert (np.abs(found.modes.omega - truth.omega) < 4 * limit.omega_std).all()
     assert (np.abs(found.modes.zeta - truth.zeta) < 4 * limit.zeta_std).all()
@@ -99,6 +99,6 @@ def test_noise_that_is_not_white_holds_no_modes(truth, record):
 def test_a_mode_at_half_the_sample_rate_keeps_no_other_from_being_fitted():
     truth = modes([0.1, 0.1003, 0.2, 0.3, 0.49995], [0.002, 0.002, 0.004, 0.001, 0.01], 6)
     record = free_decay(truth, sample_time=1.0, n_samples=5000, noise_std=0.01, seed=1)
-    found, limit = identify_long([record], most_modes=99).modes, bound(truth, record, noise_std=0.01)
+    found, limit = identify_long([record], most_modes=99).modes, cramer_rao_bound(truth, record, noise_std=0.01)
     assert found.n_modes == 5
     assert (np.abs(found.omega - truth.omega)[:4] < 4 * limit.omega_std[:4]).all()

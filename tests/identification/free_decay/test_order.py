@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound, refine
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.member import Bar
@@ -27,7 +27,7 @@ def test_the_modes_that_are_there_and_no_others(truth, noise):
     record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=noise, seed=1)
     found = identify(record)
     assert found.modes.n_modes == 5
-    std = bound(truth, record, noise_std=noise or 1e-9).omega_std
+    std = cramer_rao_bound(truth, record, noise_std=noise or 1e-9).omega_std
     assert (np.abs(found.modes.omega - truth.omega) < 4 * std).all()
     assert (found.evidence > found.limit).all()
 
@@ -37,7 +37,7 @@ def test_without_noise_every_mode_comes_in_and_nothing_else_is_tried():
     bar = Bar(length=1.0, mass_per_length=taper, axial_stiffness=taper, left="fixed", right="free",
               damping=ProportionalDamping(g1=0.002, g2=0.1))  # fmt: skip
     exact = bar.modes(20)
-    decay = struck(exact, at=0.63, positions=np.arange(1, 7) / 6)
+    decay = impulse_response_modes(exact, at=0.63, positions=np.arange(1, 7) / 6)
     found = identify(free_decay(decay, sample_time=0.01, n_samples=1500, quantity="acceleration"))
     assert np.abs(found.modes.omega / exact.omega - 1.0).max() < 1e-11
     assert found.noise_modes.n_modes == 0
@@ -57,7 +57,7 @@ def test_noise_alone_is_refused():
 
 def test_bound_is_what_refinement_reports(truth):
     record = free_decay(truth, sample_time=0.01, n_samples=800, noise_std=1e-4, seed=2)
-    known = bound(truth, record, noise_std=1e-4)
+    known = cramer_rao_bound(truth, record, noise_std=1e-4)
     assert np.allclose(refine(record, truth).omega_std, known.omega_std, rtol=0.1)
 
 
@@ -87,6 +87,6 @@ def test_crowded_modes_at_two_sensors_are_two():
     truth = SampledModes(2 * np.pi * np.array([4.0, 4.08, 9.0]), [0.012, 0.014, 0.015], shapes, [0.0, 1.0])
     assert 0.95 < mac(truth.shapes, truth.shapes)[0, 1] < 0.99
     record = free_decay(truth, sample_time=0.02, n_samples=1000, noise_std=0.002, seed=0)
-    found, limit = identify(record).modes, bound(truth, record, noise_std=0.002)
+    found, limit = identify(record).modes, cramer_rao_bound(truth, record, noise_std=0.002)
     assert found.n_modes == 3
     assert (np.abs(found.omega - truth.omega) < 4 * limit.omega_std).all()

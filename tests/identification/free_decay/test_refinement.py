@@ -3,8 +3,8 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from workbench.identification.free_decay.ibrahim import stacked_delays
-from workbench.identification.free_decay.refinement import amplitudes, refine
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.free_decay.refinement import modal_amplitudes, refine
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
 
@@ -136,9 +136,9 @@ def test_amplitudes_at_the_blow():
     from dataclasses import replace
 
     modes = replace(modes, damping=np.full(3, 0.01))
-    decay = struck(modes, at=0.63, positions=[0.3, 0.9, 1.4])
+    decay = impulse_response_modes(modes, at=0.63, positions=[0.3, 0.9, 1.4])
     record = free_decay(decay, sample_time=0.02, n_samples=600, quantity="acceleration", start_time=0.7)
-    found = amplitudes(record, stacked_delays(record, n_modes=3))
+    found = modal_amplitudes(record, stacked_delays(record, n_modes=3))
     assert np.allclose(found.shapes, decay.shapes, rtol=1e-7, atol=1e-9)
 
 

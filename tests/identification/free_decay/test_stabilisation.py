@@ -1,7 +1,7 @@
 import numpy as np
 
-from workbench.identification.free_decay.stabilisation import real_modes, stabilise
-from workbench.identification.shapes.mode_pairing import tell_apart
+from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
+from workbench.identification.shapes.mode_pairing import pair_modes
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
@@ -14,7 +14,7 @@ def test_real_modes_stay_and_noise_does_not():
     clean = free_decay(truth, sample_time=0.008, n_samples=800)
     noise = 0.03 * np.sqrt((clean.outputs**2).mean())
     record = free_decay(truth, sample_time=0.008, n_samples=800, noise_std=noise, seed=1)
-    found = real_modes(stabilise(record, orders=range(3, 16), delays=60))
+    found = stable_modes(stabilise(record, orders=range(3, 16), delays=60))
     assert found.modes.n_modes == 4
     assert np.abs(found.modes.omega / truth.omega - 1).max() < 5e-3
     assert (found.presence > 0.9).sum() >= 3
@@ -25,8 +25,8 @@ def test_travelling_shapes_are_not_counted():
     shapes = np.array([[1.0, 1.0], [0.5, 1j], [-0.2, -1.0], [0.7, -1j]])
     truth = SampledModes([10.0, 17.0], [0.01, 0.01], shapes, np.linspace(0, 1, 4))
     diagram = stabilise(free_decay(truth, sample_time=0.05, n_samples=400), orders=[2], delays=40)
-    assert np.allclose(real_modes(diagram).modes.omega, [10.0])
-    assert real_modes(diagram, standing=0.0).modes.n_modes == 2
+    assert np.allclose(stable_modes(diagram).modes.omega, [10.0])
+    assert stable_modes(diagram, standing=0.0).modes.n_modes == 2
 
 
 def test_each_measured_mode_is_at_most_one_of_the_model():
@@ -45,7 +45,7 @@ def test_each_measured_mode_is_at_most_one_of_the_model():
         np.column_stack([np.linspace(-1, 1, 10), shapes[:, order], twin, stranger]),
         positions,
     )
-    told = tell_apart(measured, model)
+    told = pair_modes(measured, model)
     assert list(told.matched) == [1, 2, 3]
     assert list(told.model) == [0, 1, 2]
     assert list(told.others) == [0, 4, 5]

@@ -6,7 +6,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.signal import lfilter
 
 from workbench.identification.driven import identify_driven
-from workbench.identification.input_output.noise_spectrum import course, lines_of, samples_of
+from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.records.record import Channel, Record
 
 DT, OUTPUTS, INPUTS = 0.01, 3, 2
@@ -39,11 +39,13 @@ def driven(rng, omega, zeta, *, tails, kind="noise", n=1200, level=0.02, draw=No
     """Velocities under known forces that are held, from a state that is not told, in noise of a tail an output."""
     poles = omega * (-zeta + 1j * np.sqrt(1.0 - zeta**2))
     seen = rng.standard_normal((OUTPUTS, omega.size)) * omega
-    loads, u = rng.standard_normal((omega.size, INPUTS)), excitation(rng, kind, n)
+    participation, u = rng.standard_normal((omega.size, INPUTS)), excitation(rng, kind, n)
     mu = np.exp(poles * DT)
-    swings = [lfilter([0.0, (m - 1.0) / p], [1.0, -m], f + 0j) for m, p, f in zip(mu, poles, loads @ u, strict=True)]
+    modal_responses = [
+        lfilter([0.0, (m - 1.0) / p], [1.0, -m], f + 0j) for m, p, f in zip(mu, poles, participation @ u, strict=True)
+    ]
     begun = 0.05 * rng.standard_normal((omega.size, 1)) * mu[:, None] ** np.arange(n)
-    y = (seen @ (np.array(swings) + begun)).real + 0.1 * rng.standard_normal((OUTPUTS, INPUTS)) @ u
+    y = (seen @ (np.array(modal_responses) + begun)).real + 0.1 * rng.standard_normal((OUTPUTS, INPUTS)) @ u
     noisy = rng if draw is None else np.random.default_rng([draw, 1])
     noise = np.vstack([tailed(noisy, tail, n, 1) for tail in tails])
     y = y + level * y.std(axis=1, keepdims=True) * noise
@@ -65,15 +67,15 @@ def test_the_course_of_noise_is_its_spectrum():
     rng = np.random.default_rng(0)
     left = [size * np.vstack([tailed(rng, 0.95, n, 1), tailed(rng, 0.0, n, 1)]).T for size, n in ((1, 4000), (3, 2000))]
     taken = [np.zeros(each.shape) for each in left]
-    sizes = course(left, [1e3 * each for each in left], taken, 0, np.array([4000.0, 2000.0]))
-    for loud, each in zip((1.0, 3.0), sizes, strict=True):
+    line_std = noise_spectrum(left, [1e3 * each for each in left], taken, 0, np.array([4000.0, 2000.0]))
+    for loud, each in zip((1.0, 3.0), line_std, strict=True):
         omega = np.pi / len(each) * np.arange(len(each))
         exact = loud**2 * (1.0 - 0.95**2) / np.abs(1.0 - 0.95 * np.exp(-1j * omega)) ** 2 / (22.0 / 6.0)
         # Of variance as of an autoregression: 2 p / n at each frequency, and more at the corner.
         assert np.abs(np.log(each[:, 0] ** 2 / exact)).max() < 0.2
         assert np.ptp(each[:, 1]) == 0.0
     white = tailed(rng, 0.0, 1000).T
-    assert course([white], [1e3 * white], [0.0 * white], 0, np.array([1000.0])) is None
+    assert noise_spectrum([white], [1e3 * white], [0.0 * white], 0, np.array([1000.0])) is None
 
 
 def test_lines_of_steep_noise_are_independent_and_as_large_as_told():

@@ -7,7 +7,7 @@ from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.bands import eigenfunction_bands
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 from workbench.structure.supports import End, PointMass
@@ -24,7 +24,7 @@ def beam():
 
 
 def refined(beam, seed, level=0.02):
-    decay = struck(beam, at=0.63, positions=np.linspace(0.2, 1.8, 8))
+    decay = impulse_response_modes(beam, at=0.63, positions=np.linspace(0.2, 1.8, 8))
     clean = free_decay(decay, sample_time=0.05, n_samples=300)
     noise = level * np.sqrt((clean.outputs**2).mean())
     record = free_decay(decay, sample_time=0.05, n_samples=300, noise_std=noise, seed=seed)
@@ -48,7 +48,7 @@ def test_bands_hold_the_true_curve_as_often_as_they_say(beam):
         error = np.abs(sign * bands.phi - truth)[1:-1] / bands.std[1:-1]
         inside.append(error < 1.96)
         whole.append((error < bands.width).all(axis=0))
-        foretold.append(bands.missed.max(axis=0) == 0)
+        foretold.append(bands.interpolation_std.max(axis=0) == 0)
     assert np.mean(foretold) > 0.9  # a smooth beam and sensors enough: nothing is said to be missed
     # 200 curves: a share of 0.95 strays by 0.015 (one sigma); points of a curve go together
     assert 0.92 < np.mean(inside) < 0.98
@@ -64,14 +64,14 @@ def test_bands_hold_what_a_spline_misses_of_springs_and_a_mass():
     )  # fmt: skip
     modes = structure.modes(6)
     truth, inside = modes.phi(X), []
-    decay = struck(modes, at=0.77, positions=np.linspace(0.05, 1.95, 10))
+    decay = impulse_response_modes(modes, at=0.77, positions=np.linspace(0.05, 1.95, 10))
     window = {"sample_time": 0.4 / modes.frequencies_hz[-1], "n_samples": 600, "quantity": "acceleration"}
     level = np.sqrt((free_decay(decay, **window).outputs ** 2).mean())
     for seed in range(5):
         found = refine(free_decay(decay, noise_std=0.01 * level, seed=seed, **window), decay)
         bands = eigenfunction_bands(found, X, length=LENGTH, mass_per_length=1.5, point_masses=[part])
         error = np.abs(bands.phi * np.sign((bands.phi * truth).sum(axis=0)) - truth)
-        noise = np.sqrt(bands.std**2 - bands.missed**2)
+        noise = np.sqrt(bands.std**2 - bands.interpolation_std**2)
         inside.append([(error < 1.96 * told).mean(axis=0) for told in (bands.std, noise)])
     share, by_noise = np.mean(inside, axis=0)
     assert share.min() > 0.8 and share.mean() > 0.9

@@ -40,7 +40,7 @@ def test_an_end_told_wrongly_is_refused_and_one_told_rightly_is_not(left, level)
     found = refined(left, level=level, seed=0)
     check_ends(found, told(left), length=LENGTH)
     for other in set(ENDS) - {left}:
-        with pytest.raises(ValueError, match="the left end is told to hold"):
+        with pytest.raises(ValueError, match="the left end is stated to have zero"):
             check_ends(found, told(other), length=LENGTH)
 
 
@@ -52,7 +52,7 @@ def test_the_refusal_says_what_the_shapes_say_instead():
     slope, std = map(float, re.search(r"mode 1 has a slope of (\S+) ± (\S+) there", str(refusal.value)).groups())
     assert abs(slope - np.pi) < 3.0 * std < 1.0
     assert "leave it untold" in str(refusal.value)
-    with pytest.raises(ValueError, match="the right end is told to hold value and slope"):
+    with pytest.raises(ValueError, match="the right end is stated to have zero value and slope"):
         check_ends(found, KnownEnds.of("beam", length=LENGTH, right="clamped"), length=LENGTH)
 
 

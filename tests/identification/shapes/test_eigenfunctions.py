@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from workbench.identification.shapes.eigenfunctions import KnownEnds, best_degrees, eigenfunctions, interpolating_spline
-from workbench.identification.shapes.interpolation_error import missed_kernel
-from workbench.identification.signal.synthesis import struck
+from workbench.identification.shapes.interpolation_error import peano_kernel
+from workbench.identification.signal.synthesis import impulse_response_modes
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 from workbench.structure.supports import PointMass
@@ -67,7 +67,9 @@ def test_scaled_by_a_blow_without_knowing_the_mass():
     modes = elastic("beam", "clamped", "free", 4)
     positions = np.linspace(0.1, 2.0, 20)
     ends = KnownEnds.of("beam", length=2.0, left="clamped", right="free")
-    found = eigenfunctions(struck(modes, at=1.63, positions=positions), length=2.0, driven_at=1.63, ends=ends)
+    found = eigenfunctions(
+        impulse_response_modes(modes, at=1.63, positions=positions), length=2.0, driven_at=1.63, ends=ends
+    )
     assert np.abs(np.abs(found.phi(X)) - np.abs(modes.phi(X))).max() < 1e-4
     assert found.essential == modes.essential
 
@@ -102,7 +104,7 @@ def test_what_a_spline_misses_by_its_peano_kernel(derivative, right):
 
     held = np.array([float(sine(at, d)) for at, d in spline.conditions])
     drawn = spline.matrix(x, derivative) @ sine(positions, 0) + spline.of_held(x, derivative) @ held
-    kernel = missed_kernel(spline, x, positions, 2.0, derivative)
+    kernel = peano_kernel(spline, x, positions, 2.0, derivative)
     u = (np.arange(kernel.shape[1]) + 0.5) * 2.0 / kernel.shape[1]
     missed = kernel @ sine(u, 4) * np.sqrt(2.0 / u.size)
     assert np.abs(missed - (sine(x, derivative) - drawn)).max() < 0.02 * np.abs(missed).max()
@@ -133,6 +135,6 @@ def test_refusals():
     with pytest.raises(ValueError, match="no known end"):
         KnownEnds.of("bar", length=1.0, left="clamped")
     hinged = elastic("beam", "hinged", "hinged", 2)
-    blow_at_node = struck(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
+    blow_at_node = impulse_response_modes(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
     with pytest.raises(ValueError, match="hardly drives mode 2"):
         eigenfunctions(blow_at_node, length=2.0, driven_at=1.0, degree=5)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.order import identify
-from workbench.identification.signal.data_quality import ailments, check_fit
+from workbench.identification.signal.data_quality import check_data_quality, data_faults
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -29,18 +29,18 @@ def with_row(record, j, row):
 
 
 def only(record):
-    [found] = ailments(record)
+    [found] = data_faults(record)
     return found
 
 
 def test_a_sound_record_has_none(sound):
-    assert ailments(sound) == ()
-    check_fit(sound)
+    assert data_faults(sound) == ()
+    check_data_quality(sound)
 
 
 def test_single_mode_without_noise_is_no_copy():
     modes = SampledModes([19.0], [0.01], [[1.0], [0.5], [-0.7]], np.linspace(0, 1, 3))
-    assert ailments(free_decay(modes, sample_time=0.01, n_samples=800)) == ()
+    assert data_faults(free_decay(modes, sample_time=0.01, n_samples=800)) == ()
 
 
 @pytest.mark.parametrize("steps", [2, 5, 30, 300])
@@ -49,7 +49,7 @@ def test_single_mode_without_noise_is_no_copy():
 def test_rounding_is_neither_clipping_nor_another_rate(steps, omega, zeta):
     modes = SampledModes([omega], [zeta], [[float(steps)]], [0.0])
     clean = free_decay(modes, sample_time=0.01, n_samples=4000)
-    assert ailments(replace(clean, outputs=np.round(clean.outputs))) == ()
+    assert data_faults(replace(clean, outputs=np.round(clean.outputs))) == ()
 
 
 def test_dead_sensor(sound):
@@ -80,7 +80,7 @@ def test_sensor_of_another_rate(sound):
     held = only(with_row(sound, 0, np.repeat(slow, 4)))
     joined = only(with_row(sound, 0, np.interp(time, time[::4], slow)))
     for found in (held, joined):
-        assert (found.kind, found.outputs) == ("slower", ("y1",)) and "sampled at 25 Hz" in found.message
+        assert (found.kind, found.outputs) == ("upsampled", ("y1",)) and "sampled at 25 Hz" in found.message
     assert "held" in held.message and "straight lines" in joined.message
 
 
@@ -96,4 +96,4 @@ def test_measured_arm_ails_in_nothing():
         pytest.skip(f"measured records are not at {ARM}")
     for path in sorted(ARM.glob("*.txt")):
         table = np.loadtxt(path)
-        assert ailments(Record(0.002, table[:, -1][None], (Channel("a"),))) == ()
+        assert data_faults(Record(0.002, table[:, -1][None], (Channel("a"),))) == ()

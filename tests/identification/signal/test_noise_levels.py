@@ -9,8 +9,8 @@ from scipy.stats import bartlett, chi2
 from workbench.identification.driven import identify_driven
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import bound, refine
-from workbench.identification.signal.noise_levels import differ, variances
+from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
+from workbench.identification.signal.noise import differ, variances
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -34,7 +34,7 @@ def records(seed, n=(400, 500), noise=NOISE):
 def least():
     """Standard errors of ω and ζ that none can be below."""
     told = [
-        np.linalg.inv(bound(replace(MODES, shapes=SHAPES * struck), record, noise_std=std).covariance)
+        np.linalg.inv(cramer_rao_bound(replace(MODES, shapes=SHAPES * struck), record, noise_std=std).covariance)
         for struck, record, std in zip(STRUCK, records(0), NOISE, strict=True)
     ]
     return np.sqrt(np.diag(np.linalg.inv(sum(told))))

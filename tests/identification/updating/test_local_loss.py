@@ -7,7 +7,7 @@ from skfem.helpers import dd, ddot, dot, grad
 from workbench.identification.free_decay.order import identify
 from workbench.identification.signal.synthesis import free_decay
 from workbench.identification.updating.distributions import Basis
-from workbench.identification.updating.local_loss import WIDTHS, find_loss, scan
+from workbench.identification.updating.local_loss import WIDTHS, locate_damage, scan
 from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import Task
@@ -55,7 +55,7 @@ def measured(kind, *, lost, centre):
 @pytest.mark.parametrize(("kind", "centre"), [("beam", 0.625), ("bar", 0.3)])
 def test_a_fifth_of_the_stiffness_lost_over_a_tenth_of_the_length_is_found(kind, centre):
     """Neither mass nor stiffness is known, but for the mass at one place."""
-    found = find_loss(
+    found = locate_damage(
         measured(kind, lost=0.2, centre=centre),
         NOMINAL[kind],
         known_mass=[(0.5, 1.0)],
@@ -73,7 +73,7 @@ def test_a_fifth_of_the_stiffness_lost_over_a_tenth_of_the_length_is_found(kind,
 
 @pytest.mark.parametrize("kind", ["beam", "bar"])
 def test_nothing_is_found_where_nothing_is_lost(kind):
-    found = find_loss(
+    found = locate_damage(
         measured(kind, lost=0.0, centre=0.5),
         NOMINAL[kind],
         known_mass=[(0.5, 1.0)],
@@ -108,7 +108,7 @@ def test_an_edge_that_passes_the_end_comes_back(beside_the_end):
 @pytest.mark.parametrize("centre", [0.92, 0.96])
 def test_what_of_a_loss_passes_the_end_is_not_told(centre, beside_the_end):
     modes = beside_the_end if centre == 0.92 else measured("beam", lost=0.2, centre=centre)
-    found = find_loss(modes, NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[2], stiffness_terms=[3])
+    found = locate_damage(modes, NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[2], stiffness_terms=[3])
     loss, truth = found.loss, LocalLoss(0.2, centre, 0.1).within(1.0)
     assert loss.centre + 0.5 * loss.width <= 1.0 + 1e-12
     low, high = found.interval().T
@@ -118,4 +118,4 @@ def test_what_of_a_loss_passes_the_end_is_not_told(centre, beside_the_end):
 
 def test_a_number_of_terms_must_be_given():
     with pytest.raises(ValueError, match="no number of terms was given"):
-        find_loss(measured("beam", lost=0.0, centre=0.5), NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[])
+        locate_damage(measured("beam", lost=0.0, centre=0.5), NOMINAL["beam"], known_mass=[(0.5, 1.0)], mass_terms=[])

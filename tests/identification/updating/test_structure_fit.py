@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from workbench.identification.free_decay.refinement import bound
+from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.ring_down import ring_down
-from workbench.identification.signal.synthesis import free_decay, struck
+from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.structure_fit import choose_structure, fit_structure
 from workbench.identification.updating.structure_task import GaussianPrior
@@ -37,9 +37,9 @@ def measured(kind, noise=1e-3):
     """Five elastic modes of the true structure, with the covariance that white noise in a record would leave."""
     rigid = 2 if kind == "free beam" else 0
     modes = structure(kind).modes(rigid + 5).select(slice(rigid, None))
-    decay = struck(replace(modes, damping=np.full(5, 0.005)), at=1.73, positions=SENSORS)
+    decay = impulse_response_modes(replace(modes, damping=np.full(5, 0.005)), at=1.73, positions=SENSORS)
     record = free_decay(decay, sample_time=1.0 / modes.omega[-1], n_samples=1500)
-    return bound(decay, record, noise_std=noise * float(np.sqrt((record.outputs**2).mean())))
+    return cramer_rao_bound(decay, record, noise_std=noise * float(np.sqrt((record.outputs**2).mean())))
 
 
 def redrawn(exact, seed):
@@ -159,7 +159,7 @@ def test_a_beam_on_springs_with_a_mass_from_its_ring_down():
     ends, parts = (End(3e4, 50.0), End(2e4)), (PointMass(at=1.3, mass=0.25),)
     truth = known(heavy, stiff, *ends, parts=parts).modes(6)
     window = {"sample_time": 0.4 / truth.frequencies_hz[-1], "n_samples": 1500, "quantity": "acceleration"}
-    decay = struck(truth, at=0.77, positions=np.linspace(0.05, 1.95, 10))
+    decay = impulse_response_modes(truth, at=0.77, positions=np.linspace(0.05, 1.95, 10))
     level = np.sqrt((free_decay(decay, **window).outputs ** 2).mean())
     told = ring_down(free_decay(decay, noise_std=0.01 * level, seed=1, **window))
     assert told.modes.n_modes == 6 and not any(told.remarks)

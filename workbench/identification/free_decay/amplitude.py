@@ -1,7 +1,7 @@
-"""Do frequency and damping depend on amplitude? The modes of one stretch of a decay after another.
+"""Amplitude dependence of frequency and damping: the modes of successive segments of a decay.
 
-Stretches double in length as the motion dies away. In each, the modes still there are refined by themselves; in a
-linear structure all stretches agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square.
+Segments double in length as the motion dies away. In each, the modes still there are refined by themselves; in a
+linear structure all segments agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.coloured_noise import in_its_noise
-from workbench.identification.free_decay.refinement import Refined, refine
+from workbench.identification.free_decay.refined import Refined, in_coloured_noise
+from workbench.identification.free_decay.refinement import refine
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
@@ -19,14 +19,14 @@ from workbench.threads import one_blas_thread
 STRETCHES = 4
 # Amplitude that a mode must have in a stretch, and cycles, for its frequency there to mean something.
 LEAST_EVIDENCE, LEAST_CYCLES = 100.0, 3.0
-# Relative standard error of a frequency up to which a stretch tells of it.
+# Relative standard error of a frequency up to which a segment counts.
 LEAST_SURE = 0.01
 SURE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class AmplitudeDependence:
-    """Each mode by amplitude; nan where a stretch does not tell of it.
+    """Each mode by amplitude; nan where a segment does not determine it.
 
     Attributes:
         record: (n_stretches,) which record each is of, from 0.
@@ -36,8 +36,8 @@ class AmplitudeDependence:
         omega_std: (n_stretches, n_modes) standard errors.
         zeta: (n_stretches, n_modes) damping ratios.
         zeta_std: (n_stretches, n_modes) standard errors.
-        probability: (2, n_modes) of frequencies, and of damping ratios, so far apart in a linear structure; 1 where
-            fewer than two stretches tell.
+        probability: (2, n_modes) of frequencies, and damping ratios, that differ so in a linear structure; 1 where
+            fewer than two segments determine it.
     """
 
     record: np.ndarray
@@ -73,9 +73,9 @@ def amplitude_dependence(
         raise ValueError(f"amplitudes are compared over two stretches or more; got {stretches}")
     records = [records] if isinstance(records, Record) else records
     each = zip(records, refined.amplitudes, refined.noise, strict=True)
-    told = [_stretches(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
-    start = np.concatenate([each[0] for each in told])
-    amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in told]))
+    values = [_segments(record, refined, np.abs(a), noise, stretches) for record, a, noise in each]
+    start = np.concatenate([each[0] for each in values])
+    amplitude, omega, omega_std, zeta, zeta_std = (frozen(rows) for rows in np.hstack([each[1] for each in values]))
     alike = np.stack([_alike(omega, omega_std), _alike(zeta, zeta_std)])
     which = np.repeat(np.arange(len(records)), stretches)
     return AmplitudeDependence(
@@ -83,7 +83,7 @@ def amplitude_dependence(
     )
 
 
-def _stretches(
+def _segments(
     record: Record, refined: Refined, size: np.ndarray, noise: np.ndarray, stretches: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Starts (n_stretches,), and (5, n_stretches, n_modes) of amplitude, ω and its error, ζ and its error."""
@@ -101,7 +101,7 @@ def _stretches(
             continue
         try:
             stretch = _samples(record, first, last)
-            found = in_its_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
+            found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
         except np.linalg.LinAlgError:
             continue
         if not found.converged:
@@ -109,9 +109,9 @@ def _stretches(
         sure = found.omega_std < LEAST_SURE * found.modes.omega
         sure &= found.modes.frequencies_hz * span > LEAST_CYCLES
         there = there[sure]
-        told = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
+        values = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
         figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))
-        figures[1:, w, there] = np.stack(told)[:, sure]
+        figures[1:, w, there] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
 
 

@@ -1,11 +1,11 @@
-"""One mode whose frequency and damping go with its amplitude: the other account of a beat that one sensor sees.
+"""One mode whose frequency and damping depend on amplitude: the alternative model of a beat in one sensor.
 
 Its envelope r and phase θ follow a backbone, smooth and one for each amplitude (Nayfeh & Mook 1979, 2.3),
 
     r' = -σ(r) r,   θ' = ω(r),   -σ + iω = Σ_k λ_k r^p_k,      y = Re A exp(Σ_k λ_k ∫ r^p_k dt),   r(0) = 1
 
 with powers p of 0, 1, 2 (stiffness and damping that rise or fall), 0, ½, 1 (joints that slip) or -1, 0, 1 (friction):
-eight numbers with A, as many as two linear modes have, so that the likelier account is the truer.
+eight parameters with A, as many as two linear modes have, so that the likelier model is preferred.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ POWERS = ((0.0, 1.0, 2.0), (0.0, 0.5, 1.0), (0.0, -1.0, 1.0))
 STEPS, FADED, DIED = 150, 7.0, 60.0
 MOST_TRIES = 40
 SLIGHTLY = 1e-5
-# A swing may not grow beyond this; what one that does is said to leave, over the record.
+# Beyond this a motion diverges; its residual is then taken for so many times the record.
 LARGEST, BEYOND = 1e100, 10.0
 
 
@@ -53,8 +53,8 @@ class _Backbone:
 
     def __init__(self, record: Record, powers: np.ndarray, others: np.ndarray, offset: bool) -> None:
         self.time, self.powers = record.sample_time * np.arange(record.n_samples), powers
-        swings = np.exp(np.outer(self.time, others))
-        columns = np.hstack([swings.real, swings.imag, np.ones((self.time.size, int(offset)))])
+        exponentials = np.exp(np.outer(self.time, others))
+        columns = np.hstack([exponentials.real, exponentials.imag, np.ones((self.time.size, int(offset)))])
         self.beside = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
         self.y = self._apart(record.outputs[0])
 
@@ -76,14 +76,14 @@ class _Backbone:
         step = SLIGHTLY * max(abs(real[0]), 1e-3 / self.time[-1])
         held, *moved = self._held(np.vstack([real, real + step * np.eye(3)]))
         with np.errstate(over="ignore", invalid="ignore"):
-            swing = np.exp(held @ (real + turn))
-            by_real = [(np.exp(h @ (r + turn)) - swing) / step for h, r in zip(moved, real + step * np.eye(3))]
+            motion = np.exp(held @ (real + turn))
+            by_real = [(np.exp(h @ (r + turn)) - motion) / step for h, r in zip(moved, real + step * np.eye(3))]
         if not (np.abs(by_real) < LARGEST).all():
             return BEYOND * np.abs(self.y), np.zeros((self.y.size, 6))
-        q, r = np.linalg.qr(self._apart(np.column_stack([swing.real, swing.imag])))
+        q, r = np.linalg.qr(self._apart(np.column_stack([motion.real, motion.imag])))
         seen = q.T @ self.y
         a, b = np.linalg.lstsq(r, seen, rcond=1e-12)[0]
-        slopes = np.column_stack([*by_real, 1j * swing[:, None] * held])
+        slopes = np.column_stack([*by_real, 1j * motion[:, None] * held])
         slopes = self._apart(slopes.real * a + slopes.imag * b)
         return self.y - q @ seen, -(slopes - q @ (q.T @ slopes))
 

@@ -1,4 +1,4 @@
-"""Slow drift taken out of a free decay without touching its modes."""
+"""Removal of slow drift from a free decay, its modes unchanged."""
 
 from dataclasses import dataclass, field, replace
 
@@ -15,7 +15,7 @@ HIGHEST_DEGREE = 8
 
 @dataclass(frozen=True, eq=False)
 class Drift:
-    """What moves more slowly than any mode.
+    """Drift slower than any mode.
 
     Attributes:
         record: without it; constants stay.
@@ -29,7 +29,7 @@ class Drift:
 def without_drift(record: Record, poles: np.ndarray) -> Drift:
     """A record less a polynomial in time, fitted beside its modes: y_j = Re Σ a_jr e^{λ_r t} + Σ_k p_jk P_k(t).
 
-    The degree is the least, of those that turn no faster than the slowest mode swings, by Schwarz's criterion; and
+    The degree is the least, of those that oscillate no faster than the slowest mode, by Schwarz's criterion; and
     nothing is taken where noise alone would show as much in one record of a thousand.
 
     Args:
@@ -43,12 +43,12 @@ def without_drift(record: Record, poles: np.ndarray) -> Drift:
     if highest < 1:
         return nothing
     decay = np.exp(np.outer(record.sample_time * np.arange(n), poles))
-    swings = np.hstack([decay.real, decay.imag])
+    exponentials = np.hstack([decay.real, decay.imag])
     slow = legvander(np.linspace(-1.0, 1.0, n), highest)
-    q, r = np.linalg.qr(np.hstack([slow[:, :1], swings, slow[:, 1:]]))
+    q, r = np.linalg.qr(np.hstack([slow[:, :1], exponentials, slow[:, 1:]]))
     # Columns of q beyond constant and modes add one degree after the other.
     along = q.T @ record.outputs.T
-    fixed = 1 + swings.shape[1]
+    fixed = 1 + exponentials.shape[1]
     power = (record.outputs**2).sum(axis=1)
     left = power - np.vstack([(along[:fixed] ** 2).sum(axis=0), along[fixed:] ** 2]).cumsum(axis=0)
     left = np.maximum(left, 1e-26 * power + 1e-300)

@@ -3,7 +3,7 @@
 Every sensor sees the same decaying exponentials, u(t) = Σ b_r e^{λ_r t} (3.29). Stack the signals at a few delays to
 a column, put many instants beside one another to a matrix A, and the same one step later to Â. Then Â = G A, and G
 has eigenvalues e^{λ_r Δt} and eigenvectors that begin with b_r. The normal matrix A A^T of (3.34) would square the
-condition number; an orthogonal factorisation of A gives the same least squares answer without it.
+condition number; an orthogonal factorisation of A gives the same least squares solution without it.
 
 Two forms are offered. `two_delays` is the one of 1981: each signal and its copy one step later, so m sensors give
 exactly m modes, those that the structure does not have included. `stacked_delays` takes as many copies as the modes
@@ -15,6 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.linalg import lstsq, svd
 
+from workbench.identification.signal.data_quality import check_same_sensors
+from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
@@ -66,7 +68,7 @@ def stacked_delays(
 
     Args:
         records: free decay of the same sensors at one sample rate.
-        n_modes: how many; a stabilisation diagram (`stabilise`, `real_modes`) helps to choose.
+        n_modes: how many; a stabilisation diagram (`stabilise`, `stable_modes`) helps to choose.
         delays: copies of each signal; by default a third of the record, within what a matrix can hold.
         branch: k of (3.23): frequencies lie between k and k + 1 times the Nyquist frequency.
 
@@ -77,7 +79,7 @@ def stacked_delays(
         ValueError: too few samples, records that differ in sensors or rate.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    check_alike(records)
+    check_same_sensors(records)
     basis = signal_subspace(records, 2 * n_modes, delays=delays)
     mu, vectors = shift_eigenpairs(basis, records[0].n_outputs)
     return as_modes(mu, vectors, records[0], branch)
@@ -116,14 +118,6 @@ def shift_eigenpairs(basis: np.ndarray, n_outputs: int) -> tuple[np.ndarray, np.
     return mu, basis[:n_outputs] @ vectors
 
 
-def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
-    """Each column turned as near the real axis as it goes, largest entry 1, first clear entry positive."""
-    turned = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
-    turned = turned / np.abs(turned).max(axis=0)
-    clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)
-    return turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0)
-
-
 def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 0) -> SampledModes:
     """Modes from eigenvalues of one step, λ = (log μ + 2πi k)/Δt (3.23); real eigenvalues are no modes."""
     upper = (mu.imag > 0) & (np.abs(mu) > 0)
@@ -139,24 +133,6 @@ def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 
     return SampledModes(
         omega[order], -(poles.real / omega)[order], normalised_shapes(shapes)[:, order], record.positions
     )
-
-
-def check_alike(records: Sequence[Record]) -> None:
-    """Refuse no records, or records that differ in outputs or sample time."""
-    if not records:
-        raise ValueError("identification needs at least one record")
-    first = records[0]
-    for other in records[1:]:
-        if other.output_names != first.output_names:
-            raise ValueError(
-                f"records identified together must have the same outputs; {first.name!r} has"
-                f" {', '.join(first.output_names)} and {other.name!r} has {', '.join(other.output_names)}"
-            )
-        if abs(other.sample_time - first.sample_time) > 1e-9 * first.sample_time:
-            raise ValueError(
-                f"records {first.name!r} and {other.name!r} are sampled every {first.sample_time:g} s and"
-                f" {other.sample_time:g} s; resample one of them"
-            )
 
 
 def _default_delays(m: int, lengths: Sequence[int], order: int) -> int:

@@ -1,16 +1,16 @@
 """Which modes a long record of many sensors holds, at a cost that grows with its samples and no faster.
 
 As `order` decides it, but many at a time. What the modes so far leave of the record, weighted by its noise, is compared
-with decaying swings e^{λt} by fast transforms, each rate of decay with as many samples as it lives,
+with damped exponentials e^{λt} by fast transforms, each rate of decay over as many samples as it lasts,
 
-    χ²(λ) = 2 Σ_j |Σ_t e^{λ* t} r_j(t)|² / (s_j² Σ_t |e^{λt}|² (1 - o)),    o what the modes so far share of the swing,
+    χ²(λ) = 2 Σ_j |Σ_t e^{λ* t} r_j(t)|² / (s_j² Σ_t |e^{λt}|² (1 - o)),    o the share that the modes so far explain,
 
-and every peak enters that rises above the noise about it and above what stronger peaks leak to its place,
+and every peak enters that rises above the noise about it and above the leakage of stronger peaks,
 
     |<e^{λt}, e^{κt}>|² / (‖e^{λt}‖² ‖e^{κt}‖²) = 4 σ_λ σ_κ / ((σ_λ + σ_κ)² + (ω_λ - ω_κ)²).
 
-All poles are then fitted together, on the whole record, and those go out again that are no modes. What was hidden
-beneath the strong ones shows in the next round; it ends when no peak is higher than noise makes it.
+All poles are then fitted together, on the whole record, and those leave again that are no modes. What was masked by
+strong ones shows in the next round; the search ends when no peak is higher than noise makes it.
 """
 
 import os
@@ -22,57 +22,64 @@ from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.coloured_noise import in_its_noise
-from workbench.identification.free_decay.identified import FALSE_ALARM, MOST_DAMPED, Identified, no_modes, unshaped
-from workbench.identification.free_decay.refinement import MOST_STEPS, as_refined, noise_level, search
+from workbench.identification.free_decay.refined import Identified, as_refined, in_coloured_noise, unshaped
+from workbench.identification.free_decay.refinement import MOST_STEPS, noise_level, search
+from workbench.identification.signal.budget import Budget
+from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, spurious_modes
 from workbench.identification.signal.projection import Projection
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 
-# Rates of decay to look for: the slowest over the record, and how each follows from the one before.
+# Rates of decay searched: the slowest in nepers over the record, and the ratio of each to the one before.
 SLOWEST, RATIO = 0.7, 4.0
-# A swing is looked at while it lives, so many times as long as it takes to fall to 1/e.
+# Time constants after which a damped exponential is left out.
 LIFE = 8.0
 AT_ONCE = 16  # outputs transformed together
-# Cells on either side from which the noise about a peak is taken, by what half of them and nine in ten stay below: what
-# is left about a mode that shifts as it decays is not smooth.
+# Cells on either side from which the noise about a peak is taken, and its quantiles: the residual about a mode that
+# depends on amplitude is not smooth.
 BESIDE, SHARES = 64, (0.5, 0.9)
-LEAKED = 2.0  # a peak must be so many times what stronger ones may leak to its place
-LEAST_APART, OVERLAPS, LIKE = 0.05, 0.5, 1e-10
+LEAKED = 2.0  # a peak must be so many times the leakage of stronger ones
+# Least share of a candidate outside the modes so far; share of energy from which two modes overlap; regularisation.
+LEAST_INDEPENDENT, OVERLAPS, RIDGE = 0.05, 0.5, 1e-10
+# Least-squares steps after peaks entered, and rounds at most.
 STEPS, MOST_ROUNDS = 6, 60
-# A peak refused so often where it stood is noise; once may be for poles that were not settled. Rounds that leave no
-# more modes than before: where noise is not white, or modes shift as they decay, there may be no end of them.
-MOST_REFUSALS, MOST_FRUITLESS = 2, 3
+# A peak rejected so often is noise: once may be for poles that had not converged. Rounds that leave no more modes than
+# before: where noise is not white, or modes depend on amplitude, they would not end.
+MOST_REJECTIONS, MOST_FRUITLESS = 2, 3
 
 
-def identify_long(records: Sequence[Record], *, most_modes: int, false_alarm: float = FALSE_ALARM) -> Identified | None:
+def identify_long(
+    records: Sequence[Record], *, most_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
+) -> Identified | None:
     """The modes of long records, as many as there are; None where none rises above the noise.
 
     Args:
         records: free decay in white noise, of the same sensors at one rate; each output may hold a constant.
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
+        budget: of time; none unless given.
     """
-    peeled, fruitless = _Peeled(records, false_alarm), 0
+    search_for, fruitless = _Search(records, false_alarm, budget or Budget()), 0
     for _ in range(MOST_ROUNDS):
-        before = peeled.poles.size
-        peaks = peeled.peaks()[: max(most_modes - before, 0)] if fruitless < MOST_FRUITLESS else np.zeros(0)
+        before = search_for.poles.size
+        ended = fruitless >= MOST_FRUITLESS or search_for.budget.spent("search for further modes")
+        peaks = np.zeros(0) if ended else search_for.peaks()[: max(most_modes - before, 0)]
         if peaks.size:
-            peeled.take_in(peaks)
-            peeled.prune()
-            fruitless = 0 if peeled.poles.size > before else fruitless + 1
+            search_for.take_in(peaks)
+            search_for.prune()
+            fruitless = 0 if search_for.poles.size > before else fruitless + 1
         else:
-            peeled.settle(peeled.poles, MOST_STEPS)
-            if not peeled.prune(thoroughly=True):
+            search_for.settle(search_for.poles, MOST_STEPS)
+            if not search_for.prune(thoroughly=not search_for.budget.spent("check of each mode")):
                 break
-    return peeled.report() if peeled.poles.size else None
+    return search_for.report() if search_for.poles.size else None
 
 
-class _Peeled:
-    """Poles so far, what they leave of the records, and what was refused."""
+class _Search:
+    """Poles so far, their residual, and what was rejected."""
 
-    def __init__(self, records: Sequence[Record], false_alarm: float) -> None:
-        self.records = records
+    def __init__(self, records: Sequence[Record], false_alarm: float, budget: Budget) -> None:
+        self.records, self.budget = records, budget
         self.dt, self.longest = records[0].sample_time, max(r.n_samples for r in records)
         self.span = self.longest * self.dt
         self.bin_width = 2.0 * np.pi / self.span
@@ -86,9 +93,9 @@ class _Peeled:
         self.limit = float(chi2.isf(false_alarm / cells, self.signals + 2))
         # Sums over so many samples are no more exact than this.
         self.floor = 1e-11 * np.sqrt(np.mean([(r.outputs**2).mean() for r in records]))
-        # Swings as they stood out, of the modes and of what was refused.
+        # Candidates as they entered, of the modes and of what was rejected.
         self.origins = np.zeros(0, complex)
-        self.refused: list[tuple[complex, float]] = []
+        self.rejected: list[tuple[complex, float]] = []
         self.weights = np.ones((len(records), records[0].n_outputs))
         self.fine = np.zeros(1)
         self.settle(np.zeros(0, complex), 0)
@@ -98,11 +105,17 @@ class _Peeled:
         self.settle(np.append(self.poles, peaks), STEPS)
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
-        """All poles fitted together, outputs weighted by what was left of them before."""
+        """All poles fitted together, outputs weighted by the residual before."""
         self.converged, self.steps = True, 0
         if poles.size:
             poles, fits, self.converged, self.steps = search(
-                self.records, poles, self.weights, True, most_steps, many=True
+                self.records,
+                poles,
+                self.weights,
+                True,
+                most_steps,
+                hold=True,
+                budget=self.budget,
             )
         else:
             fits = [_nothing(record) for record in self.records]
@@ -111,7 +124,7 @@ class _Peeled:
         self.weights = 1.0 / self.noise
 
     def peaks(self) -> np.ndarray:
-        """Poles of the swings that stand out of what is left, strongest first."""
+        """Candidates that stand out of the residual, strongest first."""
         strengths = [self._strengths(rate) for rate in self.rates]
         self.fine = strengths[0]
         found = [self._peaks(rate, each) for rate, each in zip(self.rates, strengths, strict=True)]
@@ -119,29 +132,29 @@ class _Peeled:
         taken, heights = np.zeros(0, complex), np.zeros(0)
         for r in np.argsort(-height):
             leaked = np.sqrt(heights * self._overlap(taken, poles[r])).sum() ** 2
-            if height[r] > LEAKED * leaked and height[r] > self.enter * self._colour(poles[r]):
+            if height[r] > LEAKED * leaked and height[r] > self.enter * self._noise_ratio(poles[r]):
                 taken, heights = np.append(taken, poles[r]), np.append(heights, height[r])
         return taken
 
     def prune(self, thoroughly: bool = False) -> bool:
-        """Put out what is no mode, and, thoroughly, what its neighbours can stand for; whether any went."""
+        """Leave out what is no mode and, thoroughly, what its neighbours explain as well; whether any left."""
         if self.poles.size == 0:
             return False
         evidence = self.evidence()
-        limit = self.limit * np.array([self._colour(pole) for pole in self.poles])
-        out = no_modes(self.poles, self._shapes, evidence, self.bin_width) | (evidence < limit)
+        limit = self.limit * np.array([self._noise_ratio(pole) for pole in self.poles])
+        out = spurious_modes(self.poles, self._shapes, evidence, self.bin_width) | (evidence < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
                 near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > OVERLAPS)
-                if near.size > 1 and self._alone(r, near) < limit[r]:
-                    evidence[r] = self._missed(r, near)
+                if near.size > 1 and self._evidence_beside(r, near) < limit[r]:
+                    evidence[r] = self._gain(r, near)
                     out[r] = evidence[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
             # Of two that overlap the weaker goes first: the other may then stand.
-            rivals = out & (evidence < evidence[r]) & (self._overlap(self.poles, self.poles[r]) > OVERLAPS)
-            out[r] = not rivals.any()
+            weaker = out & (evidence < evidence[r]) & (self._overlap(self.poles, self.poles[r]) > OVERLAPS)
+            out[r] = not weaker.any()
         if out.any():
-            self.refused += [(complex(pole), e) for pole, e in zip(self.origins[out], evidence[out], strict=True)]
+            self.rejected += [(complex(pole), e) for pole, e in zip(self.origins[out], evidence[out], strict=True)]
             self.origins = self.origins[~out]
             self.settle(self.poles[~out], 2)
         return bool(out.any())
@@ -164,8 +177,8 @@ class _Peeled:
             strength += float((a * np.linalg.solve(fit.spread[np.ix_(both, both)], a)).sum())
         return strength
 
-    def _alone(self, r: int, near: np.ndarray) -> float:
-        """χ² of mode r in what its neighbours cannot stand for: combinations of the outputs that see none of them."""
+    def _evidence_beside(self, r: int, near: np.ndarray) -> float:
+        """χ² of mode r in combinations of the outputs that see none of its neighbours."""
         shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
         return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
 
@@ -173,18 +186,18 @@ class _Peeled:
         found = self.records, self.poles, self.fits, self.noise
         refined = as_refined(*found, converged=self.converged, steps=self.steps)
         evidence = self.evidence()[np.argsort(np.abs(self.poles))]
-        refused = sorted(self.refused, key=lambda pair: abs(pair[0]))
-        noise = unshaped(np.array([pole for pole, _ in refused], complex), self.records[0])
-        refined, tried = in_its_noise(refined, self.records), frozen([strength for _, strength in refused])
-        return Identified(refined, frozen(evidence), self.limit, noise, tried)
+        rejected = sorted(self.rejected, key=lambda pair: abs(pair[0]))
+        noise = unshaped(np.array([pole for pole, _ in rejected], complex), self.records[0])
+        refined, tried = in_coloured_noise(refined, self.records), frozen([strength for _, strength in rejected])
+        return Identified(refined, frozen(evidence), self.limit, noise, tried, self.budget.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:
-        """Samples over which a swing lives, and the length of the transform that tells frequencies finely enough."""
+        """Samples that one of this rate lasts, and the length of a transform that resolves its frequency."""
         n = min(self.longest, int(np.ceil(LIFE / (rate * self.dt))))
         return n, next_fast_len(n if rate * n * self.dt > 0.5 * LIFE else 2 * n, real=True)
 
     def _strengths(self, rate: float) -> np.ndarray:
-        """χ² of the swings of one rate at every frequency of its transform, as if no mode stood near."""
+        """χ² of one rate at every frequency of its transform, as if no mode were near."""
         lives, size = self._size(rate)
         found = np.zeros(size // 2 + 1, np.float32)
         for fit, weights in zip(self.fits, self.weights, strict=True):
@@ -198,8 +211,8 @@ class _Peeled:
                 found += (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
         return found
 
-    def _colour(self, pole: complex) -> float:
-        """Noise about a swing over white noise, where it is larger, as the last search saw it; 1 if white."""
+    def _noise_ratio(self, pole: complex) -> float:
+        """Noise about a pole over white noise, where it is larger, as the last search saw it; 1 if white."""
         step = np.pi / (self.fine.size * self.dt)
         at, half = round(pole.imag / step), max(int(abs(pole.real) / step), BESIDE)
         beside = self.fine[max(at - half, 0) : at + half + 1]
@@ -211,30 +224,30 @@ class _Peeled:
         omega = step * np.arange(strengths.size)
         inside = (omega > max(rate / MOST_DAMPED, 1.5 * self.bin_width)) & (omega < np.pi / self.dt - self.bin_width)
         highest = np.r_[False, (strengths[1:-1] > strengths[:-2]) & (strengths[1:-1] >= strengths[2:]), False]
-        at = np.flatnonzero(inside & highest & (strengths > LEAST_APART * self.enter))
+        at = np.flatnonzero(inside & highest & (strengths > LEAST_INDEPENDENT * self.enter))
         poles = -rate + 1j * omega[at]
-        refused = np.zeros(at.size, int)
-        for pole, _ in self.refused:
-            refused += np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))
-        at, poles = at[refused < MOST_REFUSALS], poles[refused < MOST_REFUSALS]
-        apart = self._apart(poles)
-        full = strengths[at] / np.maximum(apart, LEAST_APART)
-        good = (apart > LEAST_APART) & (full > self.enter)
+        rejected = np.zeros(at.size, int)
+        for pole, _ in self.rejected:
+            rejected += np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))
+        at, poles = at[rejected < MOST_REJECTIONS], poles[rejected < MOST_REJECTIONS]
+        apart = self._independent(poles)
+        full = strengths[at] / np.maximum(apart, LEAST_INDEPENDENT)
+        good = (apart > LEAST_INDEPENDENT) & (full > self.enter)
         return full[good], poles[good]
 
-    def _apart(self, swings: np.ndarray) -> np.ndarray:
-        """Shares of swings, sorted by frequency, that lie outside the modes there already."""
-        apart = np.ones(swings.size)
+    def _independent(self, poles: np.ndarray) -> np.ndarray:
+        """Shares of candidates, sorted by frequency, that lie outside the modes so far."""
+        apart = np.ones(poles.size)
         reach = 3.0 * (2.0 * self.bin_width + np.abs(self.poles.real))
-        for first in range(0, swings.size, BESIDE):
+        for first in range(0, poles.size, BESIDE):
             some = slice(first, first + BESIDE)
-            w = swings[some]
+            w = poles[some]
             wide = reach + 3.0 * np.abs(w[0].real)
             near = self.poles[(self.poles.imag > w[0].imag - wide) & (self.poles.imag < w[-1].imag + wide)]
             if near.size:
                 both = self._products(near, w)
                 gram = self._products(near, near)
-                factor = cho_factor(gram + LIKE * np.diag(np.diag(gram)))
+                factor = cho_factor(gram + RIDGE * np.diag(np.diag(gram)))
                 shared = (both.conj() * cho_solve(factor, both)).sum(axis=0).real
                 apart[some] = 1.0 - shared / np.diag(self._products(w[:1], w[:1])).real
         return apart
@@ -246,14 +259,14 @@ class _Peeled:
         return np.where(small, self.longest, np.expm1(rate * self.longest) / np.where(small, 1.0, np.expm1(rate)))
 
     def _overlap(self, poles: np.ndarray, pole: complex) -> np.ndarray:
-        """Of the energies of swings, what they share; none is narrower than the record can tell."""
+        """Shares of energy in common; none is narrower than the resolution of the record."""
         a, b = np.abs(poles.real) + 1.0 / self.span, abs(pole.real) + 1.0 / self.span
         return 4.0 * a * b / ((a + b) ** 2 + (poles.imag - pole.imag) ** 2)
 
-    def _missed(self, r: int, near: np.ndarray) -> float:
-        """χ² by which the record is less likely without mode r, the poles near it fitted anew.
+    def _gain(self, r: int, near: np.ndarray) -> float:
+        """χ² of mode r, the poles near it fitted anew without it.
 
-        Seen along the shapes of these modes alone: no other combination of the outputs tells of them.
+        Along the shapes of these modes alone: no other combination of the outputs depends on them.
         """
         shapes = np.hstack(np.split(self._shapes[:, near], len(self.fits)))
         directions = np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0]

@@ -1,21 +1,21 @@
-"""What a mode found in a record may be instead: a drift, a hum, an overtone."""
+"""Identified modes that may be something else: a drift, a hum, an overtone."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.free_decay.refined import Refined
 from workbench.records.record import Record
 
 SURE = 3.0
 HIGHEST_OVERTONE = 9
-# An overtone of a distorted swing is small beside it.
+# Amplitude of an overtone, relative to its base, at most.
 OVERTONE_AT_MOST = 0.03
 WITHIN = 2e-3
 
 
 def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, ...]:
-    """One for each mode, empty where nothing speaks against it.
+    """One remark a mode, empty where there is none.
 
     Slower than the record is long: a drift. A damping ratio not three standard errors above zero: a hum, if it goes on
     to the end, or, three below zero, a growth. A whole multiple of the frequency of a mode thirty times as strong:

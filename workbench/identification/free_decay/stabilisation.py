@@ -1,7 +1,7 @@
-"""Which modes are there: those that stay when the order asked for grows.
+"""Stabilisation diagrams: a physical mode is stable over the model order.
 
-A true mode comes back at every order, with the same frequency and a shape that stands; what only fits the noise, or
-the small disagreement between points measured one after the other, wanders or travels.
+It appears at every order, with the same frequency and a shape that is real but for its scale; poles that only fit the
+noise, or small inconsistencies between points measured one after the other, change with the order or are complex.
 """
 
 from collections.abc import Sequence
@@ -9,14 +9,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.identification.free_decay.ibrahim import as_modes, check_alike, shift_eigenpairs, signal_subspace
+from workbench.identification.free_decay.ibrahim import as_modes, shift_eigenpairs, signal_subspace
+from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, mac
 
 
 @dataclass(frozen=True, eq=False)
 class Stabilisation:
-    """What was identified at each order, from the lowest to the highest.
+    """The modes identified at each order, from the lowest to the highest.
 
     Attributes:
         orders: numbers of modes asked for.
@@ -28,11 +29,11 @@ class Stabilisation:
 
 
 @dataclass(frozen=True, eq=False)
-class RealModes:
-    """The modes that stayed.
+class StableModes:
+    """The stable modes of a diagram.
 
     Attributes:
-        modes: each as found at the order where its shape stands best.
+        modes: each as identified at the order where its phase collinearity is highest.
         presence: (n_modes,) share of the orders at which it was found.
         frequency_spread: (n_modes,) standard deviation of its frequency over the orders, relative.
     """
@@ -54,7 +55,7 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
         ValueError: fewer samples than the highest order needs.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    check_alike(records)
+    check_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
     found = []
     for n in orders:
@@ -63,7 +64,7 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     return Stabilisation(tuple(orders), tuple(found))
 
 
-def real_modes(
+def stable_modes(
     diagram: Stabilisation,
     *,
     frequency: float = 0.02,
@@ -71,8 +72,8 @@ def real_modes(
     standing: float = 0.8,
     presence: float = 0.5,
     largest_damping: float = 0.2,
-) -> RealModes:
-    """The modes that stay over the orders of a stabilisation diagram.
+) -> StableModes:
+    """The modes that are stable over the orders of a diagram.
 
     Args:
         diagram: from `stabilise`.
@@ -86,7 +87,7 @@ def real_modes(
     for modes in diagram.found:
         keep = (modes.zeta > 0) & (modes.zeta < largest_damping) & (modes.phase_collinearity >= standing)
         taken = set()
-        # The best standing shapes choose first, so that a split of a mode does not take its place.
+        # The most collinear shapes choose first, so that a split of a mode does not take its place.
         for r in sorted(np.flatnonzero(keep), key=lambda r: -modes.phase_collinearity[r]):
             near = _nearest(groups, modes, int(r), frequency, shape)
             if near is None:
@@ -107,7 +108,7 @@ def real_modes(
         positions,
     )
     spread = np.array([np.std([m.omega[r] for m, r in g]) for g in stayed]) / np.maximum(modes.omega, 1e-300)
-    return RealModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders), spread)
+    return StableModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders), spread)
 
 
 def _nearest(groups, modes: SampledModes, r: int, frequency: float, shape: float) -> int | None:

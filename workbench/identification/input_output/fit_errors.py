@@ -1,6 +1,6 @@
-"""Standard errors of what `modal_fit` found, in noise of any smooth spectrum.
+"""Standard errors of a `modal_fit`, in noise of any smooth spectrum.
 
-A mode listens to noise about its own frequency only. Where output j has κ_jr times its mean noise there, a fit made for
+A mode is disturbed by noise about its own frequency only. Where output j has κ_jr times its mean noise there, a fit for
 white noise has errors H^-1 M H^-1, M as H with each mode's share of output j times κ_jr^½ (White, Econometrica 48,
 1980); amplitudes likewise. κ = 1 gives the Cramér-Rao bound.
 """
@@ -15,55 +15,57 @@ from workbench.identification.input_output.modal_fit import Fit, Part, free_para
 Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
-def covariance(fit: Fit, heard: np.ndarray | float = 1.0) -> np.ndarray:
-    """Of the free unknowns; `heard` is κ, (n_outputs, n_modes)."""
+def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
+    """Of the free unknowns; `noise_ratio` is κ, (n_outputs, n_modes)."""
     h = normal(fit, fit.noise)[0]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
     bound = np.linalg.pinv(h * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
-    if np.all(heard == 1.0):
+    if np.all(noise_ratio == 1.0):
         return bound
     loud = tuple(
-        replace(part, coefficients=part.coefficients * _by_column(part, rows)) for part, rows in _by_part(fit, heard)
+        replace(part, coefficients=part.coefficients * _by_column(part, rows))
+        for part, rows in _by_part(fit, noise_ratio)
     )
     return bound @ normal(replace(fit, parts=loud), fit.noise)[0] @ bound
 
 
-def pole_covariance(fit: Fit, heard: np.ndarray | float = 1.0) -> np.ndarray:
+def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
     """Of (ω, ζ), (2 n_modes, 2 n_modes): with λ = x + iy, dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
-    n, q = fit.poles.size, fit.loads.shape[1] + 1
+    n, q = fit.poles.size, fit.participation.shape[1] + 1
     free = free_parameters(fit)
     at = np.searchsorted(free, np.r_[q * np.arange(n), q * n + q * np.arange(n)])
     x, y, omega = fit.poles.real, fit.poles.imag, np.abs(fit.poles)
     jacobian = np.block(
         [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
     )
-    return jacobian @ covariance(fit, heard)[np.ix_(at, at)] @ jacobian.T
+    return jacobian @ covariance(fit, noise_ratio)[np.ix_(at, at)] @ jacobian.T
 
 
-def errors(fit: Fit, figures: Figures, heard: np.ndarray) -> np.ndarray:
-    """Covariance of figures of (poles, loads, amplitudes) by their exact first-order change.
+def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
+    """Covariance of figures of (poles, participation, amplitudes) by their exact first-order change.
 
     Args:
-        figures: analytic up to conjugation, (poles (n,), loads (n, n_drives), amplitudes (n_outputs, n)) -> real (k,).
-        heard: κ, (n_outputs, n_modes).
+        figures: analytic up to conjugation, real (k,) of poles (n,), participation (n, n_excitations) and amplitudes
+            (n_outputs, n).
+        noise_ratio: κ, (n_outputs, n_modes).
     """
-    n, p = fit.loads.shape
-    free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.loads, fit.amplitudes)
+    n, p = fit.participation.shape
+    free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
     drift = np.concatenate([-np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)) for part in fit.parts], axis=2)
     changes, output = [], 0
-    for column in _root(covariance(fit, heard)).T:
+    for column in _root(covariance(fit, noise_ratio)).T:
         whole = np.zeros(2 * size)
         whole[free] = column
         step = (whole[:size] + 1j * whole[size:]).reshape(n, p + 1)
         c = np.einsum("ckj,k->cj", drift, whole)
         changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
-    for part, rows in _by_part(fit, heard):
+    for part, rows in _by_part(fit, noise_ratio):
         spread = _root(part.spread[: 2 * n, : 2 * n])
         for loud in np.sqrt(rows):
             for column in (np.tile(loud, 2)[:, None] * spread).T:
                 a = np.zeros_like(fit.amplitudes)
                 a[output] = fit.noise[output] * (column[:n] - 1j * column[n:])
-                changes.append((np.zeros_like(fit.poles), np.zeros_like(fit.loads), a))
+                changes.append((np.zeros_like(fit.poles), np.zeros_like(fit.participation), a))
             output += 1
     found = []
     for change in changes:
@@ -74,14 +76,14 @@ def errors(fit: Fit, figures: Figures, heard: np.ndarray) -> np.ndarray:
     return jacobian.T @ jacobian
 
 
-def fixed_std(fit: Fit, heard: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Standard errors of the coefficients of the fixed columns, (n_fixed, n_outputs).
 
     Args:
-        heard: κ, (n_outputs, n_modes).
-        fixed: what each fixed column hears of the noise of each output, over its mean, (n_fixed, n_outputs).
+        noise_ratio: κ, (n_outputs, n_modes).
+        fixed: κ of each fixed column and output, (n_fixed, n_outputs).
     """
-    bound, free, n, found, first = covariance(fit, heard), free_parameters(fit), 2 * fit.poles.size, [], 0
+    bound, free, n, found, first = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, [], 0
     for part in fit.parts:
         outputs = slice(first, first + part.residual.shape[1])
         first = outputs.stop
@@ -91,20 +93,20 @@ def fixed_std(fit: Fit, heard: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     return np.hstack(found)
 
 
-def _by_part(fit: Fit, heard: np.ndarray | float) -> list[tuple[Part, np.ndarray]]:
+def _by_part(fit: Fit, noise_ratio: np.ndarray | float) -> list[tuple[Part, np.ndarray]]:
     edges = np.cumsum([part.residual.shape[1] for part in fit.parts])[:-1]
-    each = np.broadcast_to(heard, (fit.noise.size, fit.poles.size))
+    each = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
     return list(zip(fit.parts, np.split(each, edges), strict=True))
 
 
 def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:
     """κ^½ of each column of a part, 1 for those that are fixed, (n_columns, n_outputs)."""
-    swings = np.tile(np.sqrt(rows).T, (2, 1))
-    return np.vstack([swings, np.ones((part.coefficients.shape[0] - len(swings), len(rows)))])
+    coordinates = np.tile(np.sqrt(rows).T, (2, 1))
+    return np.vstack([coordinates, np.ones((part.coefficients.shape[0] - len(coordinates), len(rows)))])
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
-    """R with R R^T = matrix, which modes that are hardly told apart may have made singular."""
+    """R with R R^T = matrix, which close modes may have made singular."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
     return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

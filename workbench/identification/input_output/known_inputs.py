@@ -1,13 +1,13 @@
-"""Records driven by known inputs, as a `modal_fit.Drive`: what each pole answers, and the noise it answers in.
+"""Records with known inputs, as a `modal_fit.Measurement`: the response of each pole, and the noise.
 
-Each input u_i drives each pole, z' = λ z + Σ_i l_i u_i. Between samples the input is held, or runs straight from one to
-the next, so that z is known exactly at the samples:
+Each input u_i excites each pole, z' = λ z + Σ_i l_i u_i. Between samples the input is held, or straight from one
+to the next, so that z is exact at the samples:
 
     z_k+1 = e^{λΔt} z_k + c_0 u_k + c_1 u_k+1
     held: c_0 = Δt φ_1, c_1 = 0;    straight: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
 
-with φ_1(x) = (e^x - 1)/x, φ_2(x) = (e^x - 1 - x)/x² at x = λΔt. The state at the first sample is one more drive, a blow
-before it. Noise that is not white is weighed line by line of the cosine transform, which all columns then go through.
+with φ_1(x) = (e^x - 1)/x, φ_2(x) = (e^x - 1 - x)/x² at x = λΔt. The state at the first sample is one more excitation,
+an impulse before it. Noise that is not white is weighted line by line of the cosine transform of all columns.
 """
 
 from collections.abc import Sequence
@@ -17,12 +17,11 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.signal import lfilter
 
-from workbench.identification.free_decay.coloured_noise import heard_along, noise_near
-from workbench.identification.free_decay.identified import MOST_DAMPED
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves
-from workbench.identification.input_output.noise_spectrum import course, lines_of, samples_of
-from workbench.identification.signal.noise_levels import variances
+from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
+from workbench.identification.signal.noise import noise_along, noise_near, variances
+from workbench.identification.signal.order_selection import MOST_DAMPED
 from workbench.records.record import Record
 
 # φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
@@ -33,12 +32,12 @@ PEAKS_A_RATE = 12
 
 
 class KnownInputs:
-    """Rows are the samples, one record after another, or, with `sizes`, the lines of each record over their noise.
+    """Rows are the samples, one record after another, or, with `line_std`, the lines of each record over their noise.
 
     Args:
         records: with the same inputs and outputs at one rate.
         at_rest, straight, feedthrough: as in `identify_driven`.
-        sizes: relative noise of each line, one (n_samples, n_outputs) a record, of unit rms over all.
+        line_std: relative noise of each line, one (n_samples, n_outputs) a record, of unit rms over all.
     """
 
     def __init__(
@@ -48,16 +47,16 @@ class KnownInputs:
         at_rest: bool,
         straight: bool,
         feedthrough: bool,
-        sizes: Sequence[np.ndarray] | None = None,
+        line_std: Sequence[np.ndarray] | None = None,
     ) -> None:
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt = records[0].sample_time
         lengths = [record.n_samples for record in records]
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
-        self.sizes = sizes
-        self.by_line = sizes is not None and any(np.ptp(size, axis=0).any() for size in sizes)
-        self.weights = None if sizes is None else 1.0 / np.vstack(sizes)
+        self.line_std = line_std
+        self.by_line = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
+        self.weights = None if line_std is None else 1.0 / np.vstack(line_std)
         self.values = self._rows(np.vstack([record.outputs.T for record in records]))
         if self.weights is not None:
             self.values = self.values * self.weights
@@ -66,7 +65,7 @@ class KnownInputs:
             constant[rows, k] = 1.0
         direct = np.vstack([record.inputs.T for record in records])
         self.n_inputs = direct.shape[1]
-        self.n_drives = self.n_inputs + (0 if at_rest else len(records))
+        self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
         self.feedthrough = feedthrough and not _flat(direct)
         self.fixed = self._rows(np.hstack([direct, constant]) if self.feedthrough else constant)
         self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
@@ -77,27 +76,31 @@ class KnownInputs:
         self.rates = np.geomspace(0.5 / span, fastest, max(int(np.log(fastest * span)) + 2, 3))
         self.cells = self.rates.size * max(lengths)
 
-    def weighing(self, sizes: Sequence[np.ndarray] | None) -> "KnownInputs":
-        """The same records with lines that count by their noise; with None, samples that count alike."""
+    def weighted_by(self, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
+        """The same records with lines weighted by their noise; with None, samples of equal weight."""
         how = {"at_rest": self.at_rest, "straight": self.straight, "feedthrough": self.may_feel}
-        return KnownInputs(self.records, **how, sizes=sizes)
+        return KnownInputs(self.records, **how, line_std=line_std)
 
     def noise(self, fit: Fit) -> np.ndarray:
-        """Standard deviation of what is left of each output in each record, (n_records, n_outputs)."""
-        loud = np.array([np.sqrt((size**2).mean(axis=0)) for size in self.sizes]) if self.sizes is not None else 1.0
+        """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
+        loud = (
+            np.array([np.sqrt((size**2).mean(axis=0)) for size in self.line_std]) if self.line_std is not None else 1.0
+        )
         return np.sqrt(variances(*self._squares(fit))) * loud
 
-    def course(self, fit: Fit) -> list[np.ndarray] | None:
-        """How the noise runs along the lines of each record, as `noise_course` reads it off what a fit leaves."""
+    def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
+        """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""
         raw = fit.residual if self.weights is None else fit.residual / self.weights
         left = [self._samples(raw[rows]) for rows in self.rows]
         taken = self._taken(fit)
         shares = [taken[rows] for rows in self.rows]
-        return course(left, [record.outputs.T for record in self.records], shares, fit.poles.size, self._free(fit))
+        return noise_spectrum(
+            left, [record.outputs.T for record in self.records], shares, fit.poles.size, self._free(fit)
+        )
 
     def _taken(self, fit: Fit) -> np.ndarray:
-        """Share of the noise of each line that the fit has taken, its leverage, (n_rows, n_outputs)."""
-        phi, t = columns(self, fit.poles, fit.loads)
+        """Leverage of each line, the share of its noise that the fit took, (n_rows, n_outputs)."""
+        phi, t = columns(self, fit.poles, fit.participation)
         if not self.by_line:
             phi, t = (np.vstack([lines_of(matrix[rows]) for rows in self.rows]) for matrix in (phi, t))
         free, found = free_parameters(fit), []
@@ -116,30 +119,30 @@ class KnownInputs:
         log_sizes = 0.0 if self.weights is None else -2.0 * float(np.log(self.weights).sum())
         return log_sizes + len(fit.residual) * float(np.log((fit.residual**2).sum(axis=0)).sum())
 
-    def heard(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """Noise over its mean that each mode, (n_outputs, n_modes), and each fixed column, (n_fixed, n_outputs), hears:
-        of each record as much as the mode swings in it."""
+    def noise_ratios(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+        """κ, noise over its mean, about each mode, (n_outputs, n_modes), and along each fixed column, (n_fixed,
+        n_outputs): records weighted by the energy of the mode in each."""
         std = np.sqrt(variances(*self._squares(fit)))
-        swings = [self._swing(pole, load) for pole, load in zip(fit.poles, fit.loads)]
+        coordinates = [self._modal_coordinate(pole, l_r) for pole, l_r in zip(fit.poles, fit.participation)]
         near, beside, energy, power = [], [], [], []
         for k, rows in enumerate(self.rows):
             left = self._samples(fit.residual[rows] / std[k])
             near.append(noise_near(fit.poles, left, self.dt))
             weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
             seen = [self._samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
-            along = [heard_along(fixed, rest, fit.poles.size) for fixed, rest in zip(seen, left.T[:, :, None])]
+            along = [noise_along(fixed, rest, fit.poles.size) for fixed, rest in zip(seen, left.T[:, :, None])]
             beside.append(np.hstack(along))
             squares = np.broadcast_to(weights**2, left.shape).T
-            energy.append(np.column_stack([squares @ (x[rows] ** 2 + y[rows] ** 2) for x, y in swings]))
+            energy.append(np.column_stack([squares @ (x[rows] ** 2 + y[rows] ** 2) for x, y in coordinates]))
             power.append((squares @ self.fixed[rows] ** 2).T)
         return np.average(near, axis=0, weights=energy), np.average(beside, axis=0, weights=np.array(power) + 1e-300)
 
-    def _swing(self, pole: complex, load: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        real, imaginary = self.answers(pole)
-        return real @ load.real - imaginary @ load.imag, real @ load.imag + imaginary @ load.real
+    def _modal_coordinate(self, pole: complex, l_r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        real, imaginary = self.responses(pole)
+        return real @ l_r.real - imaginary @ l_r.imag, real @ l_r.imag + imaginary @ l_r.real
 
     def _squares(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
-        """Squares of what is left, lines counted as they are, and their degrees of freedom."""
+        """Squares of the residual and their degrees of freedom."""
         squares = np.array([(fit.residual[rows] ** 2).sum(axis=0) for rows in self.rows])
         return np.maximum(squares, 1e-28 * squares.max() + 1e-300), self._free(fit)
 
@@ -156,29 +159,29 @@ class KnownInputs:
         """Rows of one record as samples."""
         return samples_of(rows) if self.by_line else rows
 
-    def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        x = np.zeros((self.values.shape[0], self.n_drives), complex)
+    def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+        x = np.zeros((self.values.shape[0], self.n_excitations), complex)
         for k, (record, rows) in enumerate(zip(self.records, self.rows)):
             x[rows, : self.n_inputs] = self._driven(record, pole)[0].T
             if not self.at_rest:
                 x[rows, self.n_inputs + k] = np.exp(pole * self.dt * np.arange(record.n_samples))
         return self._rows(x.real), self._rows(x.imag)
 
-    def slopes(self, pole: complex, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = np.zeros(self.values.shape[0], complex)
         mu = np.exp(pole * self.dt)
         for k, (record, rows) in enumerate(zip(self.records, self.rows)):
             x, by_coefficients = self._driven(record, pole)
-            load = loads[: self.n_inputs]
-            later = self.dt * mu * (load @ x)[:-1] + (load @ by_coefficients)[1:]
+            l_r = participation[: self.n_inputs]
+            later = self.dt * mu * (l_r @ x)[:-1] + (l_r @ by_coefficients)[1:]
             found[rows] = lfilter([1.0], [1.0, -mu], np.r_[0.0, later])
             if not self.at_rest:
                 time = self.dt * np.arange(record.n_samples)
-                found[rows] += loads[self.n_inputs + k] * time * np.exp(pole * time)
+                found[rows] += participation[self.n_inputs + k] * time * np.exp(pole * time)
         return self._rows(found.real[:, None])[:, 0], self._rows(found.imag[:, None])[:, 0]
 
     def _driven(self, record: Record, pole: complex) -> tuple[np.ndarray, np.ndarray]:
-        """z of each input from rest, and what its sources change with λ, (n_inputs, n_samples) each."""
+        """z of each input from rest, and the derivative of its sources by λ, (n_inputs, n_samples) each."""
         (now, after), (now_slope, after_slope) = _sources(pole, self.dt, self.straight)
         u = record.inputs.astype(complex)
         rest = -after * u[:, :1]
@@ -187,10 +190,10 @@ class KnownInputs:
         return x, now_slope * before + after_slope * u
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
-        """Poles whose answer to the inputs agrees best with the residual.
+        """Poles whose response to the inputs agrees best with the residual.
 
         Σ_k y_k x_k(λ) = Σ_τ R_yu(τ) e^{λ τ}, so that one transform of the correlations, weighted by a decay, compares
-        all frequencies at that rate of decay; the initial state is a blow before the first sample.
+        all frequencies at that rate of decay; the initial state is an impulse before the first sample.
         """
         size, omega = self.size, 2.0 * np.pi * np.fft.rfftfreq(self.size, self.dt)
         lags = np.arange(size // 2)
@@ -200,8 +203,8 @@ class KnownInputs:
             y = np.fft.rfft(self._samples(weights * residual[rows]).T, size)
             lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
             counted = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
-            drives = [*record.inputs] if self.at_rest else [*record.inputs, np.eye(1, record.n_samples)[0]]
-            for u in filter(np.any, drives):
+            excitations = [*record.inputs] if self.at_rest else [*record.inputs, np.eye(1, record.n_samples)[0]]
+            for u in filter(np.any, excitations):
                 spectrum = np.fft.rfft(u, size)
                 crossed.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
                 own.append(np.fft.irfft(counted * np.abs(spectrum) ** 2, size)[:, : size // 2])
@@ -210,7 +213,7 @@ class KnownInputs:
             decay = np.exp(-rate * self.dt * lags)
             lowest = omega > max(0.5 * self.resolution, rate / MOST_DAMPED)
             score = np.zeros(omega.size)
-            # The answer's own power: the spectrum of the input seen through the pole.
+            # The response's own power: the spectrum of the input seen through the pole.
             for r, power in zip(crossed, own):
                 agreed = np.abs(np.fft.rfft(r * decay, size)) ** 2
                 whole = 2.0 * np.fft.rfft(power * decay, size).real - power[:, :1]
@@ -224,7 +227,7 @@ class KnownInputs:
         order = np.argsort(np.concatenate(strength))[::-1]
         return np.concatenate(found)[order[: 3 * PEAKS_A_RATE]]
 
-    def colour(self, residual: np.ndarray, pole: complex) -> float:
+    def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
         power = (np.abs(np.fft.rfft(self._samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
         at = round(pole.imag / self.resolution) - 1

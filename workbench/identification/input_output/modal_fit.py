@@ -1,39 +1,46 @@
-"""Most likely modes of whatever drives them: poles, shapes and loads, in time or over frequency.
+"""Maximum likelihood modes of whatever excites them: poles, shapes and participation, in time or over frequency.
 
-A mode answers what drives it by one complex swing s_r, which every output sees in proportion to its shape,
+Each mode has one complex modal coordinate z_r, which every output measures in proportion to its shape,
 
-    y_j = Re Σ_r a_jr s_r + Σ_f d_jf v_f,      s_r = Σ_p l_rp x_p(λ_r),
+    y_j = Re Σ_r a_jr z_r + Σ_f d_jf v_f,      z_r = Σ_p l_rp x_p(λ_r),
 
-x_p(λ) the answer of a pole λ to the p-th drive and v_f columns known beforehand. For given poles and loads the outputs
-are linear in a and d, which drop out (variable projection, Golub & Pereyra 1973); s_r is analytic in λ_r and l_rp, so
-one matrix of tangents T = ∂s_r/∂(λ_r, l_rp), projected on what the columns leave, gives the Gauss-Newton matrix H, and
-H^-1 in the noise of the outputs is the Cramér-Rao bound. One load of each mode is held: the shape carries its scale.
+x_p(λ) the response of a pole λ to the p-th excitation and v_f columns known beforehand. For given poles and
+participation l the outputs are linear in a and d, which drop out (variable projection, Golub & Pereyra 1973); z_r is
+analytic in λ_r and l_rp, so one matrix of tangents T = ∂z_r/∂(λ_r, l_rp), projected on what the columns leave, gives
+the Gauss-Newton matrix H, and H^-1 in the noise of the outputs is the Cramér-Rao bound. One participation of each mode
+is held: the shape carries its scale.
 """
 
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
+from scipy.linalg import qr, solve_triangular
+
+from workbench.identification.signal.budget import Budget
+from workbench.identification.signal.least_squares import minimise
 
 MOST_STEPS = 60
-# A step is small once it moves the estimate by less than a thousandth of its standard error.
-SETTLED = 1e-6
+# A step is negligible once it moves the estimate by less than a thousandth of its standard error, squared.
+NEGLIGIBLE = 1e-6
+# Of a sum of squares, relative to that of the measurement.
 ROUND_OFF = 1e-26
+# Nepers over a record: no pole is searched that grows faster.
+MOST_GROWTH = 20.0
 
 Pair = tuple[np.ndarray, np.ndarray]
 
 
-class Drive(Protocol):
+class Measurement(Protocol):
     """What a fit of modes needs to know of a measurement.
 
     Attributes:
         values: (n_rows, n_outputs) real readings, divided by their relative noise where `weights` is given.
         fixed: (n_rows, n_fixed) columns v_f.
         weights: (n_rows, n_outputs) inverse relative noise, or None where it is the same in all rows of an output.
-        resolution: rad/s, what a measurement of this length tells apart.
+        resolution: rad/s, of a measurement of this length.
         highest: rad/s, beyond which no pole is searched.
-        cells: number of swings that could be told apart, for the chance of a false alarm.
+        cells: number of poles that could be distinguished, for the chance of a false alarm.
     """
 
     values: np.ndarray
@@ -43,11 +50,11 @@ class Drive(Protocol):
     highest: float
     cells: int
 
-    def answers(self, pole: complex) -> Pair:
-        """Real and imaginary parts of x_p(λ), (n_rows, n_drives) each."""
+    def responses(self, pole: complex) -> Pair:
+        """Real and imaginary parts of x_p(λ), (n_rows, n_excitations) each."""
         ...
 
-    def slopes(self, pole: complex, loads: np.ndarray) -> Pair:
+    def slopes(self, pole: complex, participation: np.ndarray) -> Pair:
         """∂/∂λ of Σ_p l_p x_p(λ), (n_rows,) each."""
         ...
 
@@ -55,7 +62,7 @@ class Drive(Protocol):
         """Poles worth a try, (n_candidates,), residual in units of the noise."""
         ...
 
-    def colour(self, residual: np.ndarray, pole: complex) -> float:
+    def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         """Noise power about a pole over its mean, at least 1."""
         ...
 
@@ -74,10 +81,10 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Modes as a fit left them: poles (n_modes,), loads (n_modes, n_drives), and the projections behind them."""
+    """Fitted modes: poles (n_modes,), participation (n_modes, n_excitations), and the projections behind them."""
 
     poles: np.ndarray
-    loads: np.ndarray
+    participation: np.ndarray
     parts: tuple[Part, ...]
     converged: bool = False
     steps: int = 0
@@ -98,42 +105,42 @@ class Fit:
 
     @property
     def noise(self) -> np.ndarray:
-        """Standard deviation of what is left of each output, (n_outputs,)."""
+        """Standard deviation of the residual of each output, (n_outputs,)."""
         left = self.residual
         free = max(left.shape[0] - self.coefficients.shape[0] - free_parameters(self).size / left.shape[1], 1.0)
         squares = (left**2).sum(axis=0)
         return np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / free)
 
 
-def projected(drive: Drive, poles: np.ndarray, loads: np.ndarray) -> Fit:
-    """The shapes that belong to given poles and loads, by least squares."""
-    phi, t = columns(drive, poles, loads)
-    if drive.weights is None:
-        return Fit(poles, loads, (_part(phi, t, drive.values),))
-    each = drive.weights.T[:, :, None]
-    parts = [_part(w * phi, w * t, y[:, None]) for w, y in zip(each, drive.values.T)]
-    return Fit(poles, loads, tuple(parts))
+def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Fit:
+    """The shapes that belong to given poles and participation, by least squares."""
+    phi, t = columns(data, poles, participation)
+    if data.weights is None:
+        return Fit(poles, participation, (_part(phi, t, data.values),))
+    each = data.weights.T[:, :, None]
+    parts = [_part(w * phi, w * t, y[:, None]) for w, y in zip(each, data.values.T)]
+    return Fit(poles, participation, tuple(parts))
 
 
-def columns(drive: Drive, poles: np.ndarray, loads: np.ndarray) -> Pair:
-    """Swings and what is fixed, Φ (n_rows, n_columns), and tangents T (n_rows, n_tangents), not weighted."""
-    answers = [drive.answers(pole) for pole in poles]
-    slopes = [drive.slopes(pole, load) for pole, load in zip(poles, loads)]
-    swings, tangents = [], []
+def columns(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Pair:
+    """Modal coordinates and fixed columns, Φ (n_rows, n_columns), and tangents T (n_rows, n_tangents), not weighted."""
+    responses = [data.responses(pole) for pole in poles]
+    slopes = [data.slopes(pole, l_r) for pole, l_r in zip(poles, participation)]
+    coordinates, tangents = [], []
     for k in (0, 1):  # real parts, imaginary parts
-        whole = [a[0] @ load.real - a[1] @ load.imag for a, load in zip(answers, loads)]
-        turned = [a[0] @ load.imag + a[1] @ load.real for a, load in zip(answers, loads)]
-        swings += turned if k else whole
-        tangents += [np.column_stack([s[k], a[k]]) for s, a in zip(slopes, answers)]
-    phi = np.column_stack([*swings, drive.fixed]) if swings else drive.fixed
-    return phi, np.hstack(tangents) if tangents else np.zeros((drive.values.shape[0], 0))
+        whole = [a[0] @ l_r.real - a[1] @ l_r.imag for a, l_r in zip(responses, participation)]
+        turned = [a[0] @ l_r.imag + a[1] @ l_r.real for a, l_r in zip(responses, participation)]
+        coordinates += turned if k else whole
+        tangents += [np.column_stack([s[k], a[k]]) for s, a in zip(slopes, responses)]
+    phi = np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed
+    return phi, np.hstack(tangents) if tangents else np.zeros((data.values.shape[0], 0))
 
 
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
     q, r = qr(phi / size, mode="economic", check_finite=False)
     if phi.shape[1] and np.abs(np.diag(r)).min() < 1e-13:
-        raise np.linalg.LinAlgError("modes that cannot be told apart")
+        raise np.linalg.LinAlgError("modes that cannot be distinguished")
     qy, qt = q.T @ y, q.T @ t
     rest = t - q @ qt
     residual = y - q @ qy
@@ -142,20 +149,20 @@ def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
 
 
 def free_parameters(fit: Fit) -> np.ndarray:
-    """Indices of the unknowns searched, real parts first: pole and loads of each mode but the load that is held."""
-    n, p = fit.loads.shape
+    """Indices of the unknowns searched, real parts first: pole and participation of each mode, less the held entry."""
+    n, p = fit.participation.shape
     free = np.ones((n, p + 1), bool)
-    free[np.arange(n), 1 + _held(fit.loads)] = False
+    free[np.arange(n), 1 + _held(fit.participation)] = False
     return np.flatnonzero(np.r_[free.ravel(), free.ravel()])
 
 
-def _held(loads: np.ndarray) -> np.ndarray:
-    return np.argmin(np.abs(loads - 1.0), axis=1)
+def _held(participation: np.ndarray) -> np.ndarray:
+    return np.argmin(np.abs(participation - 1.0), axis=1)
 
 
 def moves(fit: Fit, part: Part) -> np.ndarray:
     """How each unknown moves the outputs of a part along the tangents, (n_tangents, n_unknowns, n_outputs)."""
-    n, q = fit.poles.size, fit.loads.shape[1] + 1
+    n, q = fit.poles.size, fit.participation.shape[1] + 1
     alpha = np.repeat(part.coefficients[:n], q, axis=0)
     beta = np.repeat(part.coefficients[n : 2 * n], q, axis=0)
     k, size = np.arange(n * q), n * q
@@ -167,7 +174,7 @@ def moves(fit: Fit, part: Part) -> np.ndarray:
 
 def normal(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and right-hand side of the free unknowns, outputs in units of their noise."""
-    n, q = fit.poles.size, fit.loads.shape[1] + 1
+    n, q = fit.poles.size, fit.participation.shape[1] + 1
     size, first = n * q, 0
     h, g = np.zeros((2 * size, 2 * size)), np.zeros(2 * size)
     for part in fit.parts:
@@ -189,64 +196,58 @@ def normal(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return h[np.ix_(free, free)], g[free]
 
 
-def search(drive: Drive, poles: np.ndarray, loads: np.ndarray, noise: np.ndarray, most_steps: int = MOST_STEPS) -> Fit:
-    """Levenberg-Marquardt over poles and loads, outputs in units of `noise`."""
-    heard = np.abs(loads) * [np.linalg.norm(np.vstack(drive.answers(pole)), axis=0) for pole in poles]
-    loads = loads / loads[np.arange(poles.size), np.argmax(heard, axis=1)][:, None]
-    fit = projected(drive, poles, loads)
-    cost, damping, small, steps = _cost(fit, noise), 1e-3, False, 0
-    signal = float(((drive.values / noise) ** 2).sum())
-    while steps < most_steps:
-        steps += 1
-        h, g = normal(fit, noise)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
-        while True:
-            try:
-                factor = cho_factor(h * np.outer(scale, scale) + damping * np.eye(g.size))
-            except np.linalg.LinAlgError:
-                damping = max(8.0 * damping, 1e-9)
-                continue
-            move = scale * cho_solve(factor, scale * g)
-            small = float(move @ g) <= max(SETTLED * cost / drive.values.size, ROUND_OFF * signal)
-            trial = _moved(drive, fit, move)
-            cost_there = np.inf if trial is None else _cost(trial, noise)
-            if cost_there <= cost or small or damping > 1e8:
-                break
-            damping *= 8.0
-        if trial is not None and cost_there <= cost:
-            fit, cost = trial, cost_there
-        damping = max(0.1 * damping, 1e-12)
-        if small or damping > 1e6:
-            break
-    return replace(fit, converged=bool(small), steps=steps)
+def search(
+    data: Measurement,
+    poles: np.ndarray,
+    participation: np.ndarray,
+    noise: np.ndarray,
+    most_steps: int = MOST_STEPS,
+    budget: Budget | None = None,
+) -> Fit:
+    """Least squares over poles and participation, outputs in units of `noise`."""
+    strength = np.abs(participation) * [np.linalg.norm(np.vstack(data.responses(pole)), axis=0) for pole in poles]
+    held = participation[np.arange(poles.size), np.argmax(strength, axis=1)]
+    start = projected(data, poles, participation / held[:, None])
+    found = minimise(_OutputError(data, noise), start, most_steps=most_steps, budget=budget)
+    return replace(found.state, converged=found.converged, steps=found.steps)
 
 
-def _moved(drive: Drive, fit: Fit, move: np.ndarray) -> Fit | None:
-    """The fit after a step; None where a pole leaves what is searched or modes cannot be told apart."""
-    n, p = fit.loads.shape
-    whole = np.zeros(2 * n * (p + 1))
-    whole[free_parameters(fit)] = move
-    step = (whole[: whole.size // 2] + 1j * whole[whole.size // 2 :]).reshape(n, p + 1)
-    poles, loads = fit.poles + step[:, 0], fit.loads + step[:, 1:]
-    fastest = drive.highest / np.pi
-    if (poles.imag <= 0).any() or (poles.imag >= drive.highest).any() or (-poles.real > fastest).any():
-        return None
-    if (poles.real > 20.0 * drive.resolution / (2.0 * np.pi)).any():
-        return None
-    try:
-        return projected(drive, poles, loads)
-    except np.linalg.LinAlgError:
-        return None
+class _OutputError:
+    """The `least_squares.Problem` of a measurement."""
+
+    def __init__(self, data: Measurement, noise: np.ndarray) -> None:
+        self.data, self.noise = data, noise
+        self.signal = float(((data.values / noise) ** 2).sum())
+
+    def cost(self, state: Fit) -> float:
+        return float(((state.residual / self.noise) ** 2).sum())
+
+    def normal_equations(self, state: Fit) -> tuple[np.ndarray, np.ndarray]:
+        return normal(state, self.noise)
+
+    def moved(self, state: Fit, step: np.ndarray) -> tuple[Fit | None, np.ndarray]:
+        n, p = state.participation.shape
+        whole = np.zeros(2 * n * (p + 1))
+        whole[free_parameters(state)] = step
+        change = (whole[: whole.size // 2] + 1j * whole[whole.size // 2 :]).reshape(n, p + 1)
+        poles, participation = state.poles + change[:, 0], state.participation + change[:, 1:]
+        highest, fastest = self.data.highest, self.data.highest / np.pi
+        growing = poles.real > MOST_GROWTH * self.data.resolution / (2.0 * np.pi)
+        if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest) | growing).any():
+            return None, step
+        try:
+            return projected(self.data, poles, participation), step
+        except np.linalg.LinAlgError:
+            return None, step
+
+    def negligible(self, decrease: float, cost: float) -> bool:
+        return decrease <= max(NEGLIGIBLE * cost / self.data.values.size, ROUND_OFF * self.signal)
 
 
-def _cost(fit: Fit, noise: np.ndarray) -> float:
-    return float(((fit.residual / noise) ** 2).sum())
-
-
-def settled(drive: Drive, fit: Fit, most_steps: int = MOST_STEPS) -> Fit:
+def settled(data: Measurement, fit: Fit, most_steps: int = MOST_STEPS, budget: Budget | None = None) -> Fit:
     """Searched, weighted by the noise found, and searched again."""
     if fit.poles.size == 0:
         return fit
     for _ in range(2):
-        fit = search(drive, fit.poles, fit.loads, fit.noise, most_steps)
+        fit = search(data, fit.poles, fit.participation, fit.noise, most_steps, budget)
     return fit

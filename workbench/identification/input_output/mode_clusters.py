@@ -1,38 +1,37 @@
-"""Modes that are told as several and are one.
+"""Clusters of identified modes that are one mode of the structure.
 
-Points measured one after another disagree: a moved sensor loads the structure elsewhere, a harder blow rings lower. A
-mode that depends on its amplitude has a skew peak. Modes that all outputs share can follow either only by crowding:
-three and more of them within each other's half-power bands, with shapes that swing in no common phase. One alone then
-tells what is known.
+Points measured one after another are inconsistent: a roving sensor loads the structure elsewhere, a harder hit rings
+lower. A mode that depends on its amplitude has a skew peak. A linear model fits either only by a cluster: three and
+more modes within each other's half-power bands, with complex shapes of no common phase. Only one is then reported.
 """
 
 import numpy as np
 
-# Modes of one structure may overlap in twos; damping couples more of them only by swinging out of phase.
+# Two modes of one structure may overlap; shapes of more than two do so only where damping makes them complex.
 FEWEST, IN_PHASE = 3, 0.95
-NARROW = 3.0  # half-power bands of the strongest: broader ones lead to no further parts
+NARROW = 3.0  # half-power bands of the strongest: broader ones do not extend the cluster
 
 
 def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) -> dict[int, list[int]]:
-    """The modes that stand for a crowd, each with its parts; those that stand for themselves alone are absent.
+    """The representative of each cluster, with its other members; modes in no cluster are absent.
 
     Args:
         poles: (n_modes,) rad/s.
-        collinearity: (n_modes,) modal phase collinearity, 1 where all points swing together.
-        strength: (n_modes,) the strongest of a crowd stands for it.
+        collinearity: (n_modes,) modal phase collinearity, 1 where all points move in phase.
+        strength: (n_modes,) the strongest of a cluster represents it.
     """
     width = np.abs(poles.real)
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width
-    left, crowds = list(np.argsort(-strength)), dict[int, list[int]]()
+    left, clusters = list(np.argsort(-strength)), dict[int, list[int]]()
     while left:
         first = left.pop(0)
-        crowd, leads = [int(first)], [first]
+        cluster, leads = [int(first)], [first]
         while leads:
             lead = leads.pop()
             met = [r for r in left if near[r, lead]]
             left = [r for r in left if r not in met]
-            crowd += [int(r) for r in met]
+            cluster += [int(r) for r in met]
             leads += [r for r in met if width[r] < NARROW * width[first]]
-        if len(crowd) >= FEWEST and collinearity[crowd].min() < IN_PHASE:
-            crowds[crowd[0]] = crowd[1:]
-    return crowds
+        if len(cluster) >= FEWEST and collinearity[cluster].min() < IN_PHASE:
+            clusters[cluster[0]] = cluster[1:]
+    return clusters

@@ -1,22 +1,29 @@
-"""Which modes a measurement holds, whatever drives them, decided by likelihood."""
+"""Which modes a measurement holds, whatever excites them, by stepwise selection."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.identified import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE
-from workbench.identification.input_output.modal_fit import Drive, Fit, projected, search, settled
+from workbench.identification.input_output.modal_fit import Fit, Measurement, projected, search, settled
+from workbench.identification.signal.budget import Budget
+from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Stepwise
 from workbench.structure.modes import mac
 
-MOST_REFUSALS = 3
-MOST_ROUNDS = 4
+# Candidates below the limit one after the other from which on only noise is left.
+MOST_WEAK = 3
+# Steps of a fit that only decides whether a mode enters, or leaves.
+STEPS_IN, STEPS_OUT = 20, 12
+# A candidate is tried from this share of the limit on: fitted with the others it may gain more.
+ENTER = 0.5
+# Times the limit, and bandwidths to the next mode, below which a mode is tried again.
+WEAK, CLOSE = 4.0, 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """Modes told from noise.
+class Selected:
+    """Modes selected.
 
     Attributes:
         fit: of them all.
@@ -31,71 +38,96 @@ class Told:
     full: bool
 
 
-def tell(drive: Drive, *, most_modes: int, false_alarm: float = FALSE_ALARM) -> Told:
+def select_modes(
+    data: Measurement, *, most_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
+) -> Selected:
     """The modes whose likelihood ratio is more than noise would give, taken in one by one and each tried again."""
-    outputs, drives = drive.values.shape[1], drive.answers((-0.1 + 0.5j) * drive.highest)[0].shape[1]
-    limit = float(chi2.isf(false_alarm / drive.cells, 2 * (outputs + drives)))
-    fit = projected(drive, np.zeros(0, complex), np.zeros((0, drives), complex))
-    full = False
-    for _ in range(MOST_ROUNDS):
-        grown = _grown(drive, fit, limit, most_modes)
-        kept = _pruned(drive, settled(drive, grown), limit)
-        ended = kept.poles.size <= fit.poles.size or kept.poles.size == grown.poles.size
-        fit, full = kept, grown.poles.size >= most_modes
-        if ended:
-            break
+    budget = Budget() if budget is None else budget
+    problem = _Modes(data, false_alarm, budget)
+    selection = Stepwise(problem, most_modes, MOST_WEAK, None, forgets=True, budget=budget)
+    fit = selection.select(projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex)))
     order = np.argsort(np.abs(fit.poles))
     evidence = np.array([evidence_of(fit, r) for r in order])
-    fit = replace(projected(drive, fit.poles[order], fit.loads[order]), converged=fit.converged, steps=fit.steps)
-    return Told(fit, evidence, limit, full)
+    ordered = projected(data, fit.poles[order], fit.participation[order])
+    return Selected(replace(ordered, converged=fit.converged, steps=fit.steps), evidence, problem.limit, selection.full)
 
 
-def _grown(drive: Drive, fit: Fit, limit: float, most_modes: int) -> Fit:
-    refused: list[complex] = []
-    while fit.poles.size < most_modes and len(refused) < MOST_REFUSALS:
-        tries = [pole for pole in _to_try(drive, fit) if not _near(drive, pole, refused)]
-        bases, left = bases_of(drive, fit), fit.residual / fit.noise
-        scored = [(*_added(drive, bases, left, pole), pole) for pole in tries]
+class _Modes:
+    """The `order_selection.Problem` of a measurement; a candidate is a pole and its participation."""
+
+    def __init__(self, data: Measurement, false_alarm: float, budget: Budget) -> None:
+        self.data, self.budget = data, budget
+        self.excitations = data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
+        self.limit = float(chi2.isf(false_alarm / data.cells, 2 * (data.values.shape[1] + self.excitations)))
+
+    def n_modes(self, model: Fit) -> int:
+        return model.poles.size
+
+    def pole_of(self, candidate: tuple[complex, np.ndarray]) -> complex:
+        return candidate[0]
+
+    def strongest(self, model: Fit, rejected: list[tuple[complex, float]]) -> tuple[complex, np.ndarray] | None:
+        tries = [pole for pole in _to_try(self.data, model) if not self._near(pole, rejected)]
+        bases, left = bases_of(self.data, model), model.residual / model.noise
+        scored = [(*_added(self.data, bases, left, pole), pole) for pole in tries]
         if not scored:
-            break
-        strength, load, pole = max(scored, key=lambda item: item[0])
-        colour = drive.colour(fit.residual / fit.noise, pole)
-        if strength < 0.5 * limit * colour:
-            break
-        try:
-            trial = search(drive, np.append(fit.poles, pole), np.vstack([fit.loads, load]), fit.noise, 20)
-            gain = ratio(drive, fit, trial)
-        except np.linalg.LinAlgError:
-            gain = 0.0
-        if gain < limit * colour or no_modes(drive, trial).any():
-            refused.append(pole)
-        else:
-            fit, refused = trial, []
-    return fit
+            return None
+        strength, participation, pole = max(scored, key=lambda item: item[0])
+        return None if strength < ENTER * self.threshold(model, pole) else (pole, participation)
+
+    def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
+        poles = np.append(model.poles, candidate[0])
+        participation = np.vstack([model.participation, candidate[1]])
+        return search(self.data, poles, participation, model.noise, STEPS_IN, self.budget)
+
+    def gain(self, smaller: Fit, larger: Fit) -> float:
+        """The noise of each output unknown."""
+        n = self.data.values.shape[0]
+        first, second = ((fit.residual**2).sum(axis=0) for fit in (smaller, larger))
+        floor = 1e-24 * (self.data.values**2).sum(axis=0) + 1e-300
+        return float(n * np.log((first + floor) / (second + floor)).sum())
+
+    def threshold(self, model: Fit, pole: complex) -> float:
+        return self.limit * self.data.noise_ratio(model.residual / model.noise, pole)
+
+    def splits(self, model: Fit, trial: Fit) -> bool:
+        return bool(_spurious(self.data, trial).any())
+
+    def settled(self, model: Fit) -> Fit:
+        return settled(self.data, model, budget=self.budget)
+
+    def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
+        """Those that are spurious, weak, or close to another."""
+        spurious = _spurious(self.data, model)
+        for r, pole in enumerate(model.poles):
+            near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < CLOSE * abs(pole.real)
+            if spurious[r] or near or evidence_of(model, r) < WEAK * self.threshold(model, pole):
+                rest = np.delete(np.arange(model.poles.size), r)
+                without = projected(self.data, model.poles[rest], model.participation[rest])
+                yield complex(pole), settled(self.data, without, STEPS_OUT, self.budget), bool(spurious[r])
+
+    def _near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
+        return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
 
 
-def _to_try(drive: Drive, fit: Fit) -> np.ndarray:
-    """What stands out of the residual, and what may hide beside the modes there already."""
-    width = np.maximum(np.abs(fit.poles.real), 0.5 * drive.resolution)
+def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
+    """Peaks of the residual, and poles beside the modes so far, which may mask others."""
+    width = np.maximum(np.abs(fit.poles.real), 0.5 * data.resolution)
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
-    tries = np.concatenate([drive.candidates(fit.residual / fit.noise), *beside])
-    return tries[(tries.imag > 0) & (tries.imag < drive.highest) & (-tries.real < MOST_DAMPED * np.abs(tries))]
+    tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
+    return tries[(tries.imag > 0) & (tries.imag < data.highest) & (-tries.real < MOST_DAMPED * np.abs(tries))]
 
 
-def _near(drive: Drive, pole: complex, others: Sequence[complex]) -> bool:
-    return any(abs(pole.imag - o.imag) < max(drive.resolution, 0.5 * abs(o.real)) for o in others)
+def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
+    """χ² by which one more pole lowers the misfit, residues unconstrained, and the best participation of rank one.
 
-
-def _added(drive: Drive, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
-    """χ² by which one more pole lowers the misfit, each output answering each drive as it likes; the loads it wants.
-
-    Of its answer only what stands off the basis of the columns there already is new.
+    Only the part of its response outside the basis of the columns so far counts.
     """
-    real, imaginary = drive.answers(pole)
+    real, imaginary = data.responses(pole)
     columns, size, strength, wanted = np.hstack([real, imaginary]), real.shape[1], 0.0, []
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    together = [left] if drive.weights is None else np.hsplit(left, left.shape[1])
-    for weights, basis, rest in zip(weights_of(drive), bases, together, strict=True):
+    together = [left] if data.weights is None else np.hsplit(left, left.shape[1])
+    for weights, basis, rest in zip(weights_of(data), bases, together, strict=True):
         weighted = weights * columns / scale
         apart = weighted - basis @ (basis.T @ weighted)
         u, s, vt = np.linalg.svd(apart, full_matrices=False)
@@ -103,57 +135,49 @@ def _added(drive: Drive, bases: list[np.ndarray], left: np.ndarray, pole: comple
         seen = u.T[good] @ rest
         wanted.append((vt.T[:, good] / s[good]) @ seen / scale[:, None])
         strength += float((seen**2).sum())
-    c = np.hstack(wanted)
-    heard = np.hypot(scale[:size], scale[size:])
-    load = np.linalg.svd((c[:size] - 1j * c[size:]) * heard[:, None])[0][:, 0] / heard
-    return strength, load
+    residues = np.hstack(wanted)
+    norm = np.hypot(scale[:size], scale[size:])
+    participation = np.linalg.svd((residues[:size] - 1j * residues[size:]) * norm[:, None])[0][:, 0] / norm
+    return strength, participation
 
 
-def bases_of(drive: Drive, fit: Fit) -> list[np.ndarray]:
-    """What `basis_of` says, as the outputs weigh it: one for each, or one for all of equal weights."""
-    return [basis_of(drive, fit, weights) for weights in weights_of(drive)]
+def bases_of(data: Measurement, fit: Fit) -> list[np.ndarray]:
+    """Of `basis_of`: one for each output, or one for all of equal weights."""
+    return [basis_of(data, fit, weights) for weights in weights_of(data)]
 
 
-def weights_of(drive: Drive) -> list[np.ndarray]:
+def weights_of(data: Measurement) -> list[np.ndarray]:
     """Of each output (n_rows, 1), in units of their mean; of all together where they are the same in all rows."""
-    if drive.weights is None:
+    if data.weights is None:
         return [np.ones((1, 1))]
-    return list((drive.weights / np.sqrt((drive.weights**2).mean(axis=0))).T[:, :, None])
+    return list((data.weights / np.sqrt((data.weights**2).mean(axis=0))).T[:, :, None])
 
 
-def basis_of(drive: Drive, fit: Fit, weights: np.ndarray | float = 1.0) -> np.ndarray:
-    """Orthonormal columns (n_rows, n_columns) that span the swings of a fit and what is fixed beside them, weighted."""
-    swings = []
-    for pole, load in zip(fit.poles, fit.loads):
-        real, imaginary = drive.answers(pole)
-        swings += [real @ load.real - imaginary @ load.imag, real @ load.imag + imaginary @ load.real]
-    phi = weights * (np.column_stack([*swings, drive.fixed]) if swings else drive.fixed)
+def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> np.ndarray:
+    """Orthonormal basis (n_rows, n_columns) of the modal coordinates of a fit and the fixed columns, weighted."""
+    coordinates = []
+    for pole, l_r in zip(fit.poles, fit.participation):
+        real, imaginary = data.responses(pole)
+        coordinates += [real @ l_r.real - imaginary @ l_r.imag, real @ l_r.imag + imaginary @ l_r.real]
+    phi = weights * (np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed)
     return np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))[0]
 
 
-def ratio(drive: Drive, before: Fit, after: Fit) -> float:
-    """Twice the log likelihood ratio, the noise of each output unknown."""
-    n = drive.values.shape[0]
-    first, second = ((fit.residual**2).sum(axis=0) for fit in (before, after))
-    floor = 1e-24 * (drive.values**2).sum(axis=0) + 1e-300
-    return float(n * np.log((first + floor) / (second + floor)).sum())
-
-
-def no_modes(drive: Drive, fit: Fit) -> np.ndarray:
-    """Which are damped beyond what rings, or split another mode that has their shape and their band."""
+def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
+    """Which are damped too much to ring, or split another mode that has their shape, participation and band."""
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
     strength = np.array([evidence_of(fit, r) for r in range(poles.size)])
-    band = np.abs(poles.real)[:, None] + np.abs(poles.real) + drive.resolution
+    band = np.abs(poles.real)[:, None] + np.abs(poles.real) + data.resolution
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-    alike = mac(shapes, shapes) * mac(fit.loads.T, fit.loads.T)
-    one = shapes.shape[0] * fit.loads.shape[1] == 1
+    alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
+    one = shapes.shape[0] * fit.participation.shape[1] == 1
     split = near & (alike > SAME_SHAPE) & (strength[:, None] < strength) & (not one)
     return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
 
 
 def evidence_of(fit: Fit, r: int) -> float:
-    """χ² of a mode's shape in the noise, poles and loads held."""
+    """χ² of a mode's shape in the noise, poles and participation held."""
     both, noise, found = [r, fit.poles.size + r], fit.noise, 0.0
     first = 0
     for part in fit.parts:
@@ -161,23 +185,3 @@ def evidence_of(fit: Fit, r: int) -> float:
         first += c.shape[1]
         found += float((c * np.linalg.solve(part.spread[np.ix_(both, both)], c)).sum())
     return found
-
-
-def _pruned(drive: Drive, fit: Fit, limit: float) -> Fit:
-    """Without the modes that the likelihood does not miss."""
-    while fit.poles.size:
-        trials = []
-        damped = no_modes(drive, fit)
-        for r, pole in enumerate(fit.poles):
-            near = np.abs(np.delete(fit.poles, r) - pole).min(initial=np.inf) < 2.0 * abs(pole.real)
-            need = limit * drive.colour(fit.residual / fit.noise, pole)
-            if damped[r] or near or evidence_of(fit, r) < 4.0 * need:
-                rest = np.delete(np.arange(fit.poles.size), r)
-                without = settled(drive, projected(drive, fit.poles[rest], fit.loads[rest]), 12)
-                gain = ratio(drive, without, fit)
-                if damped[r] or gain < need:
-                    trials.append((gain, without))
-        if not trials:
-            return fit
-        fit = min(trials, key=lambda item: item[0])[1]
-    return fit

@@ -1,9 +1,9 @@
-"""How the noise of each output runs along frequency, read off what a fit leaves, to weigh every line by its own.
+"""The noise spectrum of each output, estimated from the residual of a fit, to weight every line by its own noise.
 
 In the cosine transform of a record of n samples, noise of spectrum S is independent from line to line, line k of
-variance S(πk / nΔt), the closer the steeper S falls, for the transform sees no jump between a record's ends (Ahmed,
+variance S(πk / nΔt), even where S falls steeply, for the transform sees no jump between a record's ends (Ahmed,
 Natarajan & Rao, IEEE Trans. Comput. C-23, 1974). S is that of y_k = Σ_i a_i y_k-i + e_k, by Burg's recursion, as many
-terms as lower n ln var(e) + p ln n; before, each line gets back what the fit took of its noise, its leverage.
+terms as lower n ln var(e) + p ln n; before, each line gets back its leverage, the share of its noise that the fit took.
 """
 
 from collections.abc import Sequence
@@ -11,11 +11,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.fft import dct, idct
 
-from workbench.identification.free_decay.coloured_noise import ORDER, ROUNDING, SAMPLES_EACH, white
-from workbench.identification.signal.noise_levels import differ, variances
+from workbench.identification.signal.noise import ORDER, ROUNDING, SAMPLES_EACH, differ, variances, white
 
+# Root mean square of log ratios below which two spectra are the same.
 ALIKE = 0.1
-# Of a line that a fit took whole nothing is known.
+# Leverage at most: a line that the fit took whole says nothing of its noise.
 MOST_TAKEN = 0.9
 
 
@@ -29,7 +29,7 @@ def samples_of(lines: np.ndarray) -> np.ndarray:
     return idct(lines, axis=0, norm="ortho")
 
 
-def course(
+def noise_spectrum(
     left: Sequence[np.ndarray],
     whole: Sequence[np.ndarray],
     taken: Sequence[np.ndarray],
@@ -39,12 +39,12 @@ def course(
     """Standard deviation of the noise at each line of each record, (n_samples, n_outputs) each, over their rms.
 
     Args:
-        left: of each record, (n_samples, n_outputs): what a fit leaves.
+        left: of each record, (n_samples, n_outputs): the residual.
         whole: of each record, what was measured.
-        taken: of each record, (n_samples, n_outputs): share of the noise of each line that the fit has taken with it,
-            which is made good: about its modes a spectrum of what is left is too low.
+        taken: of each record, (n_samples, n_outputs): share of the noise of each line that the fit took,
+            which is made good: about its modes the spectrum of the residual is too low.
         n_modes: of the fit.
-        free: (n_records,) degrees of freedom of what is left.
+        free: (n_records,) degrees of freedom of the residual.
 
     Returns:
         None where the noise may be white, and as loud in all records, or is round-off.
@@ -73,7 +73,7 @@ def course(
 
 
 def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) -> bool:
-    """Whether noise runs along the lines of all records as another does."""
+    """Whether two noise spectra are the same."""
     if one is None or other is None:
         return one is other
     return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < ALIKE)

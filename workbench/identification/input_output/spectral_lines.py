@@ -1,15 +1,19 @@
-"""Lines of measured transfer functions, as a fit of modes sees them: a `modal_fit.Drive`."""
+"""Lines of measured transfer functions, as a `modal_fit.Measurement`, and their noise."""
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.ndimage import median_filter
+from scipy.stats import chi2, spearmanr
 
-from workbench.identification.free_decay.identified import MOST_DAMPED
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import bases_of, weights_of
+from workbench.identification.signal.order_selection import MOST_DAMPED
 
 MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
-# Widths beside a mode, and the chance that even noise is taken for uneven.
+# Half-power bandwidths beside a mode, and the chance that even noise is taken for louder.
 DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
+# Chance that even noise is taken for uneven; and b |H| / a at the median line, from nothing to all.
+UNEVEN, SHARES = 1e-4, np.geomspace(1e-3, 1e3, 61)
+SMOOTHED = 5  # lines
 
 
 class Lines:
@@ -25,7 +29,7 @@ class Lines:
         s = 1j * omega / omega[-1]
         self.fixed = self._stacked(np.array([self._of(i, s**p) for i in range(self.refs) for p in powers]))
         self.resolution = float(np.diff(omega).min())
-        # A pole may leave the band: one close beyond it is no constant there. It counts among what is left out.
+        # A pole may leave the band: one close beyond it is no constant there. Such poles are residual terms.
         self.highest = 2.0 * float(omega[-1])
         span = omega[-1] - omega[0]
         self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), RATES)
@@ -44,17 +48,17 @@ class Lines:
         real, imaginary = np.split(rows, 2)
         return (real + 1j * imaginary).T.reshape(-1, self.refs, self.lines)
 
-    def answers(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+    def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         s = 1j * self.omega
         above, below = 1.0 / (s - pole), 1.0 / (s - pole.conjugate())
         pair = (0.5 * (above + below), -0.5j * (above - below))
         real, imaginary = (self._stacked(np.array([self._of(i, x) for i in range(self.refs)])) for x in pair)
         return real, imaginary
 
-    def slopes(self, pole: complex, loads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         s = 1j * self.omega
-        above = loads[:, None] / (s - pole) ** 2
-        below = loads.conj()[:, None] / (s - pole.conjugate()) ** 2
+        above = participation[:, None] / (s - pole) ** 2
+        below = participation.conj()[:, None] / (s - pole.conjugate()) ** 2
         pair = (0.5 * (above + below), -0.5j * (above - below))
         real, imaginary = (self._stacked(x[None])[:, 0] for x in pair)
         return real, imaginary
@@ -81,21 +85,21 @@ class Lines:
         return self.unstacked((self.values - fit.residual) / (1.0 if self.weights is None else self.weights))
 
     def left(self, fit: Fit) -> np.ndarray:
-        """What the model leaves at the lines, (n_outputs, n_references, n_frequencies)."""
+        """The residual at the lines, (n_outputs, n_references, n_frequencies)."""
         return self.unstacked(fit.residual / (1.0 if self.weights is None else self.weights))
 
     def misfit(self, fit: Fit) -> np.ndarray:
-        """Rms of what is left of each output, (n_outputs,), in units of the noise where that was told."""
+        """Rms of the residual of each output, (n_outputs,), in units of the noise where that was stated."""
         if not self.guessed:
             return fit.noise
         raw = fit.residual / self.weights
         return fit.noise * np.sqrt((raw**2).sum(axis=0) / (fit.residual**2).sum(axis=0))
 
-    def louder_near(self, fit: Fit) -> np.ndarray:
-        """What is left about each mode as the mode hears it, in power, over the mean of all lines, (n_modes,).
+    def noise_ratio_near(self, fit: Fit) -> np.ndarray:
+        """κ, the power of the residual about each mode over the mean of all lines, (n_modes,).
 
-        It is heard by swings a few widths beside the mode, each output as much as it shows the mode. 1 where that may
-        be noise alike at all lines.
+        It is measured by poles a few half-power bandwidths beside the mode, outputs weighted by their amplitude. 1
+        where the noise may be the same at all lines.
         """
         residual, noise = fit.residual / fit.noise, fit.noise
         found = np.ones(fit.poles.size)
@@ -105,26 +109,56 @@ class Lines:
         for r, pole in enumerate(fit.poles):
             shown = (np.abs(fit.amplitudes[:, r]) / noise) ** 2
             width = max(abs(pole.real), 0.5 * self.resolution)
-            heard = []
+            noise_ratio = []
             for beside in pole.imag + width * DETUNED:
                 if self.omega[0] < beside < self.omega[-1]:
-                    columns = np.hstack(self.answers(-width + 1j * beside))
+                    columns = np.hstack(self.responses(-width + 1j * beside))
                     power = []
                     for basis, weight, rest in zip(bases, weights, np.split(residual, len(bases), axis=1), strict=True):
-                        # of the rest the amplitudes have taken the noise
+                        # The amplitudes took the noise along the basis.
                         x = weight * columns - basis @ (basis.T @ (weight * columns))
                         power.append((x.T @ rest) ** 2 / (x**2).sum(axis=0)[:, None])
-                    heard.append(np.hstack(power))
-            if not heard:
+                    noise_ratio.append(np.hstack(power))
+            if not noise_ratio:
                 continue
-            power = np.mean(heard, axis=(0, 1)) @ shown / shown.sum()
-            degrees = np.size(heard) / shown.size * shown.sum() ** 2 / (shown**2).sum()
+            power = np.mean(noise_ratio, axis=(0, 1)) @ shown / shown.sum()
+            degrees = np.size(noise_ratio) / shown.size * shown.sum() ** 2 / (shown**2).sum()
             found[r] = power if power > chi2.isf(LOUDER, degrees) / degrees else 1.0
         return found
 
-    def colour(self, residual: np.ndarray, pole: complex) -> float:
+    def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))
         at = int(np.argmin(np.abs(self.omega - pole.imag)))
         beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
         # The median of a power of two degrees of freedom and more is at most its mean.
         return max(1.0, float(np.median(beside) / power.mean()))
+
+
+def noise_with_size(left: np.ndarray, fitted: np.ndarray) -> np.ndarray | None:
+    """Relative noise of every line, (n_outputs, n_references, n_lines); None where it may be the same at all.
+
+    s² = a² + b² |H|² of each output: its sensor's own noise, and that of the force or of too few averages. What a fit
+    has not yet found is smooth from line to line, noise is not: where lines are evenly spaced, r_k less the mean of
+    r_k-1 and r_k+1 is noise alone, 3/2 s² of it. H is the fit's own, for a measured H goes with its noise; where a mode
+    is not yet found it is the running median of the measured.
+
+    Args:
+        left: the residual, complex, of that shape.
+        fitted: the fit, of that shape.
+    """
+    inner = np.arange(1, left.shape[-1] - 1, 3)  # every third: no line counts twice
+    rough = np.abs(left[..., inner] - 0.5 * (left[..., inner - 1] + left[..., inner + 1]))
+    seen = median_filter(np.abs(fitted + left), (1, 1, SMOOTHED))
+    size, found, uneven = np.maximum(np.abs(fitted), seen), np.ones(left.shape), False
+    for j, (each, of) in enumerate(zip(rough, size[..., inner], strict=True)):
+        typical = float(np.median(of))
+        if typical <= 0.0 or np.median(each) <= 0.0:
+            continue
+        if spearmanr(each.ravel(), of.ravel(), alternative="greater").pvalue > UNEVEN:
+            continue
+        # Least absolute errors of log s: the few lines of a mode not yet found count little.
+        logs = [np.log(each) - 0.5 * np.log1p((share * of / typical) ** 2) for share in SHARES]
+        errors = [np.abs(log - np.median(log)).sum() for log in logs]
+        found[j] = np.sqrt(1.0 + (SHARES[int(np.argmin(errors))] * size[j] / typical) ** 2)
+        uneven = True
+    return found if uneven else None

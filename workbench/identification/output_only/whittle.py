@@ -1,12 +1,12 @@
-"""Most likely modes of a spectrum: outputs that unknown forces drive, each mode in its own band.
+"""Maximum likelihood modes of a spectrum: outputs under unknown forces, each mode in its own band.
 
 Transforms of a long record are independent from line to line, normal, of covariance S(ω_k) (Whittle, 1953), and S is
 the transform of R(k) = Re Σ φ_r c_r^T e^{λ_r k Δt}, k > 0,
 
     S = Z + Z^H + B,   Z = ½ Σ_r [φ_r c_r^T g(μ_r) + conjugates of φ_r, c_r, μ_r],   g(μ) = μ / (z - μ)
 
-with z = e^{iωΔt}, μ = e^{λΔt}, nothing left out between samples. B, Hermitian, is the same over a band: noise of the
-sensors, and what forces and modes elsewhere leave there; forces need be white no further than a band is wide. So
+with z = e^{iωΔt}, μ = e^{λΔt}, exact for sampled signals. B, Hermitian and linear over a band, is the noise of the
+sensors and what forces and modes elsewhere add there; forces need be white no further than a band is wide. So
 
     L = -Σ_k (ln det S_k + tr S_k^-1 P_k),     F_ab = Σ_k tr(S_k^-1 ∂_a S_k S_k^-1 ∂_b S_k)
 
@@ -20,18 +20,24 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal.windows import tukey
 
-# A taper at both ends keeps strong modes from leaking into far weak ones.
+from workbench.identification.signal.budget import Budget
+from workbench.identification.signal.least_squares import minimise
+
+# Share of the record that is tapered at its ends, so that strong modes do not leak into weak ones.
 TAPERED = 0.1
-# A band reaches so many half-widths, and lines, beyond its modes, and is averaged to so many parts of a half-width.
+# Half-widths, and lines, by which a band reaches beyond its modes; averages to a half-width, and to a band at most.
 REACH, LEAST_LINES, PARTS, MOST_PARTS = 20.0, 40, 6, 400
 # Modes so many half-widths apart, both taken together, are fitted together.
 TOGETHER = 10.0
+# Of the polynomial in frequency of the noise B.
 DEGREE = 1
-MOST_STEPS, MOST_SWEEPS, SETTLED = 40, 3, 1e-2
-LEAST_TOLD = 1e-10
-# A mode narrower than so many lines would answer single ones, and no record is too unlikely for that.
+# Scoring steps, sweeps over all bands, and the decrease of -L below which a step is negligible.
+MOST_STEPS, MOST_SWEEPS, NEGLIGIBLE = 40, 3, 1e-2
+# Least eigenvalue of the scaled information; what lies below is as uncertain as can be.
+LEAST_IDENTIFIABLE = 1e-10
+# Lines of the narrowest half-width: one narrower would fit single lines, and the likelihood would have no bound.
 NARROWEST = 3.0
-# Nor for a spectrum that is singular at a line, across what is seen there: the mean of a few lines keeps it from that.
+# Least share of the mean over a few lines that S keeps in each direction: singular at one line it would have no bound.
 LEAST_OF_MEAN = 0.05
 
 
@@ -67,22 +73,22 @@ class Spectrum:
 
 
 @dataclass(frozen=True, eq=False)
-class Swing:
-    """A mode as a spectrum holds it: pole, shape φ and drive c, (n_directions,) complex each."""
+class SpectralMode:
+    """A mode in a spectrum: pole, shape φ and excitation c, (n_directions,) complex each."""
 
     pole: complex
     shape: np.ndarray
-    drive: np.ndarray
+    excitation: np.ndarray
 
     @property
     def height(self) -> float:
-        """Of its peak, over what a whole sample time would give."""
-        return float(np.linalg.norm(self.shape) * np.linalg.norm(self.drive) / abs(self.pole.real))
+        """Of its peak, relative."""
+        return float(np.linalg.norm(self.shape) * np.linalg.norm(self.excitation) / abs(self.pole.real))
 
     def spectrum(self, z: np.ndarray, dt: float) -> np.ndarray:
-        """What it gives S at z, (n_lines, n_directions, n_directions)."""
+        """Its contribution to S at z, (n_lines, n_directions, n_directions)."""
         mu = np.exp(self.pole * dt)
-        a = 0.5 * np.outer(self.shape, self.drive)
+        a = 0.5 * np.outer(self.shape, self.excitation)
         half = a * _resonance(mu, z)[:, None, None] + a.conj() * _resonance(mu.conj(), z)[:, None, None]
         return half + _adjoint(half)
 
@@ -92,42 +98,44 @@ class Band:
     """Modes fitted together.
 
     Attributes:
-        swings: the modes.
+        modes: the modes.
         covariance: (2 n, 2 n) of Re λ, then Im λ.
         cost: -L at the end.
         converged: whether the search ended because the step was small.
     """
 
-    swings: tuple[Swing, ...]
+    modes: tuple[SpectralMode, ...]
     covariance: np.ndarray
     cost: float
     converged: bool
 
 
-def fit_bands(spectrum: Spectrum, swings: Sequence[Swing]) -> list[tuple[list[int], Band]]:
-    """The most likely modes near those given: bands, each with the indices of its modes.
+def fit_bands(
+    spectrum: Spectrum, modes: Sequence[SpectralMode], budget: Budget | None = None
+) -> list[tuple[list[int], Band]]:
+    """The maximum likelihood modes near those given: bands, each with the indices of its modes.
 
-    What a mode gives to other bands is taken from the last fit of its own, until no pole moves any more.
+    The contribution of a mode to other bands is that of the last fit of its own, until no pole moves any more.
     """
-    found, groups = list(swings), bands(spectrum, [swing.pole for swing in swings])
+    found, groups = list(modes), bands(spectrum, [mode.pole for mode in modes])
     for sweep in range(MOST_SWEEPS):
-        before = np.array([swing.pole for swing in found])
+        before = np.array([mode.pole for mode in found])
         fitted = []
         for group in groups:
-            others = [swing for r, swing in enumerate(found) if r not in group]
-            band = fit_band(spectrum, [found[r] for r in group], others)
+            others = [mode for r, mode in enumerate(found) if r not in group]
+            band = fit_band(spectrum, [found[r] for r in group], others, budget=budget)
             fitted.append((group, band))
-            for r, swing in zip(group, band.swings, strict=True):
-                found[r] = swing
+            for r, mode in zip(group, band.modes, strict=True):
+                found[r] = mode
         std = np.sqrt(np.concatenate([np.diag(band.covariance).reshape(2, -1).sum(axis=0) for _, band in fitted]))
-        moved = np.abs(np.array([swing.pole for swing in found]) - before)[np.concatenate(groups).astype(int)]
+        moved = np.abs(np.array([mode.pole for mode in found]) - before)[np.concatenate(groups).astype(int)]
         if len(groups) == 1 or (sweep and (moved < 0.05 * std).all()):
             break
     return fitted
 
 
 def bands(spectrum: Spectrum, poles: Sequence[complex]) -> list[list[int]]:
-    """Indices of the modes that cannot be told one without the other."""
+    """Indices of the modes that are fitted together, one list a band."""
     groups: list[list[int]] = []
     for r in np.argsort(np.imag(poles)):
         if groups and any(
@@ -140,96 +148,91 @@ def bands(spectrum: Spectrum, poles: Sequence[complex]) -> list[list[int]]:
     return groups
 
 
-def started(spectrum: Spectrum, pole: complex, shape: np.ndarray) -> Swing:
+def initial_mode(spectrum: Spectrum, pole: complex, shape: np.ndarray) -> SpectralMode:
     """A mode of known pole and shape, as strong as its peak."""
     dt = spectrum.sample_time
     width = max(abs(pole.real), 1.1 * NARROWEST * spectrum.spacing)
     lines = _lines(spectrum, pole.imag - width, pole.imag + width)
     power = (np.abs(shape.conj() @ spectrum.values[:, lines]) ** 2).mean() / np.linalg.norm(shape) ** 4
-    return Swing(-width + 1j * pole.imag, shape.astype(complex), power * width * dt * shape.conj())
+    return SpectralMode(-width + 1j * pole.imag, shape.astype(complex), power * width * dt * shape.conj())
 
 
 def fit_band(
     spectrum: Spectrum,
-    swings: Sequence[Swing],
-    others: Sequence[Swing],
-    about: Sequence[Swing] | None = None,
+    modes: Sequence[SpectralMode],
+    others: Sequence[SpectralMode],
+    about: Sequence[SpectralMode] | None = None,
     most_steps: int = MOST_STEPS,
+    budget: Budget | None = None,
 ) -> Band:
-    """The modes of one band, what the others give it held, by Fisher scoring; the band `about` some modes, or these."""
-    task, swings = posed(spectrum, swings, others, swings if about is None else about)
-    background = task.start(swings)
-    cost, damping, settled = task.cost(swings, background), 1e-3, False
-    for _ in range(most_steps):
-        fisher, slope = task.scores(swings, background)
-        scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
-        matrix, steep, one = fisher * np.outer(scale, scale), scale * slope, np.eye(slope.size)
-        settled = steep @ np.linalg.solve(matrix + LEAST_TOLD * one, steep) < SETTLED
-        there = np.inf
-        while not settled and there > cost and damping < 1e6:
-            trial = task.moved(swings, background, scale * np.linalg.solve(matrix + damping * one, steep))
-            there = task.cost(*trial)
-            damping *= 8.0
-        if there > cost:
-            break
-        (swings, background), cost, damping = trial, there, max(damping / 80.0, 1e-9)
-    fisher, _ = task.scores(swings, background)
+    """The modes of one band, the contribution of the others held, by Fisher scoring; the band `about` some modes."""
+    likelihood, modes = posed(spectrum, modes, others, modes if about is None else about)
+    start = modes, likelihood.start(modes)
+    found = minimise(likelihood, start, most_steps=most_steps, budget=budget)
+    modes, background = found.state
+    fisher, _ = likelihood.normal_equations((modes, background))
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
     values, vectors = np.linalg.eigh(fisher * np.outer(scale, scale))
-    # What cannot be told is as uncertain as can be, not certain.
-    whole = (vectors / np.maximum(values, LEAST_TOLD)) @ vectors.T * np.outer(scale, scale)
-    at = task.size * np.arange(len(swings))
+    # What the record does not determine is as uncertain as can be, not certain.
+    whole = (vectors / np.maximum(values, LEAST_IDENTIFIABLE)) @ vectors.T * np.outer(scale, scale)
+    at = likelihood.size * np.arange(len(modes))
     both = np.r_[at, at + 1].astype(int)
-    return Band(tuple(swings), whole[np.ix_(both, both)], cost, bool(settled))
+    return Band(tuple(modes), whole[np.ix_(both, both)], found.cost, found.converged)
 
 
 def posed(
-    spectrum: Spectrum, swings: Sequence[Swing], others: Sequence[Swing], about: Sequence[Swing]
-) -> tuple["Task", tuple[Swing, ...]]:
+    spectrum: Spectrum, modes: Sequence[SpectralMode], others: Sequence[SpectralMode], about: Sequence[SpectralMode]
+) -> tuple["BandLikelihood", tuple[SpectralMode, ...]]:
     """The likelihood of a band, and its modes with the largest entry of each shape 1, which is held."""
-    held = [int(np.argmax(np.abs(swing.shape))) for swing in swings]
-    each = zip(swings, [swing.shape[k] for swing, k in zip(swings, held, strict=True)], strict=True)
-    scaled = tuple(replace(swing, shape=swing.shape / by, drive=swing.drive * by) for swing, by in each)
-    return Task(spectrum, others, about, held), scaled
+    held = [int(np.argmax(np.abs(mode.shape))) for mode in modes]
+    each = zip(modes, [mode.shape[k] for mode, k in zip(modes, held, strict=True)], strict=True)
+    scaled = tuple(replace(mode, shape=mode.shape / by, excitation=mode.excitation * by) for mode, by in each)
+    return BandLikelihood(spectrum, others, about, held), scaled
 
 
-class Task:
+State = tuple[tuple[SpectralMode, ...], np.ndarray]  # modes and background
+
+
+class BandLikelihood:
     """One band: unknowns are, mode by mode, Re λ, Im λ, φ but its largest entry, c, and then B."""
 
-    def __init__(self, spectrum: Spectrum, others: Sequence[Swing], about: Sequence[Swing], held: list[int]) -> None:
+    def __init__(
+        self, spectrum: Spectrum, others: Sequence[SpectralMode], about: Sequence[SpectralMode], held: list[int]
+    ) -> None:
         self.z, power, counts, mean = _averaged(spectrum, about)
         self.least = LEAST_OF_MEAN * mean
         self.power, self.counts, self.held = power, counts / spectrum.loss, held
         self.dt, self.narrowest = spectrum.sample_time, NARROWEST * spectrum.spacing
-        self.fixed = sum((swing.spectrum(self.z, self.dt) for swing in others), np.zeros_like(power))
+        self.fixed = sum((mode.spectrum(self.z, self.dt) for mode in others), np.zeros_like(power))
         self.p = power.shape[1]
         self.size = 4 * self.p
         self.hermitian = _hermitian_basis(self.p)
         # Where the band begins and ends it is -1 and 1.
         self.across = np.vstack([np.linspace(-1.0, 1.0, self.z.size) ** k for k in range(DEGREE + 1)])
 
-    def start(self, swings: Sequence[Swing]) -> np.ndarray:
+    def start(self, modes: Sequence[SpectralMode]) -> np.ndarray:
         """A background that leaves S positive."""
         quiet = np.ones(self.z.size, bool)
         omega = np.angle(self.z) / self.dt
-        for swing in swings:
-            quiet &= np.abs(omega - swing.pole.imag) > 0.5 * REACH * abs(swing.pole.real)
+        for mode in modes:
+            quiet &= np.abs(omega - mode.pole.imag) > 0.5 * REACH * abs(mode.pole.real)
         quiet = quiet if quiet.sum() >= 2 * self.p else np.ones(self.z.size, bool)
         level = np.linalg.eigvalsh(self.power[quiet].mean(axis=0))
         floor = np.zeros((DEGREE + 1, self.p, self.p), complex)
         floor[0] = max(level[0], 1e-6 * level[-1]) * np.eye(self.p)
-        whole = self.whole(swings, floor) - self.least
+        whole = self.whole(modes, floor) - self.least
         floor[0] += max(0.0, 1.1 * float((-np.linalg.eigvalsh(whole)[:, 0]).max()) + level[0]) * np.eye(self.p)
         return floor
 
-    def whole(self, swings: Sequence[Swing], background: np.ndarray) -> np.ndarray:
+    def whole(self, modes: Sequence[SpectralMode], background: np.ndarray) -> np.ndarray:
         level = np.einsum("dij,dk->kij", background, self.across)
-        return sum((swing.spectrum(self.z, self.dt) for swing in swings), self.fixed + level)
+        return sum((mode.spectrum(self.z, self.dt) for mode in modes), self.fixed + level)
 
-    def cost(self, swings: Sequence[Swing], background: np.ndarray) -> float:
-        if any(-s.pole.real < self.narrowest or not 0 < s.pole.imag * self.dt < np.pi for s in swings):
+    def cost(self, state: State) -> float:
+        modes, background = state
+        if any(-s.pole.real < self.narrowest or not 0 < s.pole.imag * self.dt < np.pi for s in modes):
             return np.inf
-        s = self.whole(swings, background)
+        s = self.whole(modes, background)
         try:
             root = np.linalg.cholesky(s)
             np.linalg.cholesky(s - self.least)
@@ -238,10 +241,11 @@ class Task:
         logs = 2.0 * np.log(np.einsum("kii->ki", root).real).sum(axis=1)
         return float(self.counts @ (logs + np.einsum("kij,kji->k", np.linalg.inv(s), self.power).real))
 
-    def scores(self, swings: Sequence[Swing], background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Fisher's information and the slope of L."""
-        inverse = np.linalg.inv(self.whole(swings, background))
-        changes = np.concatenate([self._changes(s, k) for s, k in zip(swings, self.held, strict=True)] + [self._levels])
+    def normal_equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Fisher information and slope of L."""
+        modes, background = state
+        inverse = np.linalg.inv(self.whole(modes, background))
+        changes = np.concatenate([self._changes(s, k) for s, k in zip(modes, self.held, strict=True)] + [self._levels])
         x = inverse @ changes
         over = inverse @ self.power - np.eye(self.p)
         slope = np.einsum("akij,kji,k->a", x, over, self.counts).real
@@ -253,31 +257,36 @@ class Task:
     def _levels(self) -> np.ndarray:
         return np.einsum("aij,dk->dakij", self.hermitian, self.across).reshape(-1, self.z.size, self.p, self.p)
 
-    def _changes(self, swing: Swing, k: int) -> np.ndarray:
+    def _changes(self, mode: SpectralMode, k: int) -> np.ndarray:
         """∂S by each unknown of a mode, (n_unknowns, n_lines, n_directions, n_directions)."""
-        mu = np.exp(swing.pole * self.dt)
+        mu = np.exp(mode.pole * self.dt)
         here, mirrored = (_resonance(m, self.z) for m in (mu, mu.conj()))
         slope, mirrored_slope = (self.dt * m * self.z / (self.z - m) ** 2 for m in (mu, mu.conj()))
         unit = np.eye(self.p)
-        a = 0.5 * np.outer(swing.shape, swing.drive)
-        shapes = [0.5 * np.outer(unit[j], swing.drive) for j in range(self.p) if j != k]
-        drives = [0.5 * np.outer(swing.shape, unit[j]) for j in range(self.p)]
+        a = 0.5 * np.outer(mode.shape, mode.excitation)
+        shapes = [0.5 * np.outer(unit[j], mode.excitation) for j in range(self.p) if j != k]
+        excitations = [0.5 * np.outer(mode.shape, unit[j]) for j in range(self.p)]
         found = []
-        for matrices, f, g in (([a], slope, mirrored_slope), ([*shapes, *drives], here, mirrored)):
+        for matrices, f, g in (([a], slope, mirrored_slope), ([*shapes, *excitations], here, mirrored)):
             for matrix in matrices:
                 up, down = matrix * f[:, None, None], matrix.conj() * g[:, None, None]
                 found += [up + down, 1j * (up - down)]
         half = np.array(found)
         return half + _adjoint(half)
 
-    def moved(self, swings: Sequence[Swing], background: np.ndarray, move: np.ndarray):
-        each = move[: self.size * len(swings)].reshape(len(swings), self.size)
+    def moved(self, state: State, step: np.ndarray) -> tuple[State, np.ndarray]:
+        modes, background = state
+        each = step[: self.size * len(modes)].reshape(len(modes), self.size)
         found = []
-        for swing, step, k in zip(swings, each, self.held, strict=True):
-            step = step[0::2] + 1j * step[1::2]
-            shape = swing.shape + np.insert(step[1 : self.p], k, 0.0)
-            found.append(Swing(swing.pole + step[0], shape, swing.drive + step[self.p :]))
-        return tuple(found), background + np.tensordot(move[each.size :].reshape(DEGREE + 1, -1), self.hermitian, 1)
+        for mode, own, k in zip(modes, each, self.held, strict=True):
+            change = own[0::2] + 1j * own[1::2]
+            shape = mode.shape + np.insert(change[1 : self.p], k, 0.0)
+            found.append(SpectralMode(mode.pole + change[0], shape, mode.excitation + change[self.p :]))
+        level = np.tensordot(step[each.size :].reshape(DEGREE + 1, -1), self.hermitian, 1)
+        return (tuple(found), background + level), step
+
+    def negligible(self, decrease: float, cost: float) -> bool:
+        return decrease < NEGLIGIBLE
 
 
 def _resonance(mu: complex, z: np.ndarray) -> np.ndarray:
@@ -307,10 +316,12 @@ def _lines(spectrum: Spectrum, low: float, high: float) -> slice:
     return slice(first, max(first + 1, min(int(np.floor(high / spectrum.spacing)), n)))
 
 
-def _averaged(spectrum: Spectrum, swings: Sequence[Swing]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _averaged(
+    spectrum: Spectrum, modes: Sequence[SpectralMode]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """z, products of the transforms, how many lines each stands for, and their mean over a few lines about, over the
     band of some modes."""
-    centre, width = np.array([[s.pole.imag, abs(s.pole.real)] for s in swings]).T
+    centre, width = np.array([[s.pole.imag, abs(s.pole.real)] for s in modes]).T
     reach = np.maximum(np.minimum(REACH * width, 0.5 * centre), LEAST_LINES * spectrum.spacing)
     band = _lines(spectrum, max((centre - reach).min(), 2.5 * spectrum.spacing), (centre + reach).max())
     values = spectrum.values[:, band]

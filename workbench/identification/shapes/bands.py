@@ -1,11 +1,12 @@
-"""Confidence bands of eigenfunctions: the sensors' noise carried along the structure, and what the spline misses there.
+"""Confidence bands of eigenfunctions: the sensors' noise carried along the structure, and the interpolation error.
 
 With values v at the sensors, a spline W(x) v and the scale q = v^T M v, M = ∫ m W^T W dx, the eigenfunction is
-φ(x) = W(x) v / √q, and an error dv of the values and what the spline misses, e(x), move it by
+φ(x) = W(x) v / √q, and an error dv of the values and the interpolation error e(x) move it by
 
     dφ(x) = J(x) dv + e(x) / √q - φ(x) ∫ m W v e dx / q,     J(x) = W(x) / √q - φ(x) (M v)^T / q
 
-so that its covariance along the structure is J C J^T and that of e, which `unseen` tells. A band that holds the whole
+so that its covariance along the structure is J C J^T plus that of e, from `interpolation_error`. A band that holds the
+whole
 curve, not each point by itself, is wider: its width is the quantile of the largest |dφ(x)| / std(x) along the
 structure, drawn from that covariance.
 """
@@ -17,11 +18,11 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from workbench.identification.free_decay.ibrahim import normalised_shapes
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.free_decay.refined import Refined
 from workbench.identification.shapes.boundary_check import check_ends
 from workbench.identification.shapes.eigenfunctions import KnownEnds, Splines, inertia_of, mass_matrix
-from workbench.identification.shapes.interpolation_error import Foretold, missed_kernel
+from workbench.identification.shapes.interpolation_error import LeaveOneOut, peano_kernel
+from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.structure.modes import frozen
 from workbench.structure.profile import ProfileLike
 from workbench.structure.supports import PointMass
@@ -34,14 +35,14 @@ HELD = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Bands:
-    """Eigenfunctions along a structure, with what noise and too few sensors leave uncertain of them.
+    """Eigenfunctions along a structure, with their uncertainty by noise and by too few sensors.
 
     Attributes:
         x: (n_points,) places, m.
         phi: (n_points, n_modes) eigenfunctions, scaled as `eigenfunctions` does.
         std: (n_points, n_modes) standard error at each place.
-        missed: (n_points, n_modes) of it, what the spline may miss there; 0 where the sensors foretell each other to
-            their noise. Where it is most of `std`, more sensors help and longer records do not.
+        interpolation_std: (n_points, n_modes) the part of it by interpolation error; 0 where the sensors predict each
+            other to within their noise. Where it is most of `std`, more sensors help and longer records do not.
         width: (n_modes,) standard errors either side that hold the whole curve with probability `level`.
         level: of both bands.
     """
@@ -49,7 +50,7 @@ class Bands:
     x: np.ndarray
     phi: np.ndarray
     std: np.ndarray
-    missed: np.ndarray
+    interpolation_std: np.ndarray
     width: np.ndarray
     level: float
 
@@ -80,8 +81,8 @@ def eigenfunction_bands(
 ) -> Bands:
     """Confidence bands of the eigenfunctions that `eigenfunctions` draws through refined shapes.
 
-    They hold what noise does to real shapes, and what a spline misses between and beyond the sensors as far as the
-    sensors fail to foretell each other. Bands too wide for use, about a point mass or towards an end on springs, narrow
+    They hold what noise does to real shapes, and the interpolation error between and beyond the sensors as far as the
+    sensors fail to predict each other. Bands too wide for use, about a point mass or towards an end on springs, narrow
     with more sensors there; the eigenfunctions of `choose_structure(...).structure` know what is attached.
 
     Args:
@@ -109,10 +110,10 @@ def eigenfunction_bands(
     splines = Splines.through(modes, degree=degree, **where)
     inertia = inertia_of(mass_per_length, point_masses, length)
     values = normalised_shapes(modes.shapes).real
-    phi, std, missed = (np.zeros((x.size, modes.n_modes)) for _ in range(3))
+    phi, std, interpolation = (np.zeros((x.size, modes.n_modes)) for _ in range(3))
     width = np.zeros(modes.n_modes)
     for spline, those in splines.groups:
-        foretold = Foretold(modes.positions, degree=spline.degree, **where)
+        leave_one_out = LeaveOneOut(modes.positions, degree=spline.degree, **where)
         along, mass = spline.matrix(x), mass_matrix(spline, inertia, length)
         for r in those:
             v = values[:, r]
@@ -121,18 +122,18 @@ def eigenfunction_bands(
             jacobian = along / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
             strengths, directions = np.linalg.eigh(refined.shape_covariance[r])
             root = jacobian @ (directions * np.sqrt(np.maximum(strengths, 0.0)))
-            roughness = foretold.roughness(v, refined.shape_covariance[r])
+            roughness = leave_one_out.roughness(v, refined.shape_covariance[r])
             if roughness > 0.0:
-                error = missed_kernel(spline, x, modes.positions, length) / np.sqrt(q)
+                error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)
                 for y, weights, derivative in inertia.weighed(spline, length):
-                    there = missed_kernel(spline, y, modes.positions, length, derivative)
+                    there = peano_kernel(spline, y, modes.positions, length, derivative)
                     error -= np.outer(phi[:, r], (weights * (spline.matrix(y, derivative) @ v)) @ there / q)
                 error *= np.sqrt(roughness)
-                missed[:, r] = np.linalg.norm(error, axis=1)
+                interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])
             std[:, r] = np.linalg.norm(root, axis=1)
             unsure = std[:, r] > HELD * std[:, r].max()
             if unsure.any():
                 drawn = (root[unsure] / std[unsure, r, None]) @ rng.standard_normal((root.shape[1], DRAWS))
                 width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
-    return Bands(frozen(x), frozen(phi), frozen(std), frozen(missed), frozen(width), level)
+    return Bands(frozen(x), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)

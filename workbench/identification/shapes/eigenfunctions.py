@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.interpolate import BSpline
 
-from workbench.identification.free_decay.ibrahim import normalised_shapes
+from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
@@ -20,7 +20,7 @@ from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
 
 # In section 4.4 each two degrees more cut the error of the lowest eigenfunctions by ten, and that of the highest, which
-# swing too fast for their sensors, is made worse at the ends. So every mode takes the degree that best foretells each
+# vary too fast for their sensors, is made worse at the ends. So every mode takes the degree that best predicts each
 # inner sensor from all the others.
 DEFAULT_DEGREES = (3, 5, 7, 9)
 
@@ -151,7 +151,7 @@ def eigenfunctions(
     """`Modes` from `SampledModes`: real parts of the shapes, interpolated and scaled.
 
     The scale comes from one of two things. A known mass distribution gives ∫ m φ_r² dx + Σ_k M_k φ_r(x_k)² = 1. A unit
-    blow at x0, with shapes that carry the amplitude s_r of the decay it leaves (`amplitudes`), gives
+    impulse at x0, with shapes that carry the amplitude s_r of the decay after it (`modal_amplitudes`), gives
     φ_r(x) φ_r(x0) = i s_r(x) ω_dr, so φ_r(x) = i s_r(x) ω_dr / (i s_r(x0) ω_dr)^½ without any knowledge of the mass.
 
     Args:
@@ -159,7 +159,7 @@ def eigenfunctions(
         length: m.
         mass_per_length: kg/m, where known; without it and without `driven_at` the shapes keep ∫ φ_r² dx = length.
         point_masses: what is attached, kg; left out, a heavy one makes every shape wrong in size by as much as 30 %.
-        driven_at: x0 of a unit blow at t = 0 that `sampled` answers, m.
+        driven_at: x0 of a unit impulse at t = 0 that caused `sampled`, m.
         ends: what the supports hold at zero; it is believed. Of an end on springs only what it holds is known.
         degree: of the splines, odd; chosen mode by mode as in `best_degrees` unless given.
         covariance: of (ω, ζ), carried along where `refine` gave one.
@@ -169,7 +169,7 @@ def eigenfunctions(
 
     Raises:
         ValueError: as `interpolating_spline`; both ways of scaling at once; point masses outside, or
-            without a mass distribution; a blow at a node of a mode.
+            without a mass distribution; an impulse at a node of a mode.
     """
     if mass_per_length is not None and driven_at is not None:
         raise ValueError("modes are scaled by the mass distribution or by a driving point, not by both; give one")
@@ -181,7 +181,7 @@ def eigenfunctions(
             mass = mass_matrix(spline, inertia, length)
             values[:, those] /= np.sqrt(np.einsum("jr,jk,kr->r", values[:, those], mass, values[:, those]))
     else:
-        values = _scaled_by_blow(sampled, splines, driven_at)
+        values = _scaled_by_impulse(sampled, splines, driven_at)
     values = frozen(values)
     return Modes(
         omega=sampled.omega,
@@ -194,7 +194,7 @@ def eigenfunctions(
 
 
 def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = KnownEnds()) -> np.ndarray:
-    """The degree among 3, 5, 7 and 9 that best foretells every inner sensor from the others, (n_modes,).
+    """The degree among 3, 5, 7 and 9 that best predicts every inner sensor from the others, (n_modes,).
 
     Args:
         sampled: shapes of displacement at placed sensors.
@@ -328,17 +328,17 @@ def _knots(sites: np.ndarray, derivatives: list, length: float, degree: int) -> 
     return np.r_[[0.0] * (degree + 1), inner[left : left + wanted], [length] * (degree + 1)]
 
 
-def _scaled_by_blow(sampled: SampledModes, splines: Splines, x0: float) -> np.ndarray:
+def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np.ndarray:
     omega_d = np.abs(sampled.poles.imag)
     products = (1j * sampled.shapes * omega_d).real
-    at_blow = splines(products, np.array([x0]))[0]
-    weak = at_blow <= 1e-3 * np.abs(products).max(axis=0)
+    at_impulse = splines(products, np.array([x0]))[0]
+    weak = at_impulse <= 1e-3 * np.abs(products).max(axis=0)
     if weak.any():
         raise ValueError(
-            f"the blow at x = {x0:g} hardly drives mode {int(np.argmax(weak)) + 1}"
+            f"the impulse at x = {x0:g} hardly excites mode {int(np.argmax(weak)) + 1}"
             f" ({sampled.frequencies_hz[weak][0]:.4g} Hz), so it cannot scale it; scale by the mass instead, or leave"
             " that mode out"
         )
-    values = products / np.sqrt(at_blow)
+    values = products / np.sqrt(at_impulse)
     clear = np.argmax(np.abs(values) > 0.05 * np.abs(values).max(axis=0), axis=0)
     return values * np.sign(values[clear, np.arange(values.shape[1])])

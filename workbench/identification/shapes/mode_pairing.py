@@ -1,4 +1,4 @@
-"""Which measured modes are those of a model, and which come from elsewhere."""
+"""Mode pairing: which measured modes are those of a model, and which are not."""
 
 from dataclasses import dataclass
 
@@ -9,8 +9,8 @@ from workbench.structure.modes import Modes, SampledModes, mac
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
-    """Measured modes matched one to one with those of a model.
+class ModePairing:
+    """Measured modes paired one to one with those of a model.
 
     Attributes:
         matched: (n_matched,) indices of the measured modes that are the model's, by increasing mode of the model.
@@ -27,7 +27,7 @@ class Told:
     others: np.ndarray
 
 
-def tell_apart(measured: SampledModes, model: Modes, *, shape: float = 0.9, frequency: float = 0.1) -> Told:
+def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, frequency: float = 0.1) -> ModePairing:
     """Match measured modes with a model of unknown scale of frequency, each at most once, by shape, then frequency.
 
     A measured mode is the model's if its shape agrees with that of a mode that no other measured mode agrees with
@@ -51,4 +51,4 @@ def tell_apart(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     rows, columns = rows[order], columns[order]
     scale = measured.frequencies_hz[rows[0]] / model.frequencies_hz[columns[0]] if rows.size else 1.0
     others = np.setdiff1d(np.arange(measured.n_modes), rows)
-    return Told(rows, columns, agreement[rows, columns], scale * model.frequencies_hz[columns], others)
+    return ModePairing(rows, columns, agreement[rows, columns], scale * model.frequencies_hz[columns], others)

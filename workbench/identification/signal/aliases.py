@@ -1,4 +1,4 @@
-"""Which frequencies a sampled mode may have: the branch k of the logarithm, which samples alone do not tell (3.23)."""
+"""Which frequencies a sampled mode may have: the branch k of the logarithm, which samples do not determine (3.23)."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,7 @@ def aliases(modes: SampledModes, *, sample_rate_hz: float, most: int = 4) -> Ali
     """The frequencies beyond half the sample rate that look like the modes found: f_s - f, f_s + f, 2 f_s - f, ...
 
     Samples alone do not decide. What does: a filter before the sampling (then k = 0), a record at another rate
-    (`Aliases.deciding_rate_hz`), or a model that foretells the frequency; `stacked_delays(branch=k)` then takes it.
+    (`Aliases.deciding_rate_hz`), or a model that predicts the frequency; `stacked_delays(branch=k)` then takes it.
 
     Args:
         modes: found below half the sample rate (branch 0).

@@ -1,6 +1,6 @@
-"""What ails a record, before any mode is sought in it: sensors that are dead, copied, clipped or slower than told."""
+"""Data quality: faulty channels of a record, dead, copied, clipped or upsampled, before identification."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,23 +9,23 @@ from workbench.records.record import Record
 
 # Values a sensor that moves takes at least.
 FEWEST_VALUES = 4
-# Samples piled up at the end of a range: so many, and so many times those of the next value. A swing that turns back
-# of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before.
+# Samples piled up at the end of a range: so many, and so many times those of the next value. An oscillation that turns
+# back of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before.
 LEAST_PILED, PILED = 8, 6.0
 FEWEST_CHANGES = 16
 SLOWEST = 64
-# Relative to the part of a signal that cannot be foretold from the samples before it.
+# Relative to the innovation of a signal, what its past does not predict.
 COPIED = 1e-2
-FORETOLD_FROM, LONGEST = 16, 20_000
+PREDICTOR_ORDER, LONGEST = 16, 20_000
 NOISE_FREE = 1e-9
 
 
 @dataclass(frozen=True)
-class Ailment:
+class DataFault:
     """Something in a record that would make identification wrong.
 
     Attributes:
-        kind: "dead", "copied", "clipped" or "slower".
+        kind: "dead", "copied", "clipped" or "upsampled".
         outputs: names of those that have it.
         message: what, where, why it matters and the way out.
         until: the last time it touches, s; None where it is all through.
@@ -37,61 +37,79 @@ class Ailment:
     until: float | None = None
 
 
-def ailments(record: Record) -> tuple[Ailment, ...]:
-    """All that ails a record, empty where nothing does.
+def data_faults(record: Record) -> tuple[DataFault, ...]:
+    """The faults of a record, empty where there are none.
 
     dead: an output takes fewer than four values, or is a straight line. copied: two outputs are the same but for scale
     and a constant, so that their noise would count as two. clipped: samples pile up at an end of an output's range.
-    slower: an output changes at every k-th sample only, because it was sampled at another rate and held, or joined by
-    straight lines.
+    upsampled: an output changes at every k-th sample only, because it was sampled at another rate and held, or joined
+    by straight lines.
     """
     dead = list(_dead(record))
     alive = [j for j in range(record.n_outputs) if record.output_names[j] not in {d.outputs[0] for d in dead}]
-    return (*dead, *_copied(record, alive), *_clipped(record, alive), *_slower(record, alive))
+    return (*dead, *_copied(record, alive), *_clipped(record, alive), *_upsampled(record, alive))
 
 
-def check_fit(record: Record) -> None:
-    """Refuse a record that ails.
+def check_data_quality(record: Record) -> None:
+    """Refuse a record with a fault.
 
     Raises:
-        ValueError: the first of `ailments`.
+        ValueError: the first of `data_faults`.
     """
-    for ailment in ailments(record):
-        raise ValueError(f"record {record.name!r}: {ailment.message}")
+    for fault in data_faults(record):
+        raise ValueError(f"record {record.name!r}: {fault.message}")
 
 
-def _dead(record: Record) -> Iterator[Ailment]:
+def check_same_sensors(records: Sequence[Record]) -> None:
+    """Refuse no records, or records that differ in outputs or sample time."""
+    if not records:
+        raise ValueError("identification needs at least one record")
+    first = records[0]
+    for other in records[1:]:
+        if other.output_names != first.output_names:
+            raise ValueError(
+                f"records identified together must have the same outputs; {first.name!r} has"
+                f" {', '.join(first.output_names)} and {other.name!r} has {', '.join(other.output_names)}"
+            )
+        if abs(other.sample_time - first.sample_time) > 1e-9 * first.sample_time:
+            raise ValueError(
+                f"records {first.name!r} and {other.name!r} are sampled every {first.sample_time:g} s and"
+                f" {other.sample_time:g} s; resample one of them"
+            )
+
+
+def _dead(record: Record) -> Iterator[DataFault]:
     for name, row in zip(record.output_names, record.outputs, strict=True):
-        # the first samples tell of most signals that they move, at no cost
+        # most signals move within their first samples, which saves the rest
         few = np.unique(row[:64]).size < FEWEST_VALUES and np.unique(row).size
         if few and few < FEWEST_VALUES <= record.n_samples:
             what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
-            yield Ailment("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
+            yield DataFault("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
         elif few is False and record.n_samples > 2 and _straight(row):
-            yield Ailment("dead", (name,), f"output {name!r} is a straight line, a clock or a counter; leave it out")
+            yield DataFault("dead", (name,), f"output {name!r} is a straight line, a clock or a counter; leave it out")
 
 
 def _straight(row: np.ndarray) -> bool:
     return bool(np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]))
 
 
-def _copied(record: Record, alive: list[int]) -> Iterator[Ailment]:
+def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     if len(alive) < 2:
         return
     part = record.outputs[alive, :LONGEST]
     about = part - part.mean(axis=1, keepdims=True)
     size = np.sqrt((about**2).mean(axis=1))
-    # A part that stands still has no copy to tell.
+    # A part that is at rest has no copy.
     moving = size > 1e-12 * size.max()
     scaled = about[moving] / size[moving, None]
     names = [record.output_names[j] for j, moves in zip(alive, moving, strict=True) if moves]
     alike = scaled @ scaled.T / part.shape[1]
     for i, j in zip(*np.nonzero(np.triu(np.abs(alike) > 1.0 - 1e-6, 1)), strict=True):
-        noise = _unforetold(scaled[i])
+        noise = _innovation_std(scaled[i])
         apart = np.sqrt(((scaled[i] - np.sign(alike[i, j]) * scaled[j]) ** 2).mean())
         # Without noise, sensors of a single mode are the same but for scale.
         if noise > NOISE_FREE and apart < COPIED * noise:
-            yield Ailment(
+            yield DataFault(
                 "copied",
                 (names[i], names[j]),
                 f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
@@ -99,29 +117,29 @@ def _copied(record: Record, alive: list[int]) -> Iterator[Ailment]:
             )
 
 
-def _unforetold(row: np.ndarray) -> float:
-    """Standard deviation of what the samples before do not foretell."""
-    k = min(FORETOLD_FROM, row.size // 4)
+def _innovation_std(row: np.ndarray) -> float:
+    """Standard deviation of the innovation, what the samples before do not predict."""
+    k = min(PREDICTOR_ORDER, row.size // 4)
     if k == 0:
         return 0.0
     before = np.lib.stride_tricks.sliding_window_view(row, k)[:-1]
     return float(np.std(row[k:] - before @ np.linalg.lstsq(before, row[k:], rcond=None)[0]))
 
 
-def _clipped(record: Record, alive: list[int]) -> Iterator[Ailment]:
+def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
         row, name = record.outputs[j], record.output_names[j]
         ends = {"above": row.max(), "below": row.min()}
         piled = {side: np.flatnonzero(row == end) for side, end in ends.items()}
         clear = [side for side, at in piled.items() if at.size >= LEAST_PILED and at.size > PILED * _beside(row, at)]
         if clear:
-            # Where one end of the range is too near, so may be the other: two alike tell.
+            # Where one end of the range is too near, so may be the other: two equal samples are enough there.
             last = float(record.time[max(at[-1] for at in piled.values() if at.size > 1)])
-            yield Ailment(
+            yield DataFault(
                 "clipped",
                 (name,),
                 f"output {name!r} is cut off {clear[0]} at {ends[clear[0]]:g}, {piled[clear[0]].size} samples; up to"
-                f" {last:g} s swings beyond the range are lost and would be read as modes; begin later, or measure with"
+                f" {last:g} s motion beyond the range is lost and would be read as modes; begin later, or measure with"
                 " a larger range",
                 until=last,
             )
@@ -133,7 +151,7 @@ def _beside(row: np.ndarray, at: np.ndarray) -> int:
     return int(np.count_nonzero(others == others[np.argmin(np.abs(others - row[at[0]]))]))
 
 
-def _slower(record: Record, alive: list[int]) -> Iterator[Ailment]:
+def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
         row, name = record.outputs[j], record.output_names[j]
         for order, how in ((1, "held"), (2, "joined by straight lines")):
@@ -142,8 +160,8 @@ def _slower(record: Record, alive: list[int]) -> Iterator[Ailment]:
             every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= FEWEST_CHANGES else 1
             # What rests for long and moves again would have its changes far apart.
             if 1 < every <= SLOWEST and changes.size > 0.5 * (np.ptp(changes) // every):
-                yield Ailment(
-                    "slower",
+                yield DataFault(
+                    "upsampled",
                     (name,),
                     f"output {name!r} changes at every {every}th sample only: it was sampled at"
                     f" {record.sample_rate_hz / every:g} Hz and {how}, not at {record.sample_rate_hz:g} Hz; leave it"

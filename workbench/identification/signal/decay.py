@@ -2,9 +2,9 @@
 
 Free decay, read backwards, follows from itself: y(t) = Σ_k c_k y(t + kΔt), the same c_k for every output, for any
 modes with constants and drifts besides. The c_k are learned from the end of the record on, by recursive least squares
-with a short memory, and each few samples are foretold from those after them. A force breaks the rule: what it leaves
-unforetold stands out of the level of what came after. The same is done at a quarter, a sixteenth, ... of the sample
-rate, behind a low-pass filter that leaves free decay one, for what is too slow to be seen from sample to sample.
+with a short memory, and each few samples are predicted from those after them. A force breaks the rule: the
+prediction error rises above its level in the samples after. The same is done at a quarter, a sixteenth, ... of the
+sample rate, behind a low-pass filter that leaves free decay one, for what is too slow to be seen from sample to sample.
 """
 
 import numpy as np
@@ -13,25 +13,25 @@ from scipy.signal.windows import blackman
 
 from workbench.records.record import Record
 
-# Samples from which the one before is foretold; taken so many at a time, and forgotten over so many times as many.
+# Samples that predict the one before; samples of an update; memory, and that of the error level, in orders.
 ORDER, BLOCK, MEMORY, LEVEL_MEMORY = 32, 4, 4, 2
 MOST_SIGNALS, MOST_SAMPLES = 8, 40_000
-# Means fewer than these cannot teach the rule and be told by it.
+# Fewer means are too few to learn the rule and to test it.
 SHORTEST = (4 + LEVEL_MEMORY) * ORDER
 COARSER = 4
-# Squared, of a sample not foretold over the level: alone, where the motion also rises by so much in energy, and soon
-# after another break, for a force that dies away.
+# Squared prediction error over its level: alone, where the energy of the motion also rises so many times, and within so
+# many samples of another break, for a force that dies away.
 BREAK, BREAK_RISING, RISE, BREAK_BESIDE, NEAR = 100.0, 25.0, 4.0, 16.0, 8
-# A break that leaves less of the record's energy behind it is not what the decay began with.
+# Share of the record's energy that must follow a break for the decay to begin there.
 LEAST_LEFT = 0.01
 
 
 def decay_start(record: Record) -> float:
     """The time from which a record is free decay, s, from its outputs alone.
 
-    The first sample behind the last break of the rule above that leaves a hundredth of the motion's energy behind it:
-    a blow, a hand let go, a second blow. At 40 dB it is found to half the shortest period; at 30 dB a hand lifted off
-    softly may go unseen by sensors of displacement. A record that is free decay throughout, or shorter than two
+    The first sample after the last break of the rule above that a hundredth of the motion's energy follows: an impact,
+    a release, a second impact. At 40 dB it is found to half the shortest period; at 30 dB a soft release may go
+    undetected by sensors of displacement. A record that is free decay throughout, or shorter than two
     hundred samples, begins with its first sample.
 
     Args:
@@ -82,7 +82,7 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
 
 
 def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
-    """By how much samples (n_samples,) stand out of what those after them foretell, and which break the rule."""
+    """Squared prediction error over its level (n_samples,), and which samples break the rule."""
     m, n = y.shape
     forget, forget_level = np.exp(-BLOCK / (MEMORY * ORDER)), np.exp(-BLOCK / (LEVEL_MEMORY * ORDER))
     energy = np.r_[np.cumsum((y**2).sum(axis=0)[::-1])[::-1], 0.0]
@@ -97,10 +97,10 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
             # Rounding enters as a ridge, and as the least level.
             r = np.asarray(np.linalg.qr(np.vstack([factor, ridge]), mode="r"))
             c = np.linalg.solve(r[:ORDER, :ORDER], r[:ORDER, ORDER])
-            missed = ((here - after @ c).reshape(m, BLOCK) ** 2).mean(axis=0)
+            error = ((here - after @ c).reshape(m, BLOCK) ** 2).mean(axis=0)
             if n - t >= (3 + LEVEL_MEMORY) * ORDER:
-                ratio[at] = missed / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
-            level, weight = forget_level * level + missed.mean(), forget_level * weight + 1.0
+                ratio[at] = error / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
+            level, weight = forget_level * level + error.mean(), forget_level * weight + 1.0
         rows = np.vstack([np.sqrt(forget) * factor, np.column_stack([after, here])])
         factor = np.asarray(np.linalg.qr(rows, mode="r"))
     after = np.arange(1, n + 1)

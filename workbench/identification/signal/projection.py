@@ -1,11 +1,11 @@
-"""A record split into what given poles explain of it, amplitudes free, and what they leave.
+"""The projection of a record on given poles, amplitudes free, and its residual.
 
 y_j = Φ c_j + r_j, Φ = [e^{-σt} cos ω_d t, e^{-σt} sin ω_d t] and, where asked for, a column of ones. All derivatives of
 Φ by the poles lie in the span of tΦ. In a long record the matrices ΦᵀΦ, ΦᵀtΦ, (tΦ)ᵀtΦ are sums of powers
 
     S_k(w) = Σ_{i<N} i^k w^i,     w = μ_r μ_s and μ_r μ_s*,   μ = e^{λΔt},
 
-which doubling gives in log N steps, and a swing is left out where it has died away beyond the last digit.
+which doubling gives in log N steps, and an exponential is left out where it has decayed below round-off.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ class Projection:
 
     record: Record = field(repr=False)
     poles: np.ndarray
-    squares: np.ndarray  # sum of those of what is left, (n_outputs,)
+    squares: np.ndarray  # sum of those of the residual, (n_outputs,)
     round_off: float  # of these squares, as a share of those of the record
     coefficients: np.ndarray  # (n_columns, n_outputs)
     gram: np.ndarray  # G = (tΦ)^T (I - Φ Φ^+) tΦ
@@ -41,10 +41,10 @@ class Projection:
 
     @cached_property
     def residual(self) -> np.ndarray:
-        """What is left, (n_samples, n_outputs); of a long record made only where it is asked for."""
-        swings = _Swings(self.record, self.poles)
+        """(n_samples, n_outputs); of a long record computed only on demand."""
+        exponentials = _Exponentials(self.record, self.poles)
         left = np.empty((self.record.n_samples, self.record.n_outputs))
-        for part, rows, phi, y in swings.parts():
+        for part, rows, phi, y in exponentials.parts():
             np.subtract(y, phi @ self.coefficients[rows], out=left[part])
         if len(self.coefficients) > 2 * self.poles.size:
             left -= self.coefficients[-1]
@@ -58,10 +58,10 @@ class Projection:
 
 
 def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
-    """Least squares of every output on the swings of `poles`, and on a constant with `offset`.
+    """Least squares of every output on the damped exponentials of `poles`, and on a constant with `offset`.
 
     Raises:
-        numpy.linalg.LinAlgError: two of them cannot be told apart.
+        numpy.linalg.LinAlgError: two of them cannot be distinguished.
     """
     if record.n_samples * poles.size > LARGEST_FACTORED:
         return _project_by_parts(record, poles, offset)
@@ -98,8 +98,8 @@ def power_sums(w: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return sums[0], sums[1], sums[2]
 
 
-def _columns(swings: np.ndarray) -> np.ndarray:
-    return np.hstack([swings.real, swings.imag])
+def _columns(exponentials: np.ndarray) -> np.ndarray:
+    return np.hstack([exponentials.real, exponentials.imag])
 
 
 def _grams(poles: np.ndarray, record: Record, offset: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -121,15 +121,15 @@ def _grams(poles: np.ndarray, record: Record, offset: bool) -> tuple[np.ndarray,
 def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     """The same from normal equations, where Φ would fill the memory, part after part of the record.
 
-    They square the condition number, which long records of many modes, told apart by their length, can afford.
+    They square the condition number, which long records of many modes can afford: their length separates the modes.
     """
     whole, tilted, doubly = _grams(poles, record, offset)
     seen, t_seen = np.zeros((2, 2 * poles.size, record.n_outputs))
-    swings = _Swings(record, poles)
-    for part, rows, phi, y in swings.parts():
+    exponentials = _Exponentials(record, poles)
+    for part, rows, phi, y in exponentials.parts():
         along = phi.T @ y
         seen[rows] += along
-        t_seen[rows] += part.start * record.sample_time * along + (swings.tau[: len(phi), None] * phi).T @ y
+        t_seen[rows] += part.start * record.sample_time * along + (exponentials.tau[: len(phi), None] * phi).T @ y
     if offset:
         seen = np.vstack([seen, record.outputs.sum(axis=1)])
     power = np.einsum("jt,jt->j", record.outputs, record.outputs)
@@ -146,8 +146,8 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
     return Projection(record, poles, squares, SUMMED, coefficients, gram, slopes, spread, tilt)
 
 
-class _Swings:
-    """The columns Φ of a record part by part, without the swings that have died away."""
+class _Exponentials:
+    """The columns Φ of a record part by part, without the exponentials that have decayed."""
 
     def __init__(self, record: Record, poles: np.ndarray) -> None:
         self.record, self.dt = record, record.sample_time
@@ -159,10 +159,10 @@ class _Swings:
         self.begin = np.exp(np.outer(self.tau, self.slow))
 
     def parts(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
-        """Samples, rows of the swings alive, their columns of Φ, and the outputs, (n_part, n_outputs)."""
+        """Samples, rows of the exponentials left, their columns of Φ, and the outputs, (n_part, n_outputs)."""
         for first in range(0, self.record.n_samples, PART):
             part = slice(first, min(first + PART, self.record.n_samples))
             alive = int(np.searchsorted(-self.lives, -first * self.dt, side="right"))
             rows = np.r_[self.order[:alive], self.order.size + self.order[:alive]]
-            swings = self.begin[: part.stop - first, :alive] * np.exp(first * self.dt * self.slow[:alive])
-            yield part, rows, _columns(swings), self.record.outputs[:, part].T
+            exponentials = self.begin[: part.stop - first, :alive] * np.exp(first * self.dt * self.slow[:alive])
+            yield part, rows, _columns(exponentials), self.record.outputs[:, part].T

@@ -14,10 +14,12 @@ def time_derivatives(channels: Sequence[Channel]) -> np.ndarray:
     return np.array([MEASURED.get(channel.quantity, (0, 0))[1] for channel in channels])
 
 
-def struck(modes: Modes, *, at: float, positions: Sequence[float], impulse: float = 1.0) -> SampledModes:
-    """The free decay after a blow, as sampled modes whose shapes carry amplitude and phase.
+def impulse_response_modes(
+    modes: Modes, *, at: float, positions: Sequence[float], impulse: float = 1.0
+) -> SampledModes:
+    """The free decay after an impulse, as sampled modes whose shapes carry amplitude and phase.
 
-    A blow J at x0 leaves q_r'(0) = J φ_r(x0), so w(x, t) = Re Σ_r s_r(x) e^{λ_r t} with
+    An impulse J at x0 gives q_r'(0) = J φ_r(x0), so w(x, t) = Re Σ_r s_r(x) e^{λ_r t} with
     s_r(x) = -i J φ_r(x) φ_r(x0) / ω_dr.
 
     Args:
@@ -31,7 +33,7 @@ def struck(modes: Modes, *, at: float, positions: Sequence[float], impulse: floa
     """
     if not modes.proportional or (modes.omega == 0).any() or (modes.zeta >= 1).any():
         raise ValueError(
-            "a struck structure decays in separate modes only if each is elastic and underdamped;"
+            "a free decay has separate modes only if each is elastic and underdamped;"
             " select such modes, or simulate the rig"
         )
     omega_d = modes.omega * np.sqrt(1.0 - modes.zeta**2)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.free_decay.refined import Refined
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.fitted_structure import FittedStructure
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
@@ -39,7 +39,7 @@ N_DRAWS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
-class LossFound:
+class LocatedDamage:
     """What the modes say of a local loss of stiffness.
 
     Attributes:
@@ -84,7 +84,7 @@ class LossFound:
 
 
 @one_blas_thread
-def find_loss(
+def locate_damage(
     measured: Refined,
     nominal: Bar | Beam,
     *,
@@ -93,7 +93,7 @@ def find_loss(
     stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
     false_alarm: float = FALSE_ALARM,
     **known: Any,
-) -> LossFound:
+) -> LocatedDamage:
     """Whether and where stiffness is lost over a part of the structure, from its modes alone.
 
     Args:
@@ -126,7 +126,7 @@ def find_loss(
     smooth = _smooth(task, basis, terms, lossy, limit)
     evidence = smooth.criterion - lossy.criterion + _price(task)
     # modes that not even a loss explains err by more than their standard errors, and count for less
-    return LossFound(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
+    return LocatedDamage(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
 
 
 def _price(task: Task) -> float:

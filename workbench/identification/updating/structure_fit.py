@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.free_decay.refined import Refined
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.fitted_structure import FittedStructure
 from workbench.identification.updating.structure_problem import Problem

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from workbench.identification.free_decay.ibrahim import normalised_shapes
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.free_decay.refined import Refined
+from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.sensitivity import SeriesStructure
 from workbench.structure.member import Bar, Beam

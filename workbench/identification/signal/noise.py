@@ -1,15 +1,12 @@
-"""Noise that is not white: filtered until it is, to count modes, and listened to near each mode, to say their errors.
+"""Noise of each output in each record: its variance, whether it is white, its whitening, and its power about a mode.
 
-What is left of an output is taken for e_k of y_k = Σ_i a_i y_k-i + e_k (Yule & Walker), and the record filtered by what
-makes it e_k. Free decay stays free decay of the same poles.
+Whitening: the residual of an output is modelled as y_k = Σ_i a_i y_k-i + e_k (Yule & Walker), and the record filtered
+by 1 - Σ_i a_i z^-i. A free decay stays a free decay of the same poles.
 
-A mode listens to noise within its own band only. Where output j has noise of spectrum S_j, a least squares fit made for
-white noise s_j² has the covariance H^-1 (Σ_j J_j^T S_j J_j) H^-1 (White, Econometrica 48, 1980), and each column of J
-lives where its mode does, so that
+Variance: residuals of one day have one noise, and short records know it better together. Bartlett's statistic tests
+that (Proc. R. Soc. A 160, 1937): with ν_i degrees of freedom behind the variance v_i of record i, and v of all,
 
-    J_j^T S_j J_j  ≈  κ_jr^½ κ_js^½ (J_jr^T J_js),     κ_jr = S_j(ω_r) / s_j²,
-
-for modes r and s. Where nothing speaks against white noise κ is one: the Cramér-Rao bound.
+    B = (ν ln v - Σ ν_i ln v_i) / (1 + (Σ 1/ν_i - 1/ν) / (3 (n_records - 1))),     chi-square of n_records - 1.
 """
 
 from collections.abc import Sequence
@@ -18,43 +15,23 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
+from scipy.stats import chi2
 
-from workbench.identification.free_decay.refinement import Refined, as_refined
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 
+# Chance that records of one noise are each given their own, which costs little.
+SPLIT = 0.05
 # Chance that white noise is taken for coloured, and the least number of bins over which a spectrum is averaged.
 FALSE_ALARM, LEAST_BINS = 1e-3, 6
-# Samples before that foretell one of noise, and those it takes to learn the weight of each.
+# Order of the autoregressive model, and samples for each of its coefficients.
 ORDER, SAMPLES_EACH = 12, 40
-# What is left of records without noise, over their size.
+# Residual of records without noise, relative.
 ROUNDING = 1e-9
 
 
-def in_its_noise(refined: Refined, records: Record | Sequence[Record], *, offset: bool = True) -> Refined:
-    """The same modes with standard errors that hold in noise of any smooth spectrum.
-
-    Args:
-        refined: of `refine`, made for white noise.
-        records: that it was found in.
-        offset: as in `refine`.
-    """
-    records = [records] if isinstance(records, Record) else list(records)
-    fits = [project(record, refined.modes.poles, offset) for record in records]
-    factors = np.array(
-        [
-            noise_near(refined.modes.poles, fit.residual / noise, record.sample_time)
-            for record, fit, noise in zip(records, fits, refined.noise, strict=True)
-        ]
-    )
-    if (factors == 1.0).all():
-        return refined
-    found = records, refined.modes.poles, fits, refined.noise
-    return as_refined(*found, converged=refined.converged, steps=refined.steps, heard=factors)
-
-
 def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = True) -> list[Record] | None:
-    """The records behind filters, one an output, that make white what `poles` leave; None where it may be white.
+    """The records behind filters, one an output, that whiten the residual of `poles`; None where it may be white.
 
     Args:
         records: free decays, of the same outputs.
@@ -71,7 +48,7 @@ def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = Tru
         return None
     filters = []
     for rows in zip(*left, strict=True):
-        # Records of one colour may differ in loudness.
+        # Records of one spectrum may differ in variance.
         row = [each * np.sqrt(each.size) / max(float(np.linalg.norm(each)), 1e-300) for each in rows]
         lags = [sum(float(each[k:] @ each[: each.size - k]) for each in row) for k in range(order + 1)]
         filters.append(np.r_[1.0, -solve_toeplitz(lags[:-1], lags[1:])] if lags[0] > 0 else np.r_[1.0, np.zeros(order)])
@@ -91,7 +68,7 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> n
 
     Args:
         poles: (n_modes,) of the modes taken out, rad/s.
-        residual: (n_samples, n_outputs) what they leave, over its standard deviation.
+        residual: (n_samples, n_outputs) over its standard deviation.
         sample_time: s.
     """
     n, m = residual.shape
@@ -101,30 +78,32 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> n
     coloured = ~white(power, poles.size)
     for r, pole in enumerate(poles):
         width = max(abs(pole.real), LEAST_BINS * omega[0])
-        heard = _listens((omega - pole.imag) / width)
-        # Each mode has taken the noise of one bin out with it.
-        left = max(heard.sum() - _listens((poles.imag - pole.imag) / width).sum(), 1.0)
-        factors[coloured, r] = heard @ power[:, coloured] / left
+        weight = _bandwidth_weight((omega - pole.imag) / width)
+        # Each mode took the noise of one bin.
+        left = max(weight.sum() - _bandwidth_weight((poles.imag - pole.imag) / width).sum(), 1.0)
+        factors[coloured, r] = weight @ power[:, coloured] / left
     return factors
 
 
-def heard_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.ndarray:
-    """Noise over its mean that the coefficient of a signal hears, (n_signals, n_outputs); 1 where it may be white.
+def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.ndarray:
+    """κ, noise over its mean along each signal, (n_signals, n_outputs); 1 where it may be white.
 
     Args:
         signals: (n_samples, n_signals).
-        residual: (n_samples, n_outputs) what a fit leaves, over its standard deviation.
+        residual: (n_samples, n_outputs) of a fit, over its standard deviation.
         n_modes: taken out of it.
     """
-    power, heard = (np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in (residual / np.sqrt(len(residual)), signals))
-    whole = heard.sum(axis=0)
-    along = (heard / np.where(whole > 0, whole, 1.0)).T @ power
-    # A constant hears what lies about zero.
+    power, weight = (
+        np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in (residual / np.sqrt(len(residual)), signals)
+    )
+    whole = weight.sum(axis=0)
+    along = (weight / np.where(whole > 0, whole, 1.0)).T @ power
+    # A constant is disturbed by noise about zero frequency.
     along[whole <= 1e-20 * len(signals)] = power[: 2 * LEAST_BINS].mean(axis=0)
     return np.where(white(power, n_modes), 1.0, along)
 
 
-def _listens(away: np.ndarray) -> np.ndarray:
+def _bandwidth_weight(away: np.ndarray) -> np.ndarray:
     """Power of t e^{λt}, over that at its own frequency."""
     return (1.0 + away**2) ** -2.0
 
@@ -135,5 +114,32 @@ def white(power: np.ndarray, n_modes: int) -> np.ndarray:
     whole = power.sum(axis=0)
     summed = np.cumsum(power, axis=0) / np.where(whole > 0, whole, 1.0)
     apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
-    # What the modes took out of their bins makes no colour.
+    # The bins that the modes took are not coloured noise.
     return apart < np.sqrt(0.5 * np.log(2.0 * m / FALSE_ALARM) / bins) + (n_modes + 1) / bins
+
+
+def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
+    """Variance of the noise, (n_records, n_outputs).
+
+    Args:
+        squares: (n_records, n_outputs) sums of squares of the residual, positive.
+        free: (n_records,) or (n_records, n_outputs) degrees of freedom, at least 1.
+        apart: (n_outputs,) whose records differ; by `differ` unless given.
+    """
+    free = _each(free, squares)
+    apart = differ(squares, free) if apart is None else apart
+    return np.where(apart, squares / free, squares.sum(axis=0) / free.sum(axis=0))
+
+
+def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
+    """Outputs (n_outputs,) whose noise is not the same in all records."""
+    n, free = len(squares), _each(free, squares)
+    if n == 1:
+        return np.zeros(squares.shape[1], bool)
+    whole = free.sum(axis=0)
+    apart = whole * np.log(squares.sum(axis=0) / whole) - (free * np.log(squares / free)).sum(axis=0)
+    return apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1))) > chi2.isf(SPLIT, n - 1)
+
+
+def _each(free: np.ndarray, squares: np.ndarray) -> np.ndarray:
+    return np.broadcast_to(free[:, None] if free.ndim == 1 else free, squares.shape)

@@ -1,0 +1,43 @@
+"""How long an identification may take, and what it left undone."""
+
+from time import monotonic
+
+SECONDS = 30.0
+
+
+class Budget:
+    """Time left for an identification; searches that find it spent return the best they have.
+
+    Attributes:
+        seconds: allowed, from the construction on.
+        unfinished: the searches that were ended early, each once.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        if seconds is not None and not seconds > 0:
+            raise ValueError(f"identification needs time: seconds must be positive; got {seconds:g}")
+        self.seconds = seconds
+        self.unfinished: list[str] = []
+        self._end = float("inf") if seconds is None else monotonic() + seconds
+
+    def spent(self, search: str) -> bool:
+        """Whether the time is up; the search that asks is then noted as unfinished."""
+        if monotonic() < self._end:
+            return False
+        if search not in self.unfinished:
+            self.unfinished.append(search)
+        return True
+
+    def share(self, of: int) -> "Budget":
+        """One part of so many equal ones of the time left; what it leaves unfinished counts here."""
+        part = Budget(None if self.seconds is None else max(self._end - monotonic(), 1e-3) / of)
+        part.unfinished = self.unfinished
+        return part
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was left undone, in one sentence; empty where all was finished."""
+        if not self.unfinished:
+            return ()
+        what = ", ".join(self.unfinished)
+        return (f"stopped after {self.seconds:g} s, unfinished: {what}; allow more time by `seconds`",)

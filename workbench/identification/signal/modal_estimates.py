@@ -1,0 +1,99 @@
+"""Estimates of frequencies, damping ratios and shapes: their standard errors, and how they are printed."""
+
+import math
+from collections.abc import Iterator
+from html import escape
+
+import numpy as np
+from scipy.special import ndtri
+
+from workbench.structure.modes import SampledModes
+
+HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
+
+
+class ModalEstimates:
+    """What modes with a covariance of (ω_1..ω_n, ζ_1..ζ_n), (2 n_modes, 2 n_modes), say of their errors."""
+
+    modes: SampledModes
+    covariance: np.ndarray
+
+    @property
+    def omega_std(self) -> np.ndarray:
+        """Standard error of each frequency (n_modes,), rad/s."""
+        return np.sqrt(np.diag(self.covariance)[: self.modes.n_modes])
+
+    @property
+    def zeta_std(self) -> np.ndarray:
+        """Standard error of each damping ratio (n_modes,)."""
+        return np.sqrt(np.diag(self.covariance)[self.modes.n_modes :])
+
+    def interval(self, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+        """Confidence intervals of ω and of ζ, (2, n_modes) each: lower row, upper row."""
+        width = float(ndtri(0.5 * (1.0 + level)))
+        both = ((self.modes.omega, self.omega_std), (self.modes.zeta, self.zeta_std))
+        omega, zeta = (np.stack([value - width * std, value + width * std]) for value, std in both)
+        return omega, zeta
+
+    def _remarks(self) -> tuple[str, ...]:
+        """What to print below the table."""
+        return tuple(getattr(self, "remarks", ()))
+
+    def __str__(self) -> str:
+        return as_text(self, self._remarks())
+
+    def __repr__(self) -> str:
+        return summary(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(self, self._remarks())
+
+
+def rows_of(found: ModalEstimates) -> Iterator[tuple[str, ...]]:
+    """One row a mode under `HEADINGS`, figures to the second digit of their standard errors."""
+    modes = found.modes
+    collinearity = modes.phase_collinearity
+    for r in range(modes.n_modes):
+        frequency = rounded(modes.frequencies_hz[r], found.omega_std[r] / (2.0 * np.pi))
+        damping = rounded(100 * modes.zeta[r], 100 * found.zeta_std[r])
+        yield str(r + 1), *frequency, *damping, f"{collinearity[r]:.4f}"
+
+
+def rounded(value: float, error: float) -> tuple[str, str]:
+    """A figure and its standard error, both to the second digit of the error."""
+    if not (math.isfinite(error) and error > 1e-9 * abs(value)):
+        return f"{value:.10g}", f"{error:.1g}"
+    digits = max(0, 1 - math.floor(math.log10(error)))
+    return f"{value:.{digits}f}", f"{error:.{digits}f}"
+
+
+def summary(found: ModalEstimates) -> str:
+    """One line: the type, and the frequencies of its modes."""
+    hz = found.modes.frequencies_hz
+    first = ", ".join(f"{f:.4g}" for f in hz[:4]) + (", ..." if hz.size > 4 else "")
+    return f"{type(found).__name__}({hz.size} mode{'s' * (hz.size != 1)}{f': {first} Hz' if hz.size else ''})"
+
+
+def as_text(found: ModalEstimates, remarks: tuple[str, ...] = ()) -> str:
+    """The table of modes, columns right-aligned, with what there is to remark below it."""
+    table = [HEADINGS, *rows_of(found)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
+    return "\n".join([*lines, *remarks])
+
+
+def as_html(found: ModalEstimates, remarks: tuple[str, ...] = ()) -> str:
+    """The same as a table for a notebook."""
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in HEADINGS)
+    rows = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows_of(found))
+    body = "".join(f"<tr>{row}</tr>" for row in rows)
+    below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
+    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{below}"
+
+
+def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
+    """Each column turned as near the real axis as it goes, largest entry 1, first clear entry positive."""
+    turned = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
+    turned = turned / np.abs(turned).max(axis=0)
+    clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)
+    return turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0)
