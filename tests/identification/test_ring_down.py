@@ -70,9 +70,9 @@ def test_noise_is_refused():
 def test_driven_record_is_refused(seed):
     n, pole, rng = 20_000, np.exp((-0.24 + 8.0j) * 0.02), np.random.default_rng(seed)
     force = rng.standard_normal(n)
-    swing = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
-    driven = Record(0.02, np.vstack([swing, 0.5 * swing + 0.3 * force]), (Channel("a"), Channel("b")))
-    with pytest.raises(ValueError, match="has forgotten its phase"):
+    motion = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
+    driven = Record(0.02, np.vstack([motion, 0.5 * motion + 0.3 * force]), (Channel("a"), Channel("b")))
+    with pytest.raises(ValueError, match="not correlated over its length"):
         ring_down(driven, start=0.0)
 
 
@@ -92,7 +92,7 @@ def test_number_of_modes_as_asked():
     [("hold_and_release_1", (2.5, 18.0, 53.0, 107.0, 178.5)), ("ping_mid_beam_hard", (2.5, 18.0, 53.0, 107.0, 178.5))],
 )
 def test_modes_of_the_measured_arm(name, seen):
-    """Those seen by eye in its spectra; the second record drifts by more than the modes swing."""
+    """Those seen by eye in its spectra; the second record drifts by more than the modes motion."""
     if not ARM.is_dir():
         pytest.skip(f"measured records are not at {ARM}")
     table = np.loadtxt(ARM / f"{name}.txt")
@@ -117,8 +117,8 @@ def test_swept_record_is_remarked():
     """A sweep lets mode after mode ring, and goes on."""
     time, pole = 0.02 * np.arange(1000), np.exp((-0.24 + 12.0j) * 0.02)
     force = np.sin(2 * np.pi * (0.5 + 0.5 * time) * time)
-    swing = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
-    outputs = swing + 0.01 * swing.std() * RNG.standard_normal(1000)
+    motion = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], force)
+    outputs = motion + 0.01 * motion.std() * RNG.standard_normal(1000)
     told = ring_down(Record(0.02, outputs[None], (Channel("a"),)), start=0.0)
     assert any("of the motion, is not white" in note for note in told.notes)
 
@@ -127,8 +127,8 @@ def test_short_random_response_is_refused_or_remarked():
     n, pole = 1000, np.exp((-0.24 + 8.0j) * 0.02)
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        swing = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.standard_normal((2, n)), axis=1)
-        record = Record(0.02, swing + 0.02 * swing.std() * rng.standard_normal((2, n)), (Channel("a"), Channel("b")))
+        motion = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.standard_normal((2, n)), axis=1)
+        record = Record(0.02, motion + 0.02 * motion.std() * rng.standard_normal((2, n)), (Channel("a"), Channel("b")))
         try:
             told = ring_down(record, start=0.0)
         except ValueError as error:

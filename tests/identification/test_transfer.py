@@ -146,7 +146,7 @@ def test_points_that_disagree_make_one_mode_of_a_crowd():
 
 
 def test_close_modes_that_damping_couples_are_two():
-    """Their points swing far out of phase, yet two are no cluster: eigenvalues by numpy."""
+    """Their points motion far out of phase, yet two are no cluster: eigenvalues by numpy."""
     omega, lines = 2.0 * np.pi * np.array([108.9, 110.5]), np.arange(90.0, 130.0, 0.2)
     shapes = np.random.default_rng(0).standard_normal((8, 2))
     c = np.diag(2.0 * np.array([0.006, 0.008]) * omega)

@@ -6,7 +6,7 @@ of that noise is estimated from the residual, and the modes from it in turn (`in
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import control
@@ -15,11 +15,11 @@ import numpy as np
 from workbench.identification.input_output.fit_errors import errors, fixed_std, pole_covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.model_order import Selected, select_modes
+from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.signal.budget import SECONDS, Budget
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
+from workbench.identification.signal.modal_estimates import ModalEstimates, credible, normalised_shapes
 from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
@@ -165,7 +165,8 @@ def identify_driven(
             f" {', '.join(records[0].output_names)} rises above the noise; excite harder or longer, or look whether"
             " inputs and outputs belong together"
         )
-    return _report(records, data, selected, budget.remarks)
+    selected, remarks = _without_artefacts(data, selected, budget)
+    return _report(records, data, selected, (*remarks, *budget.remarks))
 
 
 def _selected(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
@@ -190,6 +191,28 @@ def _selected(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInput
     worth = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
     strange = (~_oscillate(data, selected)).sum() > (~_oscillate(other, fewer)).sum()
     return (other, fewer) if strange or other.cost(fewer.fit) - data.cost(selected.fit) <= worth else (data, selected)
+
+
+def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) -> tuple[Selected, tuple[str, ...]]:
+    """Without poles that cannot be modes, the others fitted anew, and a remark on them."""
+    out: list[float] = []
+    fit = selected.fit
+    while fit.poles.size > 1:
+        std = np.sqrt(np.diag(pole_covariance(fit))).reshape(2, -1)
+        modes = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), fit.amplitudes, data.places)
+        good = credible(modes, *std, data.highest)
+        if good.all() or not good.any():
+            break
+        out += list(modes.frequencies_hz[~good])
+        fit = settled(data, projected(data, fit.poles[good], fit.participation[good]), budget=budget)
+    if not out:
+        return selected, ()
+    evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
+    which = ", ".join(f"{f:.4g}" for f in sorted(out))
+    return (
+        replace(selected, fit=fit, evidence=evidence),
+        (f"left out, as negatively damped, of unknown frequency or beyond Nyquist: poles at {which} Hz",),
+    )
 
 
 def _oscillate(data: KnownInputs, selected: Selected) -> np.ndarray:

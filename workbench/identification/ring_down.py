@@ -117,7 +117,9 @@ def ring_down(
             _by_stabilisation(cut, budget),
             ["model order by stabilisation diagram: by likelihood there is none"],
         )
+    found = found.without_artefacts(np.pi / cut[0].sample_time, growing=True)
     _check_decays(cut, found.refined)
+    found = found.without_artefacts(np.pi / cut[0].sample_time)
     left = [project(record, found.modes.poles, True).residual.T for record in cut]
     coloured = _coloured_residual(cut, left)
     doubtful = _unexplained(cut, left, found.refined, bool(coloured))

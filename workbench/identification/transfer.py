@@ -20,7 +20,7 @@ from workbench.identification.input_output.mode_clusters import NARROW, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.budget import SECONDS, Budget
-from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
+from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes
 from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel
@@ -189,6 +189,7 @@ def _modes_of(lines: Lines, selected: Selected, channels, edges_hz: tuple[float,
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
     covariance = pole_covariance(fit, noise_ratio)
     sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < UNSURE * np.abs(fit.poles)
+    sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     inside = np.flatnonzero(within & sure & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
     n = inside.size

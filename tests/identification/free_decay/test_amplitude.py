@@ -26,10 +26,10 @@ def test_duffing_oscillator_follows_its_backbone():
     """ω(A) = ω0 (1 + 3 κ A² / (8 ω0²)) for x'' + 2 ζ ω0 x' + ω0² x + κ x³ = 0 (Nayfeh & Mook 1979, 2.3)."""
     omega, zeta, kappa = 10.0, 0.004, 6.0
     time = 0.02 * np.arange(4000)
-    swing = solve_ivp(lambda t, y: [y[1], -2 * zeta * omega * y[1] - omega**2 * y[0] - kappa * y[0] ** 3],
+    motion = solve_ivp(lambda t, y: [y[1], -2 * zeta * omega * y[1] - omega**2 * y[0] - kappa * y[0] ** 3],
                       (0.0, time[-1]), [1.0, 0.0], t_eval=time, rtol=1e-9, atol=1e-12)  # fmt: skip
     noise = 1e-3 * np.random.default_rng(0).standard_normal(4000)
-    record = Record(0.02, (swing.y[0] + noise)[None], (Channel("x", "displacement"),))
+    record = Record(0.02, (motion.y[0] + noise)[None], (Channel("x", "displacement"),))
     found = amplitude_dependence(record, refine(record, stacked_delays(record, n_modes=1)))
     assert found.depends.all()
     backbone = omega * (1.0 + 3.0 * kappa * found.amplitude[:, 0] ** 2 / (8.0 * omega**2))

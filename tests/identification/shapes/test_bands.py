@@ -41,15 +41,15 @@ def test_the_curve_is_that_of_eigenfunctions(beam):
 
 
 def test_bands_hold_the_true_curve_as_often_as_they_say(beam):
-    truth, inside, whole, foretold = beam.phi(X), [], [], []
+    truth, inside, whole, predicted = beam.phi(X), [], [], []
     for seed in range(100):
         bands = eigenfunction_bands(refined(beam, seed), X, length=LENGTH, mass_per_length=1.5, ends=HINGED)
         sign = np.sign((bands.phi * truth).sum(axis=0))
         error = np.abs(sign * bands.phi - truth)[1:-1] / bands.std[1:-1]
         inside.append(error < 1.96)
         whole.append((error < bands.width).all(axis=0))
-        foretold.append(bands.interpolation_std.max(axis=0) == 0)
-    assert np.mean(foretold) > 0.9  # a smooth beam and sensors enough: nothing is said to be missed
+        predicted.append(bands.interpolation_std.max(axis=0) == 0)
+    assert np.mean(predicted) > 0.9  # a smooth beam and sensors enough: nothing is said to be missed
     # 200 curves: a share of 0.95 strays by 0.015 (one sigma); points of a curve go together
     assert 0.92 < np.mean(inside) < 0.98
     assert 0.91 < np.mean(whole) < 0.99

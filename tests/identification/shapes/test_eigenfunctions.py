@@ -63,7 +63,7 @@ def test_order_of_convergence(degree, order):
     assert errors[1] < 1e-4
 
 
-def test_scaled_by_a_blow_without_knowing_the_mass():
+def test_scaled_by_an_impulse_without_knowing_the_mass():
     modes = elastic("beam", "clamped", "free", 4)
     positions = np.linspace(0.1, 2.0, 20)
     ends = KnownEnds.of("beam", length=2.0, left="clamped", right="free")
@@ -111,7 +111,7 @@ def test_what_a_spline_misses_by_its_peano_kernel(derivative, right):
 
 
 def test_default_degree_follows_the_mode():
-    """High degrees for slow shapes; not for those that swing too fast for their sensors."""
+    """High degrees for slow shapes; not for those that motion too fast for their sensors."""
     modes = elastic("bar", "fixed", "free", 8)
     positions = np.arange(1, 13) / 6
     sampled = SampledModes(modes.omega, modes.zeta, modes.phi(positions), positions)
@@ -135,6 +135,6 @@ def test_refusals():
     with pytest.raises(ValueError, match="no known end"):
         KnownEnds.of("bar", length=1.0, left="clamped")
     hinged = elastic("beam", "hinged", "hinged", 2)
-    blow_at_node = impulse_response_modes(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
-    with pytest.raises(ValueError, match="hardly drives mode 2"):
-        eigenfunctions(blow_at_node, length=2.0, driven_at=1.0, degree=5)
+    impulse_at_node = impulse_response_modes(hinged, at=1.0, positions=np.linspace(0.1, 1.9, 15))
+    with pytest.raises(ValueError, match="hardly excites mode 2"):
+        eigenfunctions(impulse_at_node, length=2.0, driven_at=1.0, degree=5)

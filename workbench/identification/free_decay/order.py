@@ -76,13 +76,14 @@ def identify(
             sensors or rate; too few samples.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    return identify_within(records, Budget(seconds), most_modes=most_modes, false_alarm=false_alarm)
+    found = identify_within(records, Budget(seconds), most_modes=most_modes, false_alarm=false_alarm)
+    return found.without_artefacts(np.pi / records[0].sample_time)
 
 
 def identify_within(
     records: Sequence[Record], budget: Budget, *, most_modes: int | None = None, false_alarm: float = FALSE_ALARM
 ) -> Identified:
-    """`identify`, on a budget that others share."""
+    """`identify`, on a budget that others share, artefacts included."""
     check_same_sensors(records)
     for record in records:
         check_data_quality(record)

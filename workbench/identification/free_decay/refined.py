@@ -1,11 +1,11 @@
 """What a fit of free decays says: its modes, with the covariance of frequencies, damping and shapes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
+from workbench.identification.signal.modal_estimates import ModalEstimates, credible, normalised_shapes
 from workbench.identification.signal.noise import noise_near
 from workbench.identification.signal.projection import Projection, project
 from workbench.identification.signal.synthesis import time_derivatives
@@ -35,6 +35,17 @@ class Refined(ModalEstimates):
     noise: np.ndarray
     converged: bool
     steps: int
+
+    def select(self, which: np.ndarray) -> "Refined":
+        """Some of the modes, by index; the others were fitted beside them."""
+        both = np.r_[which, which + self.modes.n_modes]
+        return replace(
+            self,
+            modes=self.modes.select(list(which)),
+            covariance=frozen(self.covariance[np.ix_(both, both)]),
+            amplitudes=tuple(frozen(each[:, which], complex) for each in self.amplitudes),
+            shape_covariance=frozen(self.shape_covariance[which]),
+        )
 
     @property
     def noise_std(self) -> np.ndarray:
@@ -75,6 +86,35 @@ class Identified(ModalEstimates):
     def covariance(self) -> np.ndarray:  # type: ignore[override]
         """(2 n_modes, 2 n_modes) of (ω, ζ)."""
         return self.refined.covariance
+
+    def without_artefacts(self, nyquist: float, *, growing: bool = False) -> "Identified":
+        """Only poles that can be modes (`credible`); the others join `noise_modes`.
+
+        Args:
+            nyquist: frequency, rad/s.
+            growing: whether poles of negative damping stay.
+        """
+        zeta_std = np.full(self.modes.n_modes, np.inf) if growing else self.zeta_std
+        good = credible(self.modes, self.omega_std, zeta_std, nyquist)
+        if good.all() or not good.any():
+            return self
+        kept, out = np.flatnonzero(good), np.flatnonzero(~good)
+        evidence = self.evidence if self.evidence.size else np.zeros(good.size)
+        joined = np.r_[self.noise_modes.omega, self.modes.omega[out]]
+        order = np.argsort(joined)
+        noise_modes = SampledModes(
+            joined[order],
+            np.r_[self.noise_modes.zeta, self.modes.zeta[out]][order],
+            np.hstack([self.noise_modes.shapes, self.modes.shapes[:, out]])[:, order],
+            self.modes.positions,
+        )
+        return replace(
+            self,
+            refined=self.refined.select(kept),
+            evidence=frozen(self.evidence[kept]) if self.evidence.size else self.evidence,
+            noise_modes=noise_modes,
+            noise_evidence=frozen(np.r_[self.noise_evidence, evidence[out]][order]),
+        )
 
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:

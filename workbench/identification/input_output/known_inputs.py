@@ -50,7 +50,7 @@ class KnownInputs:
         line_std: Sequence[np.ndarray] | None = None,
     ) -> None:
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
-        self.dt = records[0].sample_time
+        self.dt, self.places = records[0].sample_time, records[0].positions
         lengths = [record.n_samples for record in records]
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]

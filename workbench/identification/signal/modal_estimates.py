@@ -9,6 +9,8 @@ from scipy.special import ndtri
 
 from workbench.structure.modes import SampledModes
 
+# Standard errors below zero from which on a damping ratio is negative.
+SURE = 3.0
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 
 
@@ -89,6 +91,19 @@ def as_html(found: ModalEstimates, remarks: tuple[str, ...] = ()) -> str:
     body = "".join(f"<tr>{row}</tr>" for row in rows)
     below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{below}"
+
+
+def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, nyquist: float) -> np.ndarray:
+    """Which estimates can be modes, (n_modes,): damping not negative beyond its error, a frequency known and below
+    Nyquist.
+
+    Args:
+        modes: estimated.
+        omega_std, zeta_std: (n_modes,) standard errors.
+        nyquist: frequency, rad/s.
+    """
+    growing = modes.zeta < -SURE * zeta_std
+    return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
 def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
