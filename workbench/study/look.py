@@ -12,7 +12,7 @@ from scipy.signal import find_peaks, welch
 
 from workbench.draw.plot import plot
 from workbench.draw.spectra import plot_spectra, plot_transfer
-from workbench.identification.signal.data_quality import ailments
+from workbench.identification.signal.data_quality import data_faults
 from workbench.identification.signal.decay import decay_start
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
@@ -63,7 +63,7 @@ def _record(record: Record, path: Path) -> Look:
         f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
-    faults = ailments(record)
+    faults = data_faults(record)
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
     remarks = [fault.message for fault in faults]
     untold = [channel.name for channel in channels if not channel.quantity]
