@@ -14,7 +14,14 @@ def test_a_new_case_is_a_case_once_its_records_are_there(run, tmp_path):
     for name in ("low", "high", "validate"):
         record = simulate(rig, rng.standard_normal((2, 2000)), sample_time=0.0005)
         signals = {**dict(zip(record.input_names, record.inputs)), **dict(zip(record.output_names, record.outputs))}
+        if name == "high":  # any format that holds the same channels will do
+            columns = np.column_stack([record.time, *signals.values()])
+            file = tmp_path / "arm" / "records" / "high.csv"
+            np.savetxt(file, columns, delimiter=",", header=",".join(["t", *signals]), comments="")
+            continue
         np.savez(tmp_path / "arm" / "records" / f"{name}.npz", t=record.time, **signals)
+    toml = tmp_path / "arm" / "case.toml"
+    toml.write_text(toml.read_text(encoding="utf-8").replace("high.npz", "high.csv"), encoding="utf-8")
     case = read_case(tmp_path / "arm")
     assert [len(case.fit), len(case.validation)] == [2, 1]
     again = run("new", "case", tmp_path / "arm")

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import socket
 import threading
 from dataclasses import asdict, replace
 
@@ -185,3 +186,31 @@ def test_plain_modal_data_know_no_places_to_stand(tmp_path):
     )
     with pytest.raises(StudyError, match="plain modal data know no places"):
         bench_server(*read_structure(path))
+
+
+def test_fifty_connections_at_once_are_answered(bench):
+    body, answers = plain(start(RIG)), []
+
+    def ask():
+        answers.append(request(bench, "POST", "/try", body, Content_Type="application/json")[0])
+
+    threads = [threading.Thread(target=ask) for _ in range(50)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert answers == [200] * 50
+
+
+def test_a_client_that_sends_nothing_is_dropped_and_keeps_no_other_waiting(bench, monkeypatch):
+    monkeypatch.setattr("workbench.study.bench._Handler.timeout", 0.5)
+    with socket.create_connection(("127.0.0.1", bench), timeout=10) as silent:
+        silent.sendall(b"POST /try HTTP/1.1\r\nHost: 127.0.0.1")
+        assert request(bench, "GET", "/")[0] == 200
+        assert silent.recv(1) == b"", "the server closes the connection"
+
+
+def test_undamped_residual_modes_are_not_called_stable_alone():
+    design = start(RIG)
+    found = shown(RIG, design)
+    assert found["stable"] and found["undamped"] == RIG.modes.n_modes - design.controlled

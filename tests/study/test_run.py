@@ -32,6 +32,10 @@ def fails_at_two(at):
     return at / 3
 
 
+def third(at):
+    return {"third": at / 3}
+
+
 def dies_at_two(at):
     if at == 2:
         os._exit(9)
@@ -222,3 +226,11 @@ def test_a_table_says_what_it_cannot_do(tmp_path):
             found[0].error == f"TypeError: a result cannot be called {name!r}: the table has a column of it; rename it"
         )
     assert not list(Path(tmp_path).iterdir())
+
+
+def test_results_that_cannot_be_kept_are_not_lost(tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("a file stands where the folder of the cache should be")
+    with pytest.warns(UserWarning, match="3 of 3 results could not be kept in"):
+        found = study.run([{"at": at} for at in range(3)], third, cache=blocked, workers=1)
+    assert [result["third"] for result in found] == [0.0, 1 / 3, 2 / 3] and not found.failed

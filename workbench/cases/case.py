@@ -21,6 +21,7 @@ from workbench.cases.tables import (
     text,
 )
 from workbench.records.file_error import RecordFileError
+from workbench.records.files import read_record
 from workbench.records.limits import check_size
 from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import Channel, Record
@@ -292,12 +293,18 @@ def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
     )
 
 
+def _signals(record: Record) -> dict[str, np.ndarray]:
+    """The time and the channels of a record of any format, by name."""
+    channels = (*zip(record.input_names, record.inputs), *zip(record.output_names, record.outputs))
+    return {"t": record.time, **dict(channels)}
+
+
 def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
     try:
         check_size(file)
-        arrays = load_arrays(file)
+        arrays = load_arrays(file) if file.suffix == ".npz" else _signals(read_record(file))
     except RecordFileError as error:
         raise CaseError(str(error)) from error
     for name, values in arrays.items():

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Interval
 
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
@@ -27,6 +28,8 @@ def read_structure_rig(path: Path) -> Rig:
     found = read_rig(path / "case.toml" if path.is_dir() else path)
     if found.structure is None:
         raise ValueError(f"{path}: plain modal data have no shapes between points; describe a beam or a rod instead")
+    if not isinstance(found.modes.domain, Interval):
+        raise ValueError(f"{path}: a design from the command is for a beam or a rod; design on a plate from Python")
     return found
 
 

@@ -9,6 +9,7 @@ from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 
 LINES = 4096  # samples of a segment
+SHOWN = 1e-12  # least power shown, as a share of the largest
 SEGMENTS = 4  # of the record at least
 MOST_PANELS = 12
 
@@ -23,6 +24,7 @@ def plot_spectra(record: Record) -> Figure:
         )
         if power[1:].max(initial=0.0) > 0:
             ax.semilogy(lines[1:], power[1:], color=COLOURS[1] if i < record.n_inputs else COLOURS[0], linewidth=0.9)
+            ax.set_ylim(bottom=max(ax.get_ylim()[0], SHOWN * power[1:].max()))
         ax.set_ylabel(f"{channel.name}\n[{f'({channel.unit})²/Hz' if channel.unit else '1/Hz'}]")
     axes[0, 0].set_title("power spectral density")
     axes[-1, 0].set_xlabel("frequency [Hz]")

@@ -5,12 +5,14 @@ from typing import Any
 import matplotlib
 from cycler import cycler
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullFormatter
 
 matplotlib.use("Agg")
 
 # Okabe & Ito's palette, in the order of use
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#8a8a8a"
+PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
 
 SETTINGS: Any = {
     "axes.grid": True,
@@ -35,3 +37,20 @@ def new_figure(rows: int = 1, cols: int = 1, *, width: float = 9.0, height: floa
     """A figure in the house style and its axes, as `Figure.subplots` gives them."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, cols, **options)
+
+
+def plain_ticks(figure: Figure) -> Figure:
+    """The figure with plain numbers on its logarithmic axes, 0.1, 1, 20 rather than 2×10⁰, where they are few."""
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            if axis.get_scale() != "log":
+                continue
+            low, high = sorted(axis.get_view_interval())
+            if not low > 0:
+                continue
+            if high / low < PLAIN_DECADES and low >= PLAIN_LEAST and high <= 1.0 / PLAIN_LEAST:
+                axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(
+                FuncFormatter(lambda value, _: f"{value:g}") if high / low < 10 else NullFormatter()
+            )
+    return figure

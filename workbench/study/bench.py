@@ -16,6 +16,8 @@ from workbench.study.trying import asked, setting, shown
 
 HERE = "127.0.0.1"
 MOST_BYTES = 65536
+CLIENT_SECONDS = 10.0  # after which a client that sends nothing is dropped
+MOST_WAITING = 128  # connections not yet taken
 POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self';"
     " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -41,16 +43,25 @@ def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path
     )
     handler = partial(_Handler, rig, structure, folder, page.encode())
     try:
-        return ThreadingHTTPServer((HERE, port), handler)
+        return _Server((HERE, port), handler)
     except (OSError, OverflowError) as error:
         raise StudyError(f"port {port} cannot be had ({error}); give another --port, or 0 for any") from error
+
+
+class _Server(ThreadingHTTPServer):
+    """A thread a connection; a burst of them waits instead of being refused."""
+
+    request_queue_size, daemon_threads = MOST_WAITING, True
+
+    def handle_error(self, request, client_address) -> None:
+        """Say nothing of a client that went away: only the command prints."""
 
 
 class _Handler(BaseHTTPRequestHandler):
     """Answers the bench's own page and no other: a name that leads here from elsewhere is turned away."""
 
     server_version, sys_version, protocol_version = "workbench", "", "HTTP/1.1"
-    timeout = 30
+    timeout = CLIENT_SECONDS
     wbufsize, disable_nagle_algorithm = -1, True  # an answer leaves whole and at once
 
     def __init__(self, rig: Rig, structure: str, folder: Path, page: bytes, *arguments):

@@ -57,11 +57,22 @@ def work(function: Callable, job: Job, running: Path | None = None) -> dict:
         record["error"] = f"{type(error).__name__}: {error}"
         record["trace"] = traceback.format_exc()
     record["seconds"] = time.perf_counter() - start
-    if job.file is not None and record["error"] is None:
-        write_record(job.file, record)
+    if job.file is not None:
+        record["unkept"] = keep(job.file, record)
     if running is not None:
         (running / job.key).unlink(missing_ok=True)
     return record
+
+
+def keep(file: Path, record: dict) -> str | None:
+    """Put a result away unless it is an error; why it could not be, where the disk refuses."""
+    if record["error"] is not None:
+        return None
+    try:
+        write_record(file, record)
+    except OSError as error:  # a full disk or a folder that cannot be written to loses no result of this run
+        return str(error)
+    return None
 
 
 def packed(function: Callable) -> bytes:

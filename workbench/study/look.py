@@ -82,13 +82,14 @@ def _record(record: Record, path: Path) -> Look:
         options += [] if decays else ["--ambient"]
     if faulty and kept:
         options += ["--outputs", ",".join(kept)]
+    moving = record.only([name for name in record.output_names if name not in faulty]) if kept or forces else record
     story = Story(
         title=f"What {path.name} holds",
         lead=heading,
-        lines=remarks,
+        lines=[*remarks, f"Go on with: {_command(path, options)}"],
         blocks=[
             block(plot(record), "The signals as recorded."),
-            block(plot_spectra(record), "Power spectral density, by Welch's method."),
+            block(plot_spectra(moving), "Power spectral density, by Welch's method."),
         ],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
@@ -112,6 +113,7 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
     story = Story(
         title=f"What {path.name} holds",
         lead=heading,
+        lines=[f"Go on with: {_command(path, [])}"],
         blocks=[block(plot_transfer(measured), "Magnitude of the transfer functions.")],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",

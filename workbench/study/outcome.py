@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from workbench.draw.style import plain_ticks
 from workbench.study.results import Results
 from workbench.study.runner import CACHE, run
 from workbench.study.whole_file import write_whole
@@ -64,7 +65,7 @@ class Outcome:
         """Save a figure as figures/STUDY-name.png, and show it on the page."""
         self.figures_folder.mkdir(parents=True, exist_ok=True)
         path = self.figures_folder / f"{self.name}-{name}.png"
-        figure.savefig(path, metadata={"Software": None})
+        plain_ticks(figure).savefig(path, metadata={"Software": None})
         self.figures.append((name, path, caption))
         self.shown.append((figure, caption))
 

@@ -16,7 +16,7 @@ from workbench.structure.modes import SampledModes, mac
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.page import FORMAT, Story, block, story_of, tables_of, to_its_error
-from workbench.study.verdict_page import MOVING, STANDING_OF, case_inputs
+from workbench.study.verdict_page import STANDING_OF, case_inputs, moving_modes
 
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000
@@ -45,7 +45,6 @@ def case_story(folder: Path) -> Story:
     """What a case holds before any diagnosis: its nominal model, in motion, and its records beside what that says."""
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
-    swinging = mode_motion({"nominal": rig.modes}, actuators=rig.actuators, sensors=rig.sensors)
     beside = plot_responses({"nominal": rig}, records)
     told = "Measured beside the nominal model, at the sensor and in the stretch where they differ most."
     rows = [
@@ -56,7 +55,7 @@ def case_story(folder: Path) -> Story:
     return Story(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
-        blocks=[*([block(swinging, MOVING)] if rig.structure is not None else []), block(beside, told)],
+        blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, told)],
         tables=[
             ("Records", ("record", "use", "samples", "sample rate [Hz]", "input rms"), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),

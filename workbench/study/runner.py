@@ -1,14 +1,15 @@
 """Many cases of a study: each worked once, kept as soon as it is done, and taken up again after any interruption."""
 
 import inspect
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 import joblib
 
-from workbench.study.cache import decoded, read_record, write_record
+from workbench.study.cache import decoded, read_record
 from workbench.study.cases import StudyError, checked, key_of, seed_of
-from workbench.study.engines import Job, cluster, here, processes
+from workbench.study.engines import Job, cluster, here, keep, processes
 from workbench.study.fingerprint import fingerprint
 from workbench.study.results import Result, Results
 
@@ -62,11 +63,19 @@ def run(
         if key not in records
     }
     _tell(report, len(records), len(set(keys)))
+    unkept = []
     for key, record in _worked(function, list(jobs.values()), workers, scheduler):
         records[key] = record
-        if folder is not None and scheduler and record["error"] is None:
-            write_record(_file(folder, key), record)
+        if folder is not None and scheduler:
+            record["unkept"] = keep(_file(folder, key), record)
+        unkept += filter(None, [record.get("unkept")])
         _tell(report, len(records), len(set(keys)))
+    if unkept:
+        warnings.warn(
+            f"{len(unkept)} of {len(set(keys))} results could not be kept in {folder} and would be computed again:"
+            f" {unkept[0]}",
+            stacklevel=2,
+        )
     return Results(
         tuple(
             Result(case, _seed_shown(case, s), _values(records[key]), *_ending(records[key]))

@@ -17,6 +17,7 @@ from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, 
 from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Interval
 from workbench.study.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -110,8 +111,7 @@ def start(rig: Rig) -> Design:
     Raises:
         StudyError: plain modal data, which know no places, or no mode that swings.
     """
-    if rig.structure is None:
-        raise StudyError("plain modal data know no places; describe the structure as a beam or a rod")
+    _check_along(rig)
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size == 0:
         raise StudyError("the structure has no mode that swings; ask for more modes")
@@ -119,6 +119,13 @@ def start(rig: Rig) -> Design:
     struck = next((a.at for a in rig.actuators if a.direct), 0.63 * rig.modes.length)
     count = min(len(places), rig.modes.n_modes)
     return Design(tuple(places), (), count, (20.0,) * count, LAWS[0], struck, float(2.0 * np.pi / elastic[0]))
+
+
+def _check_along(rig: Rig) -> None:
+    if rig.structure is None:
+        raise StudyError("plain modal data know no places; describe the structure as a beam or a rod")
+    if not isinstance(rig.modes.domain, Interval):
+        raise StudyError("the bench moves actuators along a beam or a rod, not over a plate; describe one of these")
 
 
 def try_out(rig: Rig, design: Design) -> Tried:
@@ -178,6 +185,7 @@ def shown(rig: Rig, design: Design) -> dict:
 
 def setting(rig: Rig) -> dict:
     """What the bench needs to know once: the structure, its modes and its shapes."""
+    _check_along(rig)
     x = np.linspace(0.0, rig.modes.length, N_PLACES)
     return {
         "length": rig.modes.length,

@@ -1,6 +1,7 @@
 """The page of a diagnosis."""
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,9 @@ from workbench.cases.case import Case
 from workbench.draw.gap import plot_missing_force, plot_responses, plot_rivals, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.gap.report.verdict import Verdict
+from workbench.rig.rig import Rig
+from workbench.structure.domain import Interval
+from workbench.structure.modes import Modes
 from workbench.study.page import Story, block, to_its_error, write_page
 
 MOVING = "How the nominal model swings, and the corrected one where it differs; circles are sensors, triangles inputs."
@@ -30,9 +34,9 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     shown = verdict.to_json()
     records = (*case.fit, *case.validation)
     better = verdict.shrinkage is None or verdict.shrinkage.overall > 0
-    rigs = {"nominal": verdict.nominal}
+    rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "nearest"
     if verdict.outcome != "none" and better:  # what makes the gap larger corrects nothing
-        rigs["corrected" if verdict.outcome == "explained" else "nearest"] = verdict.corrected
+        rigs[fitted] = verdict.corrected
     figures = [
         (
             plot_responses(rigs, records),
@@ -79,10 +83,8 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
-    moving = mode_motion(
-        {"nominal": verdict.nominal.modes, **({"corrected": verdict.corrected.modes} if changed else {})},
-        actuators=verdict.nominal.actuators,
-        sensors=verdict.nominal.sensors,
+    moving = moving_modes(
+        verdict.nominal, {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
     )
     story = Story(
         title=f"Diagnosis of {verdict.case}",
@@ -91,13 +93,20 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         lines=[*verdict.notes, *([verdict.experiment.sentence] if verdict.experiment else []), _could_show(verdict)],
         blocks=[
             *(block(figure, caption) for figure, caption in figures),
-            *([block(moving, MOVING)] if verdict.nominal.structure is not None and verdict.outcome != "none" else []),
+            *(moving if verdict.outcome != "none" else []),
         ],
         tables=[table for table in tables if table[2]],
         inputs={} if folder is None else case_inputs(folder),
         made_by=f"workbench diagnose {folder or verdict.case}",
     )
     return write_page(path, story)
+
+
+def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict]:
+    """A block of modes that move, where they are known all along a structure; none elsewhere."""
+    if rig.structure is None or not isinstance(rig.modes.domain, Interval):
+        return []
+    return [block(mode_motion(modes, actuators=rig.actuators, sensors=rig.sensors), MOVING)]
 
 
 def case_inputs(folder: Path) -> dict[str, str]:
