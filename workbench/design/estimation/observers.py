@@ -72,7 +72,7 @@ def _plant(modes: Modes, law: Law, sensors: Sequence[Sensor]):
     c = reading(own, sensors)
     if not len(sensors):
         raise DesignError("an observer needs a sensor; there are none")
-    grid = np.abs(own.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9))).max(axis=0)
+    grid = np.abs(own.phi(modes.domain.grid(8 * modes.n_modes + 8))).max(axis=0)
     n = len(index)
     for j, r in enumerate(index):
         strength = max(np.abs(c[:, j]).max(), np.abs(c[:, n + j]).max())
