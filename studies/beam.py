@@ -11,6 +11,7 @@ from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place, placement_task
 from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
 from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works
@@ -70,7 +71,7 @@ def designs(modes) -> dict[str, Law]:
     even = actuators_at(EVEN)
     task = placement_task(modes, N_CONTROLLED, impulse_at=DISTURBED_AT, weight=MODAL_WEIGHT)
     limit = 1.5 * task.placed(EVEN, "even").effort
-    best = place(task, effort_limit=limit, spacing=0.5)
+    best = place(task, Limits(effort=limit, spacing=0.5))
     return {
         "IMSC": imsc(modes, N_CONTROLLED, even, weight=MODAL_WEIGHT),
         "coupled LQR": coupled_lqr(modes, N_CONTROLLED, even, weight=FORCE_WEIGHT),

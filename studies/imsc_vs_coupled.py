@@ -15,8 +15,8 @@ from workbench.design.laws.imsc import imsc, imsc_poles, riccati_gains, riccati_
 from workbench.design.laws.on_off import on_off
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state
 from workbench.design.loop.on_off_response import respond_on_off
-from workbench.design.spillover.judge import judge, judge_on_off
-from workbench.design.spillover.robustness import survival_of, wrong_by
+from workbench.design.spillover.performance import on_off_performance, performance
+from workbench.design.spillover.robustness import perturbed_modes, stable_share
 from workbench.design.spillover.spillover import (
     distributed_cost,
     effort,
@@ -134,24 +134,24 @@ def every_design(places):
         "coupled LQR": lambda: coupled_lqr(modes, 4, actuators, weight=FORCE_WEIGHT),
         "coupled poles": lambda: coupled_poles(modes, 4, actuators, poles=wanted),
     }
-    possible = wrong_by(modes, ERRORS, count=DRAWS)
+    possible = perturbed_modes(modes, ERRORS, count=DRAWS)
     rows = []
     for law_name, make in laws.items():
         law, law_seconds = designed(make)
         for way_name, way in ways.items():
             design, seconds = designed(lambda way=way, law=law: way(law))
-            told = judge(close_with(modes, design), state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
+            told = performance(close_with(modes, design), state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
             rows.append(
                 {
                     "law": law_name,
                     "state": way_name,
                     **asdict(told),
-                    "survived_share": survival_of(possible, design),
+                    "survived_share": stable_share(possible, design),
                     "seconds": law_seconds + (0.0 if design is law else seconds),
                 }
             )
     relay, seconds = designed(lambda: on_off(modes, 4, actuators, **RELAY))
-    told = judge_on_off(modes, relay, state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
+    told = on_off_performance(modes, relay, state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
     rows.append(
         {
             "law": "IMSC, on-off", "state": "exact coordinates", **asdict(told), "margin": None,

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
 from workbench.design.placement.sensor_placement import place_sensors
 from workbench.draw.design import plot_effort_front
@@ -17,11 +18,12 @@ def study(outcome, data=None):
     nodes = task.placed(nodes_of_mode(modes, 4), "nodes of mode 5")
 
     front = [
-        place(task, effort_limit=factor * nodes.effort, spacing=SPACING)
+        place(task, Limits(effort=factor * nodes.effort, spacing=SPACING))
         for factor in outcome.track((1.0001, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0), "effort limits")
     ]
-    best = place(task, effort_limit=1.5 * nodes.effort, spacing=SPACING)
-    on_grid, tried = scan(task, effort_limit=1.5 * nodes.effort, spacing=SPACING, n_places=50)
+    limits = Limits(effort=1.5 * nodes.effort, spacing=SPACING)
+    best = place(task, limits)
+    on_grid, tried = scan(task, limits, n_places=50)
 
     work, effort, *_ = symbolic_work(task)(best.positions)
     outcome.table(

@@ -7,7 +7,8 @@ from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.placement.certificate import certify
 from workbench.design.placement.coupled_placement import place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled
-from workbench.design.placement.placement import Limits, law_at, nodes_of_mode, place, placement_task
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.placement import nodes_of_mode, place, placement_task
 from workbench.design.spillover.spillover import quadratic_cost
 from workbench.draw.design import plot_placement_fronts
 from workbench.rig.actuators import Actuator
@@ -18,7 +19,7 @@ FACTORS = (1.0001, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0)
 # share of W_R to be proven by number of actuators: cells grow by about thirty with each
 GAPS = {1: 0.01, 2: 0.01, 3: 0.01, 4: 0.05}
 # of a rig: a stretch that is taken, an amplifier's force, a condition of B
-TIGHT = {"forbidden": ((6.0, 6.6),), "peak_limit": 0.32, "condition_limit": 6.0}
+TIGHT = {"forbidden": ((6.0, 6.6),), "peak_force": 0.32, "condition": 6.0}
 # places of the grid on which coupled LQR is tried with each number of actuators
 GRIDS = {2: 200, 3: 60, 4: 24}
 
@@ -34,7 +35,7 @@ def study(outcome, data=None):
         task = placement_task(modes, 4, impulse_at=at, weight=20.0)
         nodes[name] = task.placed(nodes_of_mode(modes, 4), "nodes of mode 5")
         fronts[name] = [
-            place(task, effort_limit=factor * nodes[name].effort, spacing=SPACING, starts=6)
+            place(task, Limits(effort=factor * nodes[name].effort, spacing=SPACING), starts=6)
             for factor in outcome.track(FACTORS, f"front for {name}")
         ]
         outcome.table(
@@ -69,9 +70,9 @@ def study(outcome, data=None):
     ):
         task = placement_task(modes, n, impulse_at=6.3, weight=20.0)
         rule = task.placed(nodes_of_mode(modes, n), f"nodes of mode {n + 1}")
-        limits = {"effort_limit": 1.5 * rule.effort, "spacing": SPACING, **more}
-        best = place(task, **limits)
-        proof = certify(task, best, gap=gap, **limits)
+        limits = Limits(effort=1.5 * rule.effort, spacing=SPACING, **more)
+        best = place(task, limits)
+        proof = certify(task, limits, placement=best, gap=gap)
         proofs.append(
             {
                 "actuators": n,
@@ -124,7 +125,7 @@ def study(outcome, data=None):
     state = impulse_state(modes, 6.3)
     state[9 + 4 :] = 0.0
     regulators = {
-        "IMSC": law_at(placement_task(modes, 4, impulse_at=6.3, weight=20.0), best.positions, weight=20.0),
+        "IMSC": best.law,
         "coupled LQR": coupled_lqr(
             modes, 4, [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(together.positions)], weight=10.0
         ),

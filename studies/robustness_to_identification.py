@@ -9,9 +9,9 @@ from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.loop.reidentify import open_loop, updated
-from workbench.design.spillover.robustness import draw_modes, survive
+from workbench.design.spillover.robustness import draw_modes, robustness
 from workbench.design.spillover.spillover import distributed_cost, modal_cost
-from workbench.draw.design import plot_drift, plot_survival
+from workbench.draw.design import plot_drift, plot_robustness
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
@@ -81,7 +81,7 @@ def survival(outcome):
         possible = draw_modes(
             modes, DRAWS, seed=5, scale=scale, shape_covariance=found.shape_covariance, positions=SENSORS
         )
-        for name, result in survive(possible, chosen, state=state, final_time=FINAL_TIME).items():
+        for name, result in robustness(possible, chosen, state=state, final_time=FINAL_TIME).items():
             shares[name].append(result.share)
             spreads[name].append(result.spread())
     outcome.table("relative_omega_std", found.omega_std / found.modes.omega)
@@ -101,7 +101,9 @@ def survival(outcome):
         at_least=True,
     )
     outcome.figure(
-        "draws", plot_survival(SCALES, shares, spreads), "Share of possible structures on which each design is stable."
+        "draws",
+        plot_robustness(SCALES, shares, spreads),
+        "Share of perturbed models on which each design is stable.",
     )
 
 

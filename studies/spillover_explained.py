@@ -9,8 +9,8 @@ from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, close_with
 from workbench.design.spillover.explain import explain
-from workbench.design.spillover.remedies import remedies, sensors_that_suffice
-from workbench.draw.design import plot_cure, plot_spillover_paths
+from workbench.design.spillover.remedies import remedies, sufficient_sensors
+from workbench.draw.design import plot_sensor_counts, plot_spillover_paths
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
@@ -61,20 +61,20 @@ def study(outcome, data=None):
     outcome.check("margin on the reduced model, sensor across", reduced(observed(one, [ACROSS])), 0.01, at_least=True)
     outcome.check("margin on the full model, sensor beside the actuator", stable.margin, 0.0, at_least=True)
     outcome.check("margin on the full model, sensor across", unstable.margin, 0.0)
-    culprit = unstable.culprit
+    worst = unstable.destabilising
     outcome.say(
         f"one sensor at x = {BESIDE:.2f}, beside the actuator: stable, margin {stable.margin:.2g} 1/s; at {ACROSS:.2f}:"
-        f" mode {culprit.mode + 1} grows at {culprit.closed_pole.real:.2g} 1/s, though the reduced model's margin is"
+        f" mode {worst.mode + 1} grows at {worst.closed_pole.real:.2g} 1/s, though the reduced model's margin is"
         f" {reduced(observed(one, [ACROSS])):.2g}"
     )
 
     # two actuators and two sensors: by which path?
     crossed = explain(modes, observed(ACTUATORS, [3.1, ACROSS]))
-    worst = crossed.moved[0]
+    worst = crossed.shifts[0]
     path = worst.paths[0]
     outcome.check(
         "paths add up to the exact movement of every residual pole, relative to its frequency",
-        max(abs(sum(p.shift for p in m.paths) - m.shift) / abs(m.pole) for m in crossed.moved),
+        max(abs(sum(p.shift for p in m.paths) - m.shift) / abs(m.pole) for m in crossed.shifts),
         1e-9,
     )
     outcome.say(
@@ -93,7 +93,7 @@ def study(outcome, data=None):
     ways = {"Luenberger observer": observed, "Kalman filter": estimated, "modal filter": through_filter}
     counts, margins = {}, {}
     for name, way in ways.items():
-        counts[name], margins[name] = sensors_that_suffice(modes, way, one, most=24)
+        counts[name], margins[name] = sufficient_sensors(modes, way, one, most=24)
         outcome.say(f"{name}: {counts[name] or 'no number up to 24 of'} evenly spaced sensors suffice")
     outcome.say(
         "an even grid of k sensors takes mode 2(k + 1) - r for mode r, so a filter of displacements alone is cured only"
@@ -113,9 +113,9 @@ def study(outcome, data=None):
             {
                 "sensor": place,
                 "margin": e.margin,
-                "mode": e.moved[0].mode + 1,
-                "shift": e.moved[0].shift.real,
-                "first_order": e.moved[0].first_order.real,
+                "mode": e.shifts[0].mode + 1,
+                "shift": e.shifts[0].shift.real,
+                "first_order": e.shifts[0].first_order.real,
             }
             for place, e in ((BESIDE, stable), (ACROSS, unstable))
         ],
@@ -125,12 +125,12 @@ def study(outcome, data=None):
         [{"actuator": p.actuator, "sensor": p.sensor_at, "growth": p.shift.real} for p in worst.paths],
     )
     outcome.table("remedies", [{"kind": r.kind, "change": r.change, "size": r.size, "margin": r.margin} for r in found])
-    outcome.table("sensors_that_suffice", counts)
+    outcome.table("sufficient_sensors", counts)
     outcome.figure(
         "paths",
         plot_spillover_paths(crossed),
         "How fast each residual mode grows or decays under control, and the paths that make it.",
     )
     outcome.figure(
-        "cure", plot_cure(margins, counts), "Stability margin of the full plant against the number of sensors."
+        "cure", plot_sensor_counts(margins, counts), "Stability margin of the full plant against the number of sensors."
     )

@@ -15,6 +15,7 @@ from .design.loop.closed_loop import close_loop as close_loop
 from .design.loop.closed_loop import impulse_state as impulse_state
 from .design.loop.closed_loop import respond as respond
 from .design.placement.certificate import certify as certify
+from .design.placement.limits import Limits as Limits
 from .design.placement.placement import place as place
 from .design.placement.placement import placement_task as placement_task
 from .design.placement.sensor_placement import place_sensors as place_sensors
@@ -46,6 +47,7 @@ from .records.record import Channel as Channel
 from .records.record import Record as Record
 from .records.transfer_functions import TransferFunctions as TransferFunctions
 from .rig.actuators import Actuator as Actuator
+from .rig.actuators import piezo_patch as piezo_patch
 from .rig.elements import UserLaw as UserLaw
 from .rig.rig import Rig as Rig
 from .rig.sensors import Sensor as Sensor

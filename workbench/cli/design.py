@@ -43,7 +43,7 @@ def design(
 
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
-    from workbench.design.spillover.robustness import survival_of, wrong_by
+    from workbench.design.spillover.robustness import perturbed_modes, stable_share
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -53,14 +53,14 @@ def design(
     modes, at = found.modes, impulse_place(found, impulse_at)
     state = impulse_state(modes, at)
     state[modes.n_modes + n :] = 0.0
-    perturbed = None if errors is None else wrong_by(modes, errors)
+    perturbed = None if errors is None else perturbed_modes(modes, errors)
     laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
     end = final_time or PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0]
     rows = compare(modes, laws, state, weight=weight, final_time=end)
     table = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "largest W_r", "loop", box=None, pad_edge=False)
     for row in rows:
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
-        most = "" if row.most_fed is None else f"mode {row.most_fed + 1}"
+        most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         stable = "stable" if row.poles.real.max() < 0 else _undamped(row.poles.real.max())
         table.add_row(row.law.name, *(f"{value:.5g}" for value in numbers), most, stable)
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at x = {at:g} m, R = {weight:g}", bold=True)
@@ -79,7 +79,7 @@ def design(
         if controller is None or explained is None:
             say(f"  {why}")
             continue
-        share = None if perturbed is None else survival_of(perturbed, controller)
+        share = None if perturbed is None else stable_share(perturbed, controller)
         robust = [] if share is None else [f"{share:.0%}"]
         margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
         sensed.add_row(controller.name, margin, *_limit(explained), *robust)
@@ -126,10 +126,10 @@ def _undamped(fastest: float) -> str:
 
 def _limit(explained: "Explanation") -> tuple[str, str]:
     """The residual mode that limits the stability margin, and the path by which it does."""
-    worst = explained.culprit or (explained.moved[0] if explained.moved else None)
+    worst = explained.destabilising or (explained.shifts[0] if explained.shifts else None)
     if worst is None:
         return "", ""
-    if not explained.loop.stable and explained.culprit is None:
+    if not explained.loop.stable and explained.destabilising is None:
         return "none: unstable without any" if explained.reduced_margin <= 0 else "no single one", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"

@@ -1,7 +1,7 @@
 """`workbench place`: actuator placement."""
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.table import Table
@@ -43,7 +43,8 @@ def place(
     import numpy as np
 
     from workbench.design.placement.certificate import certify
-    from workbench.design.placement.placement import nodes_of_mode, placement_task, scan
+    from workbench.design.placement.limits import Limits
+    from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place as least_work
     from workbench.study.whole_file import check_target
 
@@ -56,18 +57,24 @@ def place(
         report = reporter(progress, "placing actuators")
         task = placement_task(modes, control, impulse_at=struck, weight=weight)
         even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
-        limits: dict[str, Any] = {
-            "effort_limit": effort * even.effort,
-            "spacing": LEAST_SPACING * modes.length if spacing is None else spacing,
-            "peak_limit": peak_force,
-            "condition_limit": condition,
-            "forbidden": [_interval(text) for text in forbid or ()],
-        }
-        if at is not None:
-            limits["candidates"] = _places(at, modes.length)
-        best = least_work(task, **limits) if at is None else scan(task, **limits)[0]
-        report("proving", 0.5)
-        certificate = None if proof is None else certify(task, best, gap=proof, **limits)
+        limits = Limits(
+            effort=effort * even.effort,
+            spacing=LEAST_SPACING * modes.length if spacing is None else spacing,
+            peak_force=peak_force,
+            condition=condition,
+            forbidden=tuple(_interval(text) for text in forbid or ()),
+            candidates=None if at is None else tuple(_places(at, modes.length)),
+        )
+        best = least_work(task, limits)
+        certificate = None
+        if proof is not None:
+            wanted = 1.0 - proof
+
+            def proving(bound: float, work: float, cells: int) -> None:
+                share = bound / work
+                report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * min(share / wanted, 1.0))
+
+            certificate = certify(task, limits, placement=best, gap=proof, progress=proving)
     rows = [best, even]
     nodes = nodes_of_mode(modes, control)
     if nodes.size == control:
@@ -79,12 +86,8 @@ def place(
         table.add_row(where, *(f"{value:.5g}" for value in numbers), row.status)
     say(f"{control} of {modes.n_modes} modes controlled, unit impulse at x = {struck:g} m, R = {weight:g}", bold=True)
     console.print(table)
-    if certificate is not None and certificate.better is not None:
-        where = ", ".join(f"{x:.4g}" for x in certificate.better)
-        say(f"  not the global optimum: actuators at {where} spill less; start from these")
-    elif certificate is not None:
-        bound = f"{1 - certificate.gap:.1%}"
-        say(f"  no placement spills less than {bound} of this: proven by branch and bound, {certificate.cells} cells")
+    if certificate is not None:
+        say(f"  {certificate}")
     write_json(
         json_path,
         {

@@ -41,7 +41,7 @@ def plot_displacements(
 
 
 def plot_work(spillovers: dict[str, Spillover]) -> Figure:
-    """Work that spills into each residual mode, one group of bars a design, on a logarithmic scale."""
+    """Spillover work in each residual mode, one group of bars a design, on a logarithmic scale."""
     figure, ax = new_figure(1, 1, width=9, height=4)
     first = next(iter(spillovers.values()))
     modes = np.array(first.residual) + 1
@@ -55,10 +55,10 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
         for x, value in zip(at, work.residual_work, strict=True):
             if value < least:
                 ax.text(x, 1.3 * least, "≈ 0", ha="center", color=bars.patches[0].get_facecolor())
-    ax.set(yscale="log", xlabel="residual mode", ylabel="work spilled into the mode, W_r", xticks=modes)
+    ax.set(yscale="log", xlabel="residual mode", ylabel="spillover work W_r", xticks=modes)
     # room above the bars for the legend
     ax.set_ylim(least, 10.0 ** (1.0 + 0.35 * len(spillovers)) * total)
-    ax.set_title("control spillover: the energy that control leaves in the modes it does not control")
+    ax.set_title("control spillover: energy that control leaves in the residual modes")
     ax.legend(loc="upper right")
     return figure
 
@@ -85,7 +85,7 @@ def plot_effort_front(placements: Sequence[Placement], marked: dict[str, Placeme
     for (name, p), colour in zip(marked.items(), COLOURS[1:], strict=False):
         axes[0].plot(p.effort, p.residual_work, "s", color=colour, markersize=9, label=name)
     axes[0].set(xscale="log", yscale="log", xlabel="effort ∫ FᵀF dt [N² s]", ylabel="spillover work W_R")
-    axes[0].set_title("what less spillover costs")
+    axes[0].set_title("spillover against effort")
     axes[0].legend()
     for p in placements:
         axes[1].plot(p.positions, np.full(p.positions.size, p.effort), "o", color=COLOURS[0], markersize=4)
@@ -101,7 +101,7 @@ def plot_filter_errors(counts: Sequence[int], errors: np.ndarray) -> Figure:
     for r in range(errors.shape[1]):
         ax.semilogy(counts, np.maximum(errors[:, r], 1e-7), "o-", label=f"mode {r + 1}", color=COLOURS[r % 7])
     ax.set(xlabel="number of sensors (displacement and slope each)", ylabel="error of the modal coordinate, |û - u|")
-    ax.set_title("modal filters: how many sensors it takes")
+    ax.set_title("error of modal filters against the number of sensors")
     ax.legend(ncols=2)
     return figure
 
@@ -121,13 +121,13 @@ def plot_comparison(rows: Sequence[dict]) -> Figure:
     ax.set(yscale="log", ylim=(least, 4.0 * ratios.max()), ylabel=f"ratio to {rows[0]['law']} (less is better)")
     ax.set_xticks(np.arange(len(keys)), ["quadratic cost", "actuator effort", "spillover W_R"])
     ax.axhline(1.0, color=GREY, linewidth=0.8)
-    ax.set_title("two ways to control the same modes with the same actuators, weighed on the actuator forces")
+    ax.set_title("independent modal-space and coupled control of the same modes with the same actuators")
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
 def plot_designs(rows: Sequence[dict], figures: dict[str, str], title: str) -> Figure:
-    """Designs in rows, one panel a figure of merit, one mark a way to know the state; what has no end is at the edge.
+    """Designs in rows, one panel a figure of merit, one mark an estimator; infinite values are at the edge.
 
     Args:
         rows: dicts with "law", "state" and every figure.
@@ -163,9 +163,9 @@ def plot_designs(rows: Sequence[dict], figures: dict[str, str], title: str) -> F
 
 
 def plot_spillover_paths(explained: Explanation) -> Figure:
-    """Growth of each residual mode in the full closed loop, and by path what control adds to it."""
+    """Growth of each residual mode in the full closed loop, and the share of each path from sensor to actuator."""
     figure, axes = new_figure(1, 2, width=11, height=4.5, width_ratios=[1, 1.2])
-    moved = sorted(explained.moved, key=lambda m: m.mode)
+    moved = sorted(explained.shifts, key=lambda m: m.mode)
     numbers = [m.mode + 1 for m in moved]
     growth = np.array([m.closed_pole.real for m in moved])
     axes[0].bar(numbers, growth, color=[COLOURS[1] if g > 0 else COLOURS[0] for g in growth])
@@ -173,40 +173,40 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
         numbers, [m.pole.real for m in moved], "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled"
     )
     axes[0].axhline(0.0, color=GREY, linewidth=0.8)
-    axes[0].set(xlabel="residual mode", ylabel="growth of the mode, Re λ [1/s]", xticks=numbers)
+    axes[0].set(xlabel="residual mode", ylabel="growth rate Re λ [1/s]", xticks=numbers)
     axes[0].set_title("above zero the full plant is unstable")
     axes[0].legend()
-    worst = explained.moved[0]
+    worst = explained.shifts[0]
     labels = [f"sensor {p.sensor_at:.2f} → {p.actuator}" for p in worst.paths] + ["all paths"]
     shifts = np.array([p.shift.real for p in worst.paths] + [worst.shift.real])
     rows = np.arange(len(labels))[::-1]
     axes[1].barh(rows, shifts, color=[COLOURS[1] if s > 0 else COLOURS[0] for s in shifts])
     axes[1].axvline(0.0, color=GREY, linewidth=0.8)
     axes[1].set_yticks(rows, labels)
-    axes[1].set(xlabel="what the path adds to the growth [1/s]", title=f"which path moves mode {worst.mode + 1}")
+    axes[1].set(xlabel="share of the path in Re λ [1/s]", title=f"which path shifts mode {worst.mode + 1}")
     return figure
 
 
-def plot_cure(margins: dict[str, np.ndarray], counts: dict[str, int | None]) -> Figure:
-    """Stability margin of the full plant against the number of sensors, one line a way to estimate."""
+def plot_sensor_counts(margins: dict[str, np.ndarray], counts: dict[str, int | None]) -> Figure:
+    """Stability margin of the full plant against the number of sensors, one line an estimator."""
     figure, ax = new_figure(width=9, height=4.5)
     for (name, values), colour, mark in zip(margins.items(), COLOURS, "osD", strict=False):
         numbers = np.arange(1, len(values) + 1)
         there = np.isfinite(values)
         count = counts[name]
-        label = f"{name}: {count} suffice" if count else f"{name}: not by {len(values)} sensors"
+        label = f"{name}: {count} sensors suffice" if count else f"{name}: none up to {len(values)} suffices"
         ax.plot(numbers[there], values[there], mark + "-", color=colour, label=label, markersize=4)
     ax.axhline(0.0, color=GREY, linewidth=1.0)
     largest = max(v[np.isfinite(v)].max() for v in margins.values())
     ax.set_yscale("symlog", linthresh=max(largest, 1e-6))
     ax.set(xlabel="number of sensors, evenly spaced", ylabel="stability margin [1/s]; below zero unstable")
-    ax.set_title("observation spillover, and what sensors do about it")
+    ax.set_title("observation spillover: stability margin against the number of sensors")
     ax.legend()
     return figure
 
 
 def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figure:
-    """What is left of each disturbance when the lowest n modes are controlled: untouched and spilled, as shares."""
+    """Energy left of each disturbance when the lowest n modes are controlled, uncontrolled and spilled, as shares."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
         total = result.energy.sum()
@@ -246,34 +246,34 @@ def plot_placement_fronts(fronts: dict[str, Sequence[Placement]], rule: dict[str
 
 
 def plot_scaling(times: dict[str, dict[int, float]], slopes: dict[str, float]) -> Figure:
-    """Time to design against the number of modes, one line a way, each with its slope on the log-log scale."""
+    """Time to design against the number of modes, one line a method, each with its slope on the log-log scale."""
     figure, ax = new_figure(width=9, height=5)
     for (name, series), colour, mark in zip(times.items(), COLOURS, "osD^v", strict=False):
         label = f"{name}: slope {slopes[name]:.1f}"
         ax.loglog(list(series), list(series.values()), mark + "-", color=colour, label=label)
     ax.set(xlabel="number of modes", ylabel="time to design [s]")
-    ax.set_title("one mode at a time, or all together")
+    ax.set_title("time to design: independent modes and coupled")
     ax.legend()
     return figure
 
 
-def plot_survival(scales: Sequence[float], shares: dict, spreads: dict) -> Figure:
-    """Share of draws survived, and median W_R with its 90 % interval, against the size of the errors."""
+def plot_robustness(scales: Sequence[float], shares: dict, spreads: dict) -> Figure:
+    """Share of perturbed models that stay stable, and median W_R with its 90 % interval, by the size of the errors."""
     figure, axes = new_figure(2, 1, width=9, height=7, sharex=True)
     for (name, values), colour, mark in zip(shares.items(), COLOURS, "osD^", strict=False):
         axes[0].semilogx(scales, values, mark + "-", color=colour, label=name)
         low, middle, high = np.array(spreads[name]).T
         axes[1].loglog(scales, middle, mark + "-", color=colour)
         axes[1].fill_between(scales, low, high, color=colour, alpha=0.15)
-    axes[0].set(ylabel="share of draws that stay stable", ylim=(-0.03, 1.05))
-    axes[0].set_title("structures that the measurement leaves possible, and larger errors than it made")
+    axes[0].set(ylabel="share of perturbed models that stay stable", ylim=(-0.03, 1.05))
+    axes[0].set_title("robustness to the errors of identification, and to larger ones")
     axes[0].legend(loc="lower left")
     axes[1].set(xlabel="errors, as multiples of the identified standard errors", ylabel="W_R, median and 90 %")
     return figure
 
 
 def plot_drift(rows: Sequence[dict]) -> Figure:
-    """Frequencies found in the loop over the true ones, and what keeping the old law costs, as the stiffness drifts."""
+    """Frequencies found in the loop over the true ones, and excess cost of the old law, as the stiffness drifts."""
     figure, axes = new_figure(1, 2, width=11, height=4.3)
     drift = [100 * (row["stiffness"] - 1) for row in rows]
     first = np.array(rows[0]["omega"])
@@ -281,14 +281,14 @@ def plot_drift(rows: Sequence[dict]) -> Figure:
         axes[0].plot(drift, [row["omega"][r] / first[r] for row in rows], color=GREY, label="true" if r == 0 else None)
         found = [row["found"][r] / first[r] for row in rows]
         axes[0].plot(drift, found, "osD"[r % 3], color=COLOURS[r], label=f"mode {r + 1}, found in the loop")
-    axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency, to that before")
+    axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency over the nominal one")
     axes[0].legend()
     for key, label, mark in (
-        ("cost_of_the_old_law", "law kept", "o-"),
-        ("cost_of_the_new_law", "law designed anew", "s-"),
+        ("cost_of_the_old_law", "nominal law", "o-"),
+        ("cost_of_the_new_law", "redesigned law", "s-"),
     ):
         axes[1].plot(drift, [1e6 * row[key] for row in rows], mark, label=label)
-    axes[1].set(xlabel="drift of the stiffness [%]", ylabel="cost above the best, parts per million")
+    axes[1].set(xlabel="drift of the stiffness [%]", ylabel="cost above the least, parts per million")
     axes[1].legend()
     return figure
 
@@ -319,5 +319,7 @@ def plot_switching(law: OnOffLaw, switched: Switched, which: int = 0) -> Figure:
         inside = (tau >= 0) & (response.time <= s.end)
         pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])
     axes[1].plot(response.time, pushes, color=COLOURS[0])
-    axes[1].set(xlabel="time [s]", ylabel="modal force", title="on, off, and in the mean between where it slides")
+    axes[1].set(
+        xlabel="time [s]", ylabel="modal force", title="modal force; its mean where the mode slides"
+    )
     return figure

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.structure.domain import Place, same_place
+from workbench.structure.domain import Between, Where, same_place
 
 
 @dataclass(frozen=True)
@@ -15,7 +15,8 @@ class Actuator:
 
     Attributes:
         name: of the input.
-        at: its place on the structure: x (m), (x, y), or the name of a point.
+        at: its place on the structure: x (m), (x, y), the name of a point, or `Between` two of these, where it acts
+            on the first and, opposite, on the second.
         kind: "force" (N) or "moment" (N m).
         hysteresis_share: of u that goes through z: (1 - share) u + share z, z' = u' - (|u'| z + u' |z|) / (2 width).
         hysteresis_width: the z that large commands come to.
@@ -31,7 +32,7 @@ class Actuator:
     """
 
     name: str
-    at: Place
+    at: Where
     kind: str = "force"
     gain: float = 1.0
     dead_zone: float = 0.0
@@ -61,3 +62,21 @@ class Actuator:
         """Whether the force is a linear function of the command (a delay is not a finite state)."""
         unbounded = np.isinf(self.limit) and np.isinf(self.rate_limit)
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
+
+
+def piezo_patch(name: str, at: float, *, length: float, gain: float = 1.0) -> Actuator:
+    """A piezo patch on a beam: the pair of opposite moments ± gain u at its ends, x = at ± length/2.
+
+    The modal force is gain u (φ_r'(at + length/2) - φ_r'(at - length/2)); Crawley & de Luis, AIAA J. 25 (1987) 1373.
+
+    Args:
+        at: its middle, m.
+        length: m.
+        gain: moment per command, N m/V where the command is a voltage.
+
+    Raises:
+        ValueError: a length that is not positive.
+    """
+    if not (np.isfinite(length) and length > 0):
+        raise ValueError(f"piezo patch {name}: its length must be positive; got {length}")
+    return Actuator(name, Between(at + 0.5 * length, at - 0.5 * length), kind="moment", gain=gain)

@@ -49,6 +49,7 @@ from workbench.rig.stepping import (
     ramped,
     step_record,
 )
+from workbench.structure.domain import Between
 
 LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
@@ -197,10 +198,14 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
 def participation_of(rig: Rig) -> np.ndarray:
     """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
     shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
-    kinds = [(1 if a.kind == "moment" else 0, a.direction) for a in rig.actuators]
-    for derivative, direction in set(kinds):
-        group = [j for j, kind in enumerate(kinds) if kind == (derivative, direction)]
-        shapes[:, group] = rig.modes.phi([rig.actuators[j].at for j in group], derivative, direction=direction).T
+    kinds = [(a.kind, a.direction, isinstance(a.at, Between)) for a in rig.actuators]
+    for kind, direction, apart in set(kinds):
+        group = [j for j, other in enumerate(kinds) if other == (kind, direction, apart)]
+        at, derivative = [rig.actuators[j].at for j in group], 1 if kind == "moment" else 0
+        if apart:
+            shapes[:, group] = np.array([rig.modes.phi_at(where, derivative, direction=direction) for where in at]).T
+        else:
+            shapes[:, group] = rig.modes.phi(at, derivative, direction=direction).T
     return shapes
 
 

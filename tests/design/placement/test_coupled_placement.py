@@ -8,7 +8,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.coupled_placement import place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled
-from workbench.design.placement.coupled_spillover import coupled_batch, coupled_figures
+from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
 from workbench.design.spillover.spillover import effort, spillover
 from workbench.rig.actuators import Actuator
@@ -25,7 +25,7 @@ def test_figures_are_those_of_the_law(modes):
     law = coupled_lqr(modes, 4, [Actuator(f"F{i}", x) for i, x in enumerate(places)], weight=10.0)
     state = impulse_state(modes, 6.3)
     state[13:] = 0.0
-    found = coupled_figures(modes, 4, places, impulse_at=6.3, weight=10.0)
+    found = coupled_costs(modes, 4, places, impulse_at=6.3, weight=10.0)
     np.testing.assert_allclose(found.by_mode, spillover(modes, law, state).residual_work, rtol=1e-7)
     assert found.effort == pytest.approx(effort(modes, law, state), rel=1e-8)
     forces = respond(close_loop(modes, law), state, np.linspace(0.0, 40.0, 8001)).forces
@@ -35,7 +35,7 @@ def test_figures_are_those_of_the_law(modes):
 def test_many_at_once_are_each_by_itself(modes):
     places = np.sort(np.random.default_rng(0).uniform(0.2, 9.8, (8, 3)), axis=1)
     work, spent = coupled_batch(modes, 4, places, impulse_at=6.3, weight=10.0)
-    each = [coupled_figures(modes, 4, x, impulse_at=6.3, weight=10.0) for x in places]
+    each = [coupled_costs(modes, 4, x, impulse_at=6.3, weight=10.0) for x in places]
     np.testing.assert_allclose(work, [found.residual_work for found in each], rtol=1e-9)
     np.testing.assert_allclose(spent, [found.effort for found in each], rtol=1e-9)
     assert coupled_batch(modes, 2, np.array([[5.0]]), impulse_at=6.3, weight=10.0)[0] == np.inf
@@ -58,4 +58,4 @@ def test_refusals(modes):
         place_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6))
     with pytest.raises(DesignError, match="on the grid"):
         scan_coupled(modes, 2, 2, impulse_at=6.3, weight=10.0, limits=Limits(effort=1e-6), n_places=9)
-    assert coupled_figures(modes, 2, [5.0], impulse_at=6.3, weight=10.0).residual_work == np.inf
+    assert coupled_costs(modes, 2, [5.0], impulse_at=6.3, weight=10.0).residual_work == np.inf

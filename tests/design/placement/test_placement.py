@@ -5,11 +5,12 @@ import pytest
 
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
-from workbench.design.placement.certificate import _Bounds, certify
+from workbench.design.placement.cell_bounds import CellBounds
+from workbench.design.placement.certificate import certify
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.peak import largest
-from workbench.design.placement.placement import law_at, nodes_of_mode, place, placement_task, scan, symbolic_work
-from workbench.design.placement.task import batch_figures, batch_work
+from workbench.design.placement.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.design.placement.task import batch_costs, batch_work
 from workbench.design.spillover.spillover import effort, finite_spillover, spillover
 from workbench.structure.member import Beam
 
@@ -26,7 +27,7 @@ def even(task):
 
 def test_the_task_agrees_with_the_law(task):
     places = (1.5, 3.5, 6.5, 8.5)
-    law = law_at(task, places, weight=20.0)
+    law = task.law(places)
     state = impulse_state(task.modes, 6.3)
     state[13:] = 0.0
     at = task.placed(places, "")
@@ -62,15 +63,15 @@ def test_nodes_of_mode_five(task):
 
 def test_the_optimum_keeps_its_limits_and_beats_a_full_grid(task):
     limit = 1.5 * even(task).effort
-    best = place(task, effort_limit=limit, spacing=0.5, starts=4)
+    best = place(task, Limits(effort=limit, spacing=0.5), starts=4)
     assert best.effort <= limit * (1 + 1e-6) and (np.diff(best.positions) >= 0.5 - 1e-6).all()
-    on_grid, tried = scan(task, effort_limit=limit, spacing=0.5, n_places=30)
+    on_grid, tried = scan(task, Limits(effort=limit, spacing=0.5), n_places=30)
     assert tried > 10000 and best.residual_work <= on_grid.residual_work
     assert best.residual_work < 0.5 * even(task).residual_work
 
 
 def test_without_a_limit_the_outer_actuators_run_onto_the_supports(task):
-    free = place(task, effort_limit=1e9, spacing=0.1, starts=4)
+    free = place(task, Limits(effort=1e9, spacing=0.1), starts=4)
     assert free.positions[0] < 0.1 and free.positions[-1] > 9.9
     assert free.residual_work == pytest.approx(5.3e-4, rel=0.1)
     assert free.effort > 10 * even(task).effort
@@ -78,9 +79,9 @@ def test_without_a_limit_the_outer_actuators_run_onto_the_supports(task):
 
 def test_limits_that_conflict_are_named(task):
     with pytest.raises(DesignError, match="the structure has 10"):
-        place(task, effort_limit=1.0, spacing=4.0)
+        place(task, Limits(effort=1.0, spacing=4.0))
     with pytest.raises(DesignError, match="effort limit"):
-        place(task, effort_limit=1e-3, spacing=0.5, starts=1)
+        place(task, Limits(effort=1e-3, spacing=0.5), starts=1)
     with pytest.raises(DesignError, match="no residual mode"):
         placement_task(task.modes, 9, impulse_at=6.3, weight=20.0)
 
@@ -90,7 +91,7 @@ def test_a_heavy_structure_is_placed_like_a_light_one(task):
     heavy = Beam(length=10.0, mass_per_length=1e8, bending_stiffness=1e8, left="hinged", right="hinged").modes(9)
     twin = placement_task(heavy, 4, impulse_at=6.3, weight=20.0, impulse=1e8)
     limits = [1.5 * even(t).effort for t in (task, twin)]
-    light, same = (scan(t, effort_limit=e, spacing=0.5, n_places=16)[0] for t, e in zip((task, twin), limits))
+    light, same = (scan(t, Limits(effort=e, spacing=0.5), n_places=16)[0] for t, e in zip((task, twin), limits))
     np.testing.assert_allclose(same.positions, light.positions, atol=1e-12)
     assert same.residual_work == pytest.approx(1e8 * light.residual_work, rel=1e-6)
 
@@ -98,7 +99,7 @@ def test_a_heavy_structure_is_placed_like_a_light_one(task):
 def law_and_state(task, places, at=6.3):
     state = impulse_state(task.modes, at)
     state[task.modes.n_modes + task.n_controlled :] = 0.0
-    return law_at(task, places, weight=20.0), state
+    return task.law(places), state
 
 
 def test_finite_time_and_peak_force_are_those_of_the_motion(task):
@@ -136,7 +137,7 @@ def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses():
 
     modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(3)
     task = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
-    law = law_at(task, [2.5, 6.0], weight=20.0)
+    law = task.law([2.5, 6.0])
     a = np.array(close_loop(modes, law).matrix)
     c = 1e-5
     a[5, 5] -= c
@@ -156,38 +157,38 @@ def test_the_tail_bound_holds_and_is_not_idle(task):
 
 
 def test_limits_on_peak_force_condition_and_stretches_are_kept(task):
-    limits = {"effort_limit": 0.4, "peak_limit": 0.34, "condition_limit": 6.0, "forbidden": [(2.5, 3.4), (7.0, 9.0)]}
-    best = place(task, spacing=0.5, starts=6, **limits)
+    limits = Limits(effort=0.4, peak_force=0.34, condition=6.0, spacing=0.5, forbidden=((2.5, 3.4), (7.0, 9.0)))
+    best = place(task, limits, starts=6)
     assert best.peak_force <= 0.34 * (1 + 1e-5) and best.condition <= 6.0 * (1 + 1e-5)
-    assert not any(((low < best.positions) & (best.positions < high)).any() for low, high in limits["forbidden"])
-    on_grid, _ = scan(task, spacing=0.5, n_places=28, **limits)
+    assert not any(((low < best.positions) & (best.positions < high)).any() for low, high in limits.forbidden)
+    on_grid, _ = scan(task, limits, n_places=28)
     assert best.residual_work <= on_grid.residual_work
 
 
 def test_candidates_are_searched_whole(task):
     candidates = np.array([1.0, 2.2, 3.1, 4.4, 5.9, 7.3, 8.6])
-    best, tried = scan(task, candidates=candidates)
+    best, tried = scan(task, Limits(candidates=candidates))
     assert tried == 35 and set(best.positions) <= set(candidates)
     with pytest.raises(DesignError, match="4 actuators at 300 places make"):
-        scan(task, candidates=np.linspace(0.1, 9.9, 300))
+        scan(task, Limits(candidates=np.linspace(0.1, 9.9, 300)))
     with pytest.raises(DesignError, match="leave 3"):
-        scan(task, candidates=[1.0, 2.0, 3.0])
+        scan(task, Limits(candidates=(1.0, 2.0, 3.0)))
 
 
 def test_which_limits_conflict_is_said(task):
     with pytest.raises(DesignError, match="condition limit 3"):
-        place(task, condition_limit=3.9, starts=1)
+        place(task, Limits(condition=3.9), starts=1)
     with pytest.raises(DesignError, match="peak force limit 0"):
-        scan(task, peak_limit=0.01, n_places=20)
+        scan(task, Limits(peak_force=0.01), n_places=20)
     with pytest.raises(DesignError, match="leave no place"):
-        place(task, forbidden=[(-1.0, 11.0)])
+        place(task, Limits(forbidden=((-1.0, 11.0),)))
     with pytest.raises(DesignError, match="effort must be positive"):
-        place(task, effort_limit=-1.0)
+        place(task, Limits(effort=-1.0))
 
 
 def test_fast_figures_are_the_careful_ones(task):
     shapes = task.shapes(np.sort(np.random.default_rng(0).uniform(0.3, 9.7, (50, 4)), axis=1))
-    careful = batch_figures(task, shapes)
+    careful = batch_costs(task, shapes)
     work, spent = batch_work(task, shapes)
     np.testing.assert_allclose(work, careful.work, rtol=1e-9)
     np.testing.assert_allclose(spent, careful.effort, rtol=1e-9)
@@ -195,76 +196,125 @@ def test_fast_figures_are_the_careful_ones(task):
 
 @pytest.mark.parametrize(
     "limits",
-    [{"effort": 0.2352}, {"peak_force": 0.31}, {"condition": 5.5}, {"effort": 0.3, "peak_force": 0.4, "condition": 7}],
+    [
+        Limits(effort=0.2352),
+        Limits(peak_force=0.31),
+        Limits(condition=5.5),
+        Limits(effort=0.3, peak_force=0.4, condition=7),
+    ],
 )
 def test_bounds_hold_on_every_cell(task, limits):
     """No placement in a cell does better than the cell's bound, nor keeps a limit that the cell cannot."""
     rng = np.random.default_rng(1)
-    limits = Limits(**limits)
-    bounds = _Bounds(task, limits)
+    bounds = CellBounds(task, limits)
     informative = refused = 0
-    for half in (0.2, 0.05, 0.01):
+    optimum = np.array([0.8655, 2.883, 6.2842, 9.2303])
+    for level in (5, 7, 9):
         centres = np.sort(rng.uniform(0.5, 9.5, (200, 4)), axis=1)
-        centres[:100] = [0.8655, 2.883, 6.2842, 9.2303] + rng.uniform(-0.3, 0.3, (100, 4))
-        lower, possible, _ = bounds(centres, half)
-        informative, refused = informative + (lower > 0).sum(), refused + (~possible).sum()
-        inside = (centres[:, None] + rng.uniform(-half, half, (200, 40, 4))).reshape(-1, 4)
-        figures = batch_figures(task, task.shapes(inside))
-        broken = limits.broken(inside, figures)
-        kept = np.all([excess <= 0 for excess in broken.values()], axis=0).reshape(200, 40)
-        assert (np.sqrt(figures.work.reshape(200, 40)) >= lower[:, None] - 1e-12)[kept].all()
+        centres[:100] = optimum + rng.uniform(-0.3, 0.3, (100, 4))
+        # each axis halved once more or less often, as in the search
+        levels = level + rng.integers(-1, 2, (200, 4))
+        cells = (centres / 10.0 * 2**levels).astype(int) + 2**levels - 1
+        lower, _, _ = bounds(cells)
+        centre, half = bounds.intervals.centre[cells], bounds.intervals.half[cells]
+        possible = np.isfinite(lower)
+        informative, refused = informative + (lower[possible] > 0).sum(), refused + (~possible).sum()
+        inside = centre[:, None] + half[:, None] * rng.uniform(-1.0, 1.0, (200, 60, 4))
+        inside[:, :16] = centre[:, None] + half[:, None] * np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, 16).T
+        inside = inside.reshape(-1, 4)
+        costs = batch_costs(task, task.shapes(inside))
+        violations = limits.violations(inside, costs)
+        kept = np.all([excess <= 0 for excess in violations.values()], axis=0).reshape(200, 60)
+        assert (np.sqrt(costs.work.reshape(200, 60)) >= lower[:, None] * (1 - 1e-9))[kept].all()
         assert not kept[~possible].any()
-    assert informative > 150 and refused > 50
+    assert informative > 100 and refused > 50
 
 
 def test_the_certificate_proves_an_optimum_and_finds_out_a_pretender():
     modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
     two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
     nodes = two.placed(nodes_of_mode(modes, 2), "nodes")
-    limits = {"effort_limit": 1.5 * nodes.effort, "spacing": 0.5}
-    proven = certify(two, place(two, starts=6, **limits), gap=0.01, **limits)
-    assert proven.complete and proven.gap == pytest.approx(0.01)
-    found_out = certify(two, nodes, gap=0.01, **limits)
+    limits = Limits(effort=1.5 * nodes.effort, spacing=0.5)
+    proven = certify(two, limits, gap=0.01)
+    assert proven.complete and proven.gap == pytest.approx(0.01) and proven.cell is None
+    assert "no placement under the limits spills less than 99.0%" in str(proven)
+    found_out = certify(two, limits, placement=nodes, gap=0.01)
     assert found_out.better is not None
     assert two.placed(found_out.better, "").residual_work < nodes.residual_work
+
+
+def test_a_search_cut_short_says_its_gap_and_the_cell_that_holds_it(task):
+    limits = Limits(effort=1.5 * even(task).effort, spacing=0.5)
+    met = []
+    best = place(task, limits, starts=4)
+    bound = certify(task, limits, placement=best, gap=0.05, most_cells=20_000, progress=lambda *at: met.append(at))
+    assert not bound.complete and bound.lower_bound < 0.95 * best.residual_work
+    assert bound.cell.shape == (4, 2) and (bound.cell[:, 0] < bound.cell[:, 1]).all()
+    counts = [cells for _, _, cells in met]
+    assert counts == sorted(counts) and "what keeps the gap open" in str(bound)
+    proven = certify(task, limits, placement=best, gap=0.05)
+    assert proven.complete and proven.gap <= 0.05 + 1e-12
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ends", "factor"), [("hinged hinged", 10.0), ("clamped free", 1.5), ("clamped clamped", 3.0)])
+def test_four_actuators_and_ten_modes_are_proven_within_five_per_cent(ends, factor):
+    left, right = ends.split()
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left=left, right=right).modes(10)
+    four = placement_task(modes, 4, impulse_at=6.3, weight=20.0)
+    limits = Limits(effort=factor * even(four).effort, spacing=0.5)
+    proven = certify(four, limits, gap=0.05)
+    assert proven.complete and proven.cells < 10_000_000
 
 
 @pytest.mark.parametrize(
     "limits",
     [
-        {"peak_limit": 0.35, "spacing": 0.5},
-        {"condition_limit": 2.5, "spacing": 0.5},
-        {"effort_limit": 0.2, "forbidden": [(4.9, 5.6), (7.0, 8.0)]},
-        {"peak_limit": 0.5, "candidates": np.linspace(0.5, 9.5, 31)},
+        Limits(peak_force=0.35, spacing=0.5),
+        Limits(condition=2.5, spacing=0.5, margin=0.05),
+        Limits(effort=0.2, forbidden=((4.9, 5.6), (7.0, 8.0))),
+        Limits(peak_force=0.5, candidates=tuple(np.linspace(0.5, 9.5, 31))),
     ],
 )
 def test_every_limit_is_part_of_the_proof(limits):
     modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
     two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
-    best = scan(two, **limits)[0] if "candidates" in limits else place(two, starts=8, **limits)
-    proof = certify(two, best, gap=0.01, **limits)
+    best = place(two, limits, starts=8)
+    proof = certify(two, limits, placement=best, gap=0.01)
     assert proof.better is None and proof.complete and proof.gap <= 0.01 + 1e-12
     # a grid by itself: no better
-    fine = np.stack(np.meshgrid(*[limits.get("candidates", np.linspace(0.05, 9.95, 199))] * 2, indexing="ij"), -1)
-    fine = fine.reshape(-1, 2)[fine.reshape(-1, 2)[:, 0] < fine.reshape(-1, 2)[:, 1]]
-    keep = Limits(
-        limits.get("effort_limit", np.inf),
-        limits.get("peak_limit", np.inf),
-        limits.get("condition_limit", np.inf),
-        limits.get("spacing", 0.0),
-        forbidden=tuple(limits.get("forbidden", ())),
-    )
-    figures = batch_figures(two, two.shapes(fine))
-    kept = np.all([excess <= 0 for excess in keep.broken(fine, figures).values()], axis=0)
-    for low, high in keep.forbidden:
+    anywhere = np.linspace(0.05, 9.95, 199) if limits.candidates is None else np.array(limits.candidates)
+    fine = np.stack(np.meshgrid(*[anywhere] * 2, indexing="ij"), -1).reshape(-1, 2)
+    fine = fine[fine[:, 0] < fine[:, 1]]
+    costs = batch_costs(two, two.shapes(fine))
+    kept = np.all([excess <= 0 for excess in limits.violations(fine, costs).values()], axis=0)
+    for low, high in limits.forbidden:
         kept &= ~((fine > low) & (fine < high)).any(axis=1)
+    kept &= ((fine >= limits.margin) & (fine <= 10.0 - limits.margin)).all(axis=1)
     # the best of the candidates is evaluated here among others: the last digit may differ
-    assert kept.any() and figures.work[kept].min() >= proof.lower_bound * (1.0 - 1e-12)
+    assert kept.any() and costs.work[kept].min() >= proof.lower_bound * (1.0 - 1e-12)
     # and a worse one that keeps the limits is found out
-    worse = two.placed(fine[kept][np.argsort(figures.work[kept])[kept.sum() // 2]], "")
-    assert certify(two, worse, gap=0.01, **limits).better is not None
+    worse = two.placed(fine[kept][np.argsort(costs.work[kept])[kept.sum() // 2]], "")
+    assert certify(two, limits, placement=worse, gap=0.01).better is not None
 
 
 def test_a_proof_needs_a_limit(task):
     with pytest.raises(DesignError, match="singular"):
-        certify(task, even(task))
+        certify(task, Limits(), placement=even(task))
+
+
+def test_the_law_stands_with_its_places(task):
+    best = place(task, Limits(effort=1.5 * even(task).effort, spacing=0.5), starts=2)
+    assert [a.at for a in best.law.actuators] == list(best.positions)
+    np.testing.assert_allclose(best.law.gain, task.law(best.positions).gain)
+
+
+def test_limits_as_keywords_still_work_with_a_warning(task):
+    limit = 1.5 * even(task).effort
+    with pytest.warns(DeprecationWarning, match="takes \\(task, limits\\)"):
+        former, _ = scan(task, effort_limit=limit, spacing=0.5, n_places=16)
+    np.testing.assert_array_equal(former.positions, scan(task, Limits(limit, spacing=0.5), n_places=16)[0].positions)
+    two = placement_task(task.modes, 2, impulse_at=6.3, weight=20.0)
+    nodes = two.placed(nodes_of_mode(task.modes, 2), "nodes")
+    with pytest.warns(DeprecationWarning, match="certify"):
+        assert certify(two, nodes, effort_limit=1.5 * nodes.effort, spacing=0.5).better is not None

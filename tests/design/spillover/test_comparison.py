@@ -24,6 +24,6 @@ def test_crowded_actuators_cost_the_coupled_regulator_less():
     assert independent.work.residual_work == pytest.approx(
         [8.418221e-3, 1.258416e-1, 4.698541e-2, 6.875917e-3, 3.450264e-2], rel=1e-5
     )
-    assert independent.most_fed == 5
+    assert independent.most_excited == 5
     fine = respond(close_loop(modes, laws[0]), state, np.linspace(0.0, 100.0, 100001))
     assert independent.peak_force == pytest.approx(np.abs(fine.forces).max(), rel=2e-2)

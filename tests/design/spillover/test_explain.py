@@ -11,7 +11,7 @@ from workbench.design.laws.coupled import controlled_plant, coupled_lqr
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state, respond
 from workbench.design.spillover.explain import explain
-from workbench.design.spillover.remedies import remedies, sensors_that_suffice
+from workbench.design.spillover.remedies import remedies, sufficient_sensors
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -100,20 +100,20 @@ def test_an_observer_in_the_loop_against_python_control():
     np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
 
 
-def test_a_residual_mode_is_named_that_stays_stable_and_unsettles_a_controlled_one():
+def test_a_residual_mode_is_named_that_stays_stable_and_destabilises_a_controlled_one():
     modes = beam(5, 0.01)
     controller = observed(modes, 3.3)
     told = explain(modes, controller)
-    assert told.margin < 0 and told.reduced_margin > 0 and told.moved[0].closed_pole.real < 0
-    assert told.culprit.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).margin > 0
+    assert told.margin < 0 and told.reduced_margin > 0 and told.shifts[0].closed_pole.real < 0
+    assert told.destabilising.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).margin > 0
     assert close_with(modes.select([0, 1, 2, 3]), controller).margin < 0
 
 
-def test_balas_one_sensor_settles_here_and_unsettles_there():
+def test_balas_one_sensor_stabilises_here_and_destabilises_there():
     modes = beam()
     good, bad = explain(modes, observed(modes, 10 / 6)), explain(modes, observed(modes, 50 / 6))
-    assert good.margin > 0 and good.culprit is None
-    assert bad.margin < 0 and bad.culprit.mode == 3
+    assert good.margin > 0 and good.destabilising is None
+    assert bad.margin < 0 and bad.destabilising.mode == 3
     assert bad.reduced_margin == pytest.approx(close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin)
     # without either spillover the same mode would stay
     assert close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin > 0
@@ -125,8 +125,8 @@ def test_balas_one_sensor_settles_here_and_unsettles_there():
 def test_paths_add_up_to_the_movement_of_the_pole(controller):
     modes = beam()
     explained = explain(modes, controller(modes))
-    assert len(explained.moved) == 6
-    for moved in explained.moved:
+    assert len(explained.shifts) == 6
+    for moved in explained.shifts:
         assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-9 * abs(moved.pole))
         assert np.abs(explained.poles - moved.closed_pole).min() == 0.0
 
@@ -137,12 +137,12 @@ def test_first_order_is_the_derivative():
     errors = []
     for share in (1e-2, 1e-3):
         controller = through_filter(modes, ACTUATORS, [2.0, 5.5], share)
-        moved = {m.mode: m for m in explain(modes, controller).moved}[4]
+        moved = {m.mode: m for m in explain(modes, controller).shifts}[4]
         errors.append(abs(moved.shift - moved.first_order) / abs(moved.shift))
     assert errors[1] < 0.15 * errors[0] < 0.01
 
 
-def test_every_remedy_settles_the_loop_and_less_does_not():
+def test_every_remedy_stabilises_the_loop_and_less_does_not():
     modes = beam()
 
     def redesign(actuators, sensors, share):
@@ -162,7 +162,7 @@ def test_the_filter_cures_it_with_sensors_enough():
     def redesign(actuators, sensors, share):
         return through_filter(modes, actuators, sensors, share)
 
-    count, margins = sensors_that_suffice(modes, redesign, ACTUATORS)
+    count, margins = sufficient_sensors(modes, redesign, ACTUATORS)
     assert margins[0] < 0 and count is not None and (margins[count - 1 :] > 0).all() and margins[count - 2] <= 0
 
 

@@ -1,4 +1,4 @@
-"""Draws have the covariance given, survival the share that theory says; closed loops give back the structure."""
+"""Draws have the covariance given, robustness the share that theory gives; closed loops give back the structure."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_loop, impulse_state
 from workbench.design.loop.reidentify import open_loop, updated
-from workbench.design.spillover.robustness import draw_modes, survival_of, survive, wrong_by
+from workbench.design.spillover.robustness import draw_modes, perturbed_modes, robustness, stable_share
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -50,28 +50,28 @@ def test_shape_errors_have_their_size_at_the_sensors():
 
 def test_models_are_wrong_by_what_was_asked():
     modes = beam(6)
-    wrong = wrong_by(modes, 0.02, count=600)
+    wrong = perturbed_modes(modes, 0.02, count=600)
     x = np.linspace(0.0, 10.0, 401)
     missed = np.array([m.phi(x) for m in wrong]) - modes.phi(x)
     size = np.sqrt(np.trapezoid(missed**2, x, axis=1).mean(axis=0))  # shapes of unit size: ∫ m φ² dx = 1
     np.testing.assert_allclose(size, 0.02, rtol=0.08)
     np.testing.assert_allclose(np.std([m.omega / modes.omega for m in wrong], axis=0), 0.02, rtol=0.12)
     idle = Law(np.zeros((1, 2)), (0,), (PLACES[0],))
-    assert survival_of(wrong, idle) == 1.0
+    assert stable_share(wrong, idle) == 1.0
     # a damping ratio that is its own standard error wide is negative in norm.cdf(-1) of the draws
-    assert survival_of(wrong_by(beam(1), 1.0, count=1200), idle) == pytest.approx(norm.cdf(1.0), abs=0.05)
+    assert stable_share(perturbed_modes(beam(1), 1.0, count=1200), idle) == pytest.approx(norm.cdf(1.0), abs=0.05)
     with pytest.raises(DesignError, match="relative error of the models must be positive; got nan"):
-        wrong_by(modes, np.nan)
+        perturbed_modes(modes, np.nan)
 
 
-def test_survival_is_the_share_of_positive_damping():
-    """Without gain a loop survives where every damping ratio drawn is positive: normal, so known."""
+def test_robustness_is_the_share_of_positive_damping():
+    """Without gain a loop is stable where every damping ratio drawn is positive: normal, so known."""
     covariance = np.zeros((2, 2))
     covariance[1, 1] = 0.01**2
     modes = replace(beam(1), covariance=covariance)
     law = Law(np.zeros((1, 2)), (0,), (PLACES[0],))
     idle = filtered(law, hermite_filter(modes, np.linspace(0.0, 10.0, 5), 1.0))
-    found = survive(draw_modes(modes, 1200), {"idle": idle}, state=impulse_state(modes, 6.3), final_time=1.0)["idle"]
+    found = robustness(draw_modes(modes, 1200), {"idle": idle}, state=impulse_state(modes, 6.3), final_time=1.0)["idle"]
     assert found.share == pytest.approx(norm.cdf(1.0), abs=4 * found.standard_error)
     assert np.isnan(found.work).mean() == pytest.approx(1 - found.share)
 

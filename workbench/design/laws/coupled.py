@@ -6,7 +6,7 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.design.laws.law import DesignError, Law, controlled_indices, moved, participation
+from workbench.design.laws.law import DesignError, Law, controllable_input, controlled_indices, participation
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
@@ -40,7 +40,7 @@ def coupled_lqr(
     if len(index) <= len(actuators):
         participation(modes, index, actuators)
     else:
-        moved(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
+        controllable_input(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
     a, b = controlled_plant(modes, index, actuators)
     q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
     r = np.asarray(weight, float)
@@ -77,7 +77,7 @@ def coupled_poles(
         DesignError: a pole that is not stable, a mode that no actuator moves, poles that cannot be held apart.
     """
     index = controlled_indices(modes, controlled)
-    b = moved(modes, index, actuators)
+    b = controllable_input(modes, index, actuators)
     a, full = controlled_plant(modes, index, actuators)
     gain = assign(a, full, poles, b.T.astype(complex), [f"mode {r + 1}" for r in index])
     return Law(gain, index, tuple(actuators), "coupled poles")

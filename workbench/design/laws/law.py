@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
-from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.structure.domain import Between, NamedPoints, Rectangle
 from workbench.structure.modes import Modes, frozen
 
 SINGULAR = 1e8
@@ -84,12 +84,12 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
             alike = (first.kind, first.direction) == (second.kind, second.direction)
-            if alike and modes.domain.separation(first.at, second.at) <= 1e-6:
+            if alike and _separation(modes, first, second) <= 1e-6:
                 raise DesignError(
                     f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
                     " move one by more than 1e-6 of the length"
                 )
-    b = moved(modes, controlled, actuators)
+    b = controllable_input(modes, controlled, actuators)
     condition = np.linalg.cond(b)
     if condition > SINGULAR:
         raise DesignError(
@@ -99,7 +99,15 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     return b
 
 
-def moved(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
+def _separation(modes: Modes, first: Actuator, second: Actuator) -> float:
+    """Distance between two actuators over the size of the structure."""
+    ends = [a.at if isinstance(a.at, Between) else (a.at,) for a in (first, second)]
+    if len(ends[0]) != len(ends[1]):
+        return 1.0
+    return max(modes.domain.separation(one, other) for one, other in zip(*ends))
+
+
+def controllable_input(modes: Modes, controlled: Sequence[int], actuators: Sequence[Actuator]) -> np.ndarray:
     """B of the controlled modes, (n_controlled, n_actuators), where some actuator moves each.
 
     Raises:

@@ -1,31 +1,34 @@
 """How far an optimum of placement can be from the best there is: branch and bound over all places.
 
-On a cell of places about x, h to each side, s = √W_R = ‖Y‖/√2 with Y_r = φ_rᵀ B⁻¹ T_r. A norm is convex and Y
-is linear but for a remainder, so
-
-    s(x + δ) >= s(x) - Σ_i |∂s/∂x_i| h - R(h),
-
-R bounded by Neumann's series of B⁻¹ about x and the largest slopes and curvatures of the shapes. Effort, peak force and
-condition of B are bounded likewise. Cells that break a limit or cannot beat the optimum are dropped, the others halved.
+Cells of places are halved, the least bounded first, until none that a limit leaves open could hold a placement that
+beats the optimum by more than the gap; `workbench.design.placement.cell_bounds` has their bounds.
 """
 
-from collections.abc import Iterable
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.limits import Limits
+from workbench.design.placement.cell_bounds import LEVELS, CellBounds
+from workbench.design.placement.limits import Limits, takes_former_limits
+from workbench.design.placement.placement import place
 from workbench.design.placement.scan import scan
-from workbench.design.placement.task import SINGULAR_SHARE, Placement, PlacementTask
+from workbench.design.placement.task import Placement, PlacementTask
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
 
-MOST_ACTUATORS = 4
-BATCH = 4_000
-TRIED = 50
-INSTANTS = 48
+START_LEVEL = 3  # halvings of the length before the first bound
+BATCH = 50_000  # cells bounded at once
+SHELVES = 64  # of open cells, by their bound: the lowest is halved first
+TRIED = 20  # centres of a batch that are evaluated as placements, where they look better than the optimum
+
+# (bound reached, W_R of the placement, cells bounded)
+Progress = Callable[[float, float, int], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +39,11 @@ class Certificate:
         placement: that was put to the test.
         lower_bound: no placement under the limits has a smaller W_R.
         cells: examined.
-        complete: whether the search ended; if not, the bound holds none the less.
+        complete: whether the gap asked for is proven; if not, the bound holds none the less.
         better: (n_actuators,) places met on the way that beat the placement by more than the gap; None where none do.
+        cell: (n_actuators, 2) the intervals of places (from, to), m, that hold the bound; None where the proof is
+            complete.
+        seconds: taken.
     """
 
     placement: Placement
@@ -45,201 +51,182 @@ class Certificate:
     cells: int
     complete: bool
     better: np.ndarray | None = None
+    cell: np.ndarray | None = None
+    seconds: float = 0.0
 
     @property
     def gap(self) -> float:
         """By what share W_R could at most be lower."""
         return 1.0 - self.lower_bound / self.placement.residual_work
 
+    def __str__(self) -> str:
+        count = f"{self.cells:,} cells, {self.seconds:.0f} s"
+        if self.better is not None:
+            return f"not the optimum: actuators at {_listed(self.better)} m spill less ({count})"
+        text = f"no placement under the limits spills less than {1.0 - self.gap:.1%} of this one ({count})"
+        if self.cell is None:
+            return text
+        where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
+        return f"{text}; what keeps the gap open: actuators at {where} m"
 
+
+def _listed(places: np.ndarray) -> str:
+    return ", ".join(f"{x:.4g}" for x in places)
+
+
+@takes_former_limits
 @one_blas_thread
 def certify(
     task: PlacementTask,
-    placement: Placement,
+    limits: Limits,
     *,
-    effort_limit: float = np.inf,
-    spacing: float = 0.0,
-    margin: float = 0.0,
-    peak_limit: float = np.inf,
-    condition_limit: float = np.inf,
-    forbidden: Iterable[tuple[float, float]] = (),
-    candidates: ArrayLike | None = None,
+    placement: Placement | None = None,
     gap: float = 0.01,
-    most_cells: int = 20_000_000,
+    seconds: float = 600.0,
+    most_cells: int = 200_000_000,
+    progress: Progress | None = None,
 ) -> Certificate:
-    """Show that no placement under the limits beats this one by more than a gap.
+    """A proof that no placement under the limits spills less than this one by more than a gap, as far as it comes.
+
+    A limit of the condition alone leaves actuators beside the supports, where B vanishes and no bound holds: give a
+    margin with it.
 
     Args:
-        placement: from `place` or `scan` under the same limits.
-        effort_limit, peak_limit, condition_limit, spacing, margin, forbidden: see `Limits`.
-        candidates: (n_candidates,) the only places there are, m: every choice of them is looked at.
+        placement: that of `place` unless given.
         gap: share of W_R to be proven.
-        most_cells: after which the search stops with the bound reached.
+        seconds, most_cells: after which the search stops with the bound that it has reached.
+        progress: called with the bound, W_R of the placement and the cells bounded so far.
 
     Raises:
-        DesignError: more than four actuators, or none of the limits that keep B from being singular.
+        DesignError: none of the limits that keep B from being singular, or a gap that is not between 0 and 1.
     """
-    limits = Limits(effort_limit, peak_limit, condition_limit, spacing, margin, tuple(forbidden))
-    n, length = task.n_controlled, task.modes.length
-    if candidates is not None:
-        best, tried = scan(
-            task,
-            effort_limit=effort_limit,
-            spacing=spacing,
-            margin=margin,
-            peak_limit=peak_limit,
-            condition_limit=condition_limit,
-            forbidden=limits.forbidden,
-            candidates=candidates,
-        )
-        found = best.positions if best.residual_work < placement.residual_work * (1.0 - gap) else None
-        return Certificate(placement, min(best.residual_work, placement.residual_work), tried, True, found)
-    if n > MOST_ACTUATORS:
-        raise DesignError(f"a certificate is to be had up to {MOST_ACTUATORS} actuators; there are {n}")
-    if not np.isfinite([effort_limit, peak_limit, condition_limit]).any():
+    if not 0 < gap < 1:
+        raise DesignError(f"the gap to be proven is a share between 0 and 1; got {gap:g}")
+    if limits.candidates is None and not limits.regular:
         raise DesignError(
             "without a limit B may come as near to singular as it likes; give one of effort, peak force or condition"
         )
-    stretches = np.array(limits.room(n, length))
-    bounds = _Bounds(task, limits)
-    wanted = np.sqrt(placement.residual_work * (1.0 - gap))
-    half = 0.5 * (length - 2 * margin) / 8
-    axis = margin + half * (2 * np.arange(8) + 1)
-    centres = np.stack(np.meshgrid(*[axis] * n, indexing="ij"), -1).reshape(-1, n)
-    corners = np.array(np.meshgrid(*[(-0.5, 0.5)] * n, indexing="ij")).reshape(n, -1).T
-    cells, least, complete = 0, np.inf, True
-    # depth first: a stack of batches keeps the memory small
-    stack = [(half, batch) for batch in np.array_split(centres, max(1, len(centres) // BATCH))]
-    while stack:
-        half, centres = stack.pop()
-        # in order, no closer than the spacing anywhere in the cell, and each interval with a place to stand
-        centres = centres[(np.diff(centres, axis=1) + 2 * half >= spacing).all(axis=1)]
-        centres = centres[_within(centres, stretches, half)]
-        if not len(centres):
-            continue
-        cells += len(centres)
-        lower, possible, work = bounds(centres, half)
+    began = time.monotonic()
+    best = place(task, limits) if placement is None else placement
+    if limits.candidates is not None:
+        least, tried = scan(task, limits)
+        found = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None
+        bound = min(least.residual_work, best.residual_work)
+        return Certificate(best, bound, tried, True, found, seconds=time.monotonic() - began)
+    return _Search(task, limits, best, gap).run(began, seconds, most_cells, progress)
+
+
+class _Search:
+    """Branch and bound: shelves of open cells, ordered by their bound of √W_R."""
+
+    def __init__(self, task: PlacementTask, limits: Limits, best: Placement, gap: float) -> None:
+        self._task, self._limits, self._best = task, limits, best
+        self._wanted = np.sqrt(best.residual_work * (1.0 - gap))
+        self._bounds = CellBounds(task, limits)
+        table = self._bounds.intervals
+        stretches = np.array(limits.intervals(task.n_controlled, task.modes.length, task.reach[0]))
+        low, high = table.centre - table.half, table.centre + table.half
+        self._low, self._high = low, high
+        self._stands = ((high[:, None] >= stretches[:, 0]) & (low[:, None] <= stretches[:, 1])).any(axis=1)
+        self._stretches = stretches
+        self._shelves: list[list[np.ndarray]] = [[] for _ in range(SHELVES)]
+        self._stuck = np.inf  # least bound of a cell that is as small as the table has them
+        self._stuck_cell: np.ndarray | None = None
+        self.cells = 0
+
+    def run(self, began: float, seconds: float, most_cells: int, progress: Progress | None) -> Certificate:
+        n = self._task.n_controlled
+        level = range(2**START_LEVEL - 1, 2 ** (START_LEVEL + 1) - 1)
+        cells = np.array(list(combinations_with_replacement(level, n)), np.int64).reshape(-1, n)
+        workers = min(os.cpu_count() or 1, 8)
+        with ThreadPoolExecutor(workers) as pool:
+            while len(cells):
+                better = self._shelve(self._kept(cells), pool, workers)
+                spent = time.monotonic() - began
+                if better is not None:
+                    return Certificate(self._best, 0.0, self.cells, False, frozen(better), seconds=spent)
+                if progress is not None:
+                    progress(self._lowest()[0] ** 2, self._best.residual_work, self.cells)
+                if spent > seconds or self.cells > most_cells:
+                    break
+                shelf = next((s for s in self._shelves if s), None)
+                cells = self._halved(_taken(shelf)) if shelf else cells[:0]
+        bound, cell = self._lowest()
+        spent = time.monotonic() - began
+        if bound >= self._wanted:
+            return Certificate(self._best, float(self._wanted**2), self.cells, True, seconds=spent)
+        return Certificate(self._best, float(bound**2), self.cells, False, None, cell, spent)
+
+    def _kept(self, cells: np.ndarray) -> np.ndarray:
+        """Cells in order, no closer than the spacing everywhere, and each interval with a place to stand."""
+        apart = self._high[cells[:, 1:]] - self._low[cells[:, :-1]] >= self._limits.spacing
+        return cells[apart.all(axis=1) & self._stands[cells].all(axis=1)]
+
+    def _halved(self, rows: np.ndarray) -> np.ndarray:
+        """Both halves of each cell along its axis, the last column; (n_cells, n_actuators + 2) with the bound."""
+        cells, axis = rows[:, :-2], rows[:, -1].astype(np.int64)
+        left, right = cells.astype(np.int64), cells.astype(np.int64)
+        each = np.arange(len(cells))
+        left[each, axis] = 2 * left[each, axis] + 1
+        right[each, axis] = 2 * right[each, axis] + 2
+        return np.concatenate([left, right])
+
+    def _shelve(self, cells: np.ndarray, pool: ThreadPoolExecutor, workers: int) -> np.ndarray | None:
+        """Bound the cells and shelve those still open; places that beat the placement, where some are met."""
+        if not len(cells):
+            return None
+        self.cells += len(cells)
+        parts = np.array_split(cells, min(workers, 1 + len(cells) // 1000))
+        lower, work, axis = (np.concatenate(found) for found in zip(*pool.map(self._bounds, parts), strict=True))
+        better = self._better(cells, work)
+        if better is not None:
+            return better
+        open_ = lower < self._wanted
+        cells, lower, axis = cells[open_], lower[open_], axis[open_]
+        # an axis that cannot be halved further gives way to the widest
+        smallest = 2**LEVELS - 1
+        at_end = cells[np.arange(len(cells)), axis] >= smallest
+        axis[at_end] = cells[at_end].argmin(axis=1)
+        stuck = cells.min(axis=1, initial=smallest) >= smallest if len(cells) else np.zeros(0, bool)
+        if stuck.any():
+            i = int(np.argmin(np.where(stuck, lower, np.inf)))
+            if lower[i] < self._stuck:
+                self._stuck, self._stuck_cell = float(lower[i]), cells[i]
+        rows = np.column_stack([cells, lower, axis])[~stuck]
+        shelf = np.minimum((SHELVES * rows[:, -2] / self._wanted).astype(int), SHELVES - 1)
+        for i in np.unique(shelf):
+            self._shelves[i].append(rows[shelf == i])
+        return None
+
+    def _better(self, cells: np.ndarray, work: np.ndarray) -> np.ndarray | None:
         for i in np.argsort(work)[:TRIED]:
-            if not work[i] < wanted:
+            if not work[i] < self._wanted:
                 break
-            rival = task.placed(centres[i], "")
-            if _within(centres[i][None], stretches)[0] and limits.kept(rival):
-                return Certificate(placement, 0.0, cells, False, frozen(centres[i]))
-        open_ = possible & (lower < wanted)
-        if cells > most_cells:
-            least, complete = min([least, *lower[open_]]), False
-            continue
-        children = (centres[open_][:, None, :] + half * corners).reshape(-1, n)
-        stack += [
-            (0.5 * half, batch) for batch in np.array_split(children, max(1, len(children) // BATCH)) if len(batch)
-        ]
-    return Certificate(placement, float(min(least, wanted) ** 2), cells, complete)
+            places = self._bounds.intervals.centre[cells[i]]
+            stands = ((places[:, None] >= self._stretches[:, 0]) & (places[:, None] <= self._stretches[:, 1])).any(1)
+            if stands.all() and self._limits.satisfied_by(self._task.placed(places, "")):
+                return places
+        return None
+
+    def _lowest(self) -> tuple[float, np.ndarray | None]:
+        """The least bound of √W_R of any open cell, and the intervals of that cell."""
+        bound, cell = min(self._wanted, self._stuck), self._stuck_cell
+        shelf = next((s for s in self._shelves if s), [])
+        for rows in shelf:
+            i = int(np.argmin(rows[:, -2]))
+            if rows[i, -2] < bound:
+                bound, cell = float(rows[i, -2]), rows[i, :-2].astype(np.int64)
+        return bound, None if cell is None else np.column_stack([self._low[cell], self._high[cell]])
 
 
-def _within(centres: np.ndarray, stretches: np.ndarray, half: float = 0.0) -> np.ndarray:
-    """Of cells (n_cells, n): whether every actuator may stand somewhere in its interval."""
-    low, high = stretches.T
-    return ((centres[..., None] + half >= low) & (centres[..., None] - half <= high)).any(axis=2).all(axis=1)
-
-
-class _Bounds:
-    """On cells: lower bounds of √W_R, whether any place may keep the limits, and √W_R in the middle where that may."""
-
-    def __init__(self, task: PlacementTask, limits: Limits) -> None:
-        self._task, self._limits = task, limits
-        n, modes = task.n_controlled, task.modes
-        grid = np.linspace(0.0, modes.length, 400 + 40 * modes.n_modes)
-        step = grid[1] - grid[0]
-        first, second, third = (np.abs(modes.phi(grid, d)) for d in (1, 2, 3))
-        # largest anywhere: on the grid, and by the next derivative between its points
-        self._curvature = (second.max(0) + 0.5 * step * third.max(0))[n:]
-        self._column_slope = _largest_row(first[:, :n]) + 0.5 * step * np.linalg.norm(second[:, :n].max(0))
-        self._column_curvature = _largest_row(second[:, :n]) + 0.5 * step * np.linalg.norm(third[:, :n].max(0))
-        # what is limited, as tr(B⁻¹ G B⁻ᵀ) <= L²: the effort; n times the square of the peak, above any mean of the
-        # forces' squares; and the condition, L = limit / ‖B‖
-        self._forces = task.forces[:, :: max(1, task.forces.shape[1] // INSTANTS)]
-        squares = []
-        if np.isfinite(limits.effort):
-            squares.append((task.force_gramian, np.sqrt(limits.effort)))
-        if np.isfinite(limits.peak_force):
-            weight = 1.0 / np.maximum((self._forces**2).sum(axis=0), 1e-12 * (self._forces**2).sum(axis=0).max())
-            spread = (self._forces * weight / weight.sum()) @ self._forces.T
-            squares.append((spread, np.sqrt(n) * limits.peak_force))
-        if np.isfinite(limits.condition):
-            squares.append((np.eye(n), np.inf))
-        self._squares = []
-        for matrix, limit in squares:
-            values, vectors = np.linalg.eigh(matrix)
-            unscale = vectors / np.sqrt(np.maximum(values, 1e-300))
-            slope = _largest_row(modes.phi(grid, 1)[:, :n] @ unscale)
-            slope += 0.5 * step * _largest_row(modes.phi(grid, 2)[:, :n] @ unscale)
-            self._squares.append((vectors * np.sqrt(np.maximum(values, 0.0)), unscale, slope, limit))
-
-    def __call__(self, centres: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        n, root_n = self._task.n_controlled, np.sqrt(self._task.n_controlled)
-        shapes = self._task.shapes(centres)
-        # no place in the cell has a ‖B‖ below this
-        frame = np.maximum(np.linalg.norm(shapes[:, :, :n], axis=(1, 2)) - root_n * self._column_slope * half, 0.0)
-        limits = [np.full(len(centres), limit) for *_, limit in self._squares]
-        if np.isfinite(self._limits.condition):
-            with np.errstate(divide="ignore"):
-                limits[-1] = self._limits.condition / frame
-        possible = np.ones(len(centres), bool)
-        for (_, unscale, slope, _), limit in zip(self._squares, limits):
-            # tr(B⁻¹ G B⁻ᵀ) = Σ 1/σ_i², σ of G^-½ B, and singular values move no further than the matrix does
-            sigma = np.linalg.svd(shapes[:, :, :n] @ unscale, compute_uv=False) + root_n * slope * half
-            possible &= np.sqrt((sigma**-2.0).sum(axis=1)) <= limit
-        lower, reached = np.zeros(len(centres)), np.full(len(centres), np.inf)
-        b = shapes[:, :, :n].transpose(0, 2, 1)
-        # about a singular B nothing is known but that the work is not negative
-        regular = np.abs(np.linalg.det(b)) > SINGULAR_SHARE * np.linalg.norm(b, axis=2).prod(axis=1)
-        known = np.flatnonzero(possible & regular)
-        if not known.size:
-            return lower, possible, reached
-        shapes, slopes, b = shapes[known], self._task.shapes(centres[known], 1), b[known]
-        inverse = np.linalg.inv(b)
-        size = np.linalg.norm(inverse, axis=(1, 2), ord=2)
-        columns = inverse @ slopes[:, :, :n].transpose(0, 2, 1)  # B⁻¹ φ'(x_i), one column an actuator
-        # B(x + δ)⁻¹ = (I + E)⁻¹ B⁻¹, E = B⁻¹ ΔB: its part linear in δ, and what the curvature adds
-        curved = 0.5 * size * self._column_curvature * root_n * half**2
-        theta = half * np.linalg.norm(columns, axis=(1, 2)) + curved
-        with np.errstate(divide="ignore", invalid="ignore"):
-            neumann = np.where(theta < 1, theta / (1 - theta), np.inf)
-        remainder = theta * neumann + curved
-
-        kept = np.ones(known.size, bool)
-        for (root, *_), limit in zip(self._squares, limits):
-            weighed = inverse @ root
-            energy = np.linalg.norm(weighed, axis=(1, 2))
-            gradient = np.einsum("pij,pji->pi", weighed @ weighed.transpose(0, 2, 1), columns) / energy[:, None]
-            kept &= ~(energy * (1 - remainder) - half * np.abs(gradient).sum(axis=1) > limit[known])
-        if np.isfinite(self._limits.peak_force):
-            forces = inverse @ self._forces
-            moved = half * np.abs(columns) @ np.abs(forces)
-            rest = np.linalg.norm(forces, axis=1) * remainder[:, None]
-            kept &= ~((np.abs(forces) - moved - rest[:, None]).max(axis=(1, 2)) > self._limits.peak_force)
-        possible[known] = kept
-
-        force = np.einsum("pij,rjk->prik", inverse, self._task.roots, optimize=True)
-        high, high_slopes = shapes[:, :, n:].transpose(0, 2, 1), slopes[:, :, n:].transpose(0, 2, 1)
-        y = np.einsum("pri,prik->prk", high, force)
-        work = np.sqrt(0.5 * (y**2).sum(axis=(1, 2)))
-        relative = high_slopes - (high @ inverse) @ slopes[:, :, :n].transpose(0, 2, 1)
-        gradient = 0.5 * np.einsum("prk,prik,pri->pi", y, force, relative, optimize=True) / work[:, None]
-        strength = np.linalg.norm(force, axis=(2, 3))
-        bent = 0.5 * root_n * half**2 * self._curvature
-        with np.errstate(invalid="ignore", over="ignore"):
-            rest = strength * (
-                np.linalg.norm(high, axis=2) * remainder[:, None]
-                + (half * np.linalg.norm(high_slopes, axis=2) + bent) * neumann[:, None]
-                + bent
-            )
-            rest = np.sqrt(0.5 * (rest**2).sum(axis=1))
-            least_work = work - half * np.abs(gradient).sum(axis=1) - rest
-        lower[known] = np.nan_to_num(np.maximum(least_work, 0.0), nan=0.0)
-        reached[known] = np.where(kept, work, np.inf)
-        return lower, possible, reached
-
-
-def _largest_row(rows: np.ndarray) -> float:
-    return float(np.linalg.norm(rows, axis=1).max())
+def _taken(shelf: list[np.ndarray]) -> np.ndarray:
+    """About a batch of cells from a shelf, the last put there first."""
+    taken, count = [], 0
+    while shelf and count < BATCH:
+        rows = shelf.pop()
+        if count + len(rows) > 2 * BATCH:
+            shelf.append(rows[BATCH:])
+            rows = rows[:BATCH]
+        taken.append(rows)
+        count += len(rows)
+    return np.concatenate(taken)

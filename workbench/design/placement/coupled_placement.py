@@ -1,10 +1,12 @@
 """Where the actuators of coupled LQR should stand: its forces depend on the places, so every place is a new design."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.coupled_spillover import coupled_batch, coupled_figures
+from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
@@ -28,7 +30,7 @@ def place_coupled(
     """Places of least W_R for coupled LQR under limits: the best of many draws, each polished by Nelder and Mead.
 
     Args:
-        modes, n_controlled, impulse_at, weight: as for `coupled_figures`.
+        modes, n_controlled, impulse_at, weight: as for `coupled_costs`.
         n_actuators: any number.
         limits: to keep to.
         starts: best draws to polish.
@@ -41,7 +43,7 @@ def place_coupled(
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
     if not weight > 0:
         raise DesignError(f"the control weight R must be positive; got {weight:g}")
-    stretches = limits.room(n_actuators, modes.length)
+    stretches = limits.intervals(n_actuators, modes.length)
 
     def look(positions: np.ndarray) -> tuple[float, Placement | None]:
         """log W_R and a wall where a limit is broken."""
@@ -49,7 +51,7 @@ def place_coupled(
         standing = all(any(low <= x <= high for low, high in stretches) for x in at)
         if not standing or (np.diff(at) < limits.spacing).any():
             return np.inf, None
-        found = coupled_figures(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)
+        found = coupled_costs(modes, n_controlled, at, impulse_at=impulse_at, weight=weight)
         within = (
             found.effort <= limits.effort
             and found.peak_force <= limits.peak_force
@@ -69,11 +71,6 @@ def place_coupled(
     if not ends:
         raise DesignError("no place drawn keeps the limits of coupled LQR; raise them or lower the spacing")
     best = min(ends, key=lambda end: end.fun)
-    found = coupled_figures(modes, n_controlled, best.x, impulse_at=impulse_at, weight=weight)
+    found = coupled_costs(modes, n_controlled, best.x, impulse_at=impulse_at, weight=weight)
     optima = tuple(sorted(((np.sort(e.x), float(np.exp(e.fun))) for e in ends), key=lambda pair: pair[1]))
-    return Placement(
-        **{name: getattr(found, name) for name in ("positions", "residual_work", "by_mode", "effort", "peak_force")},
-        condition=found.condition,
-        status=str(best.message),
-        local_optima=optima,
-    )
+    return replace(found, status=str(best.message), local_optima=optima)

@@ -6,7 +6,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.coupled_spillover import coupled_batch, coupled_figures
+from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
@@ -52,7 +52,7 @@ def scan_coupled(
         DesignError: limits that no placement on the grid meets.
     """
     length, asked = modes.length, {"impulse_at": impulse_at, "weight": weight}
-    stretches = np.array(limits.room(n_actuators, length))
+    stretches = np.array(limits.intervals(n_actuators, length))
     step = length / n_places
     grid = step * (0.5 + np.arange(n_places))
     index = np.array(list(combinations_with_replacement(range(n_places), n_actuators)))
@@ -69,8 +69,8 @@ def scan_coupled(
     for i in np.argsort(np.where(standing & (effort <= limits.effort), work, np.inf)):
         if not (standing[i] and effort[i] <= limits.effort and np.isfinite(work[i])):
             break
-        found = coupled_figures(modes, n_controlled, at[i], **asked)
-        if limits.kept(found):
+        found = coupled_costs(modes, n_controlled, at[i], **asked)
+        if limits.satisfied_by(found):
             best = found
             break
     if best is None:

@@ -8,14 +8,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, solve_continuous_are, solve_continuous_lyapunov
 
+from workbench.design.laws.law import Law
 from workbench.design.placement.peak import largest
 from workbench.design.placement.task import Placement
+from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, modal_state_matrix
 
 ON_THE_AXIS = 1e-7
 
 
-def coupled_figures(
+def coupled_costs(
     modes: Modes, n_controlled: int, positions: ArrayLike, *, impulse_at: float, weight: float, impulse: float = 1.0
 ) -> Placement:
     """What coupled LQR spills and spends with force actuators at the positions; infinite where it cannot be.
@@ -48,6 +50,7 @@ def coupled_figures(
     gramian = solve_continuous_lyapunov(loop, -np.outer(start, start))
     return Placement(
         positions=positions,
+        law=Law(gain, tuple(range(n)), forces_at(positions), "coupled LQR"),
         residual_work=float(by_mode.sum()),
         by_mode=by_mode,
         effort=float(np.trace(gain @ gramian @ gain.T)),
@@ -57,9 +60,14 @@ def coupled_figures(
     )
 
 
+def forces_at(positions: np.ndarray) -> tuple[Actuator, ...]:
+    """Point forces F1, F2, ... at the places (n_actuators,), m."""
+    return tuple(Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(positions))
+
+
 def _impossible(positions: np.ndarray, n_residual: int) -> Placement:
     inf = np.inf
-    return Placement(positions, inf, np.full(n_residual, inf), inf, inf, inf, "no regulator stabilises from here")
+    return Placement(positions, None, inf, np.full(n_residual, inf), inf, inf, inf, "no regulator stabilises from here")
 
 
 def coupled_batch(
@@ -87,9 +95,9 @@ def coupled_batch(
     works = poles.real.max(axis=1) < -ON_THE_AXIS * omega.max()
     upper = np.where(works[:, None, None], vectors[:, : 2 * n], np.eye(2 * n))
     held = np.linalg.solve(upper, np.broadcast_to(start[:, None], (count, 2 * n, 1)))[:, :, 0]
-    swings = -(b.transpose(0, 2, 1) @ vectors[:, 2 * n :]) * held[:, None, :] / weight
-    force = swings @ (1.0 / (1j * modes.omega[n:] - poles[:, :, None]))
+    amplitudes = -(b.transpose(0, 2, 1) @ vectors[:, 2 * n :]) * held[:, None, :] / weight
+    force = amplitudes @ (1.0 / (1j * modes.omega[n:] - poles[:, :, None]))
     work = 0.5 * (np.abs(np.einsum("par,par->pr", shapes[:, :, n:], force)) ** 2).sum(axis=1)
     decay = np.where(works[:, None, None], -(poles.conj()[:, :, None] + poles[:, None, :]), 1.0)
-    effort = np.einsum("pak,pkl,pal->p", swings.conj(), 1.0 / decay, swings, optimize=True).real
+    effort = np.einsum("pak,pkl,pal->p", amplitudes.conj(), 1.0 / decay, amplitudes, optimize=True).real
     return np.where(works, work, np.inf), np.where(works, effort, np.inf)

@@ -1,15 +1,19 @@
 """What a placement must keep to, and which limit is to blame where none can."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import wraps
 from itertools import combinations
 from types import SimpleNamespace
+from typing import Any, ParamSpec, TypeVar
+from warnings import warn
 
 import numpy as np
 
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.task import Placement, PlacementTask, batch_figures
+from workbench.design.placement.task import Placement, PlacementTask, batch_costs
 
-KEPT = 2e-6
+TOLERANCE = 2e-6
 APART = 1e-6  # of the length: actuators closer than this stand at one place
 DRAWS = 20_000
 
@@ -24,7 +28,8 @@ class Limits:
         condition: of B, largest ‖B‖‖B⁻¹‖ in the Frobenius norm (n where B is orthogonal).
         spacing: least distance between neighbours, m.
         margin: least distance from the ends, m.
-        forbidden: stretches (from, to) where no actuator can stand, m.
+        forbidden: intervals (from, to) where no actuator can stand, m.
+        candidates: the only places there are, m; None where an actuator may stand anywhere else.
     """
 
     effort: float = np.inf
@@ -33,6 +38,7 @@ class Limits:
     spacing: float = 0.0
     margin: float = 0.0
     forbidden: tuple[tuple[float, float], ...] = ()
+    candidates: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("effort", "peak_force", "condition"):
@@ -43,66 +49,104 @@ class Limits:
             raise DesignError(f"spacing and margin must be 0 or more; got {self.spacing:g} and {self.margin:g}")
         for low, high in self.forbidden:
             if not low < high:
-                raise DesignError(f"forbidden stretch ({low:g}, {high:g}) must run from less to more")
+                raise DesignError(f"forbidden interval ({low:g}, {high:g}) must run from less to more")
+        object.__setattr__(self, "forbidden", tuple((float(low), float(high)) for low, high in self.forbidden))
+        if self.candidates is not None:
+            object.__setattr__(self, "candidates", tuple(sorted(float(x) for x in self.candidates)))
 
-    def allowed(self, length: float) -> list[tuple[float, float]]:
-        """Stretches where an actuator may stand, m.
+    @property
+    def regular(self) -> bool:
+        """Whether a limit keeps B away from singular."""
+        return bool(np.isfinite([self.effort, self.peak_force, self.condition]).any())
+
+    def allowed(self, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
+        """Intervals where the middle of an actuator may stand, m.
+
+        Args:
+            length: of the structure, m.
+            clear: half the extent of an actuator, m.
 
         Raises:
             DesignError: none is left.
         """
-        at, stretches = self.margin, []
+        margin = max(self.margin, clear)
+        at, intervals = margin, []
         for low, high in sorted(self.forbidden):
             if low > at:
-                stretches.append((at, min(low, length - self.margin)))
+                intervals.append((at, min(low, length - margin)))
             at = max(at, high)
-        stretches.append((at, length - self.margin))
-        stretches = [(low, high) for low, high in stretches if low <= high]
-        if not stretches:
-            raise DesignError(f"margin {self.margin:g} and the forbidden stretches leave no place of {length:g} m")
-        return stretches
+        intervals.append((at, length - margin))
+        intervals = [(low, high) for low, high in intervals if low <= high]
+        if not intervals:
+            raise DesignError(f"margin {margin:g} and the forbidden intervals leave no place of {length:g} m")
+        return intervals
 
-    def room(self, n: int, length: float) -> list[tuple[float, float]]:
+    def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """The same, where n actuators find room at all.
 
         Raises:
             DesignError: spacing and margin that n actuators cannot keep on this length.
         """
-        needed = 2 * self.margin + (n - 1) * self.spacing
+        margin = max(self.margin, clear)
+        needed = 2 * margin + (n - 1) * self.spacing
         if needed > length:
             raise DesignError(
-                f"{n} actuators {self.spacing:g} apart and {self.margin:g} from the ends need {needed:g} m; the"
+                f"{n} actuators {self.spacing:g} apart and {margin:g} from the ends need {needed:g} m; the"
                 f" structure has {length:g}: lower spacing or margin"
             )
-        stretches = self.allowed(length)
+        intervals = self.allowed(length, clear)
         apart, at, fit = max(self.spacing, APART * length), -np.inf, 0
-        for low, high in stretches:
+        for low, high in intervals:
             at = max(low, at + apart)
             while at <= high * (1 + APART) and fit < n:
                 fit, at = fit + 1, at + apart
             at -= apart
         if fit < n:
             raise DesignError(
-                f"{n} actuators {self.spacing:g} apart find room for {fit} on the stretches left,"
-                f" {', '.join(f'{low:g} to {high:g}' for low, high in stretches)} m: forbid less or lower the spacing"
+                f"{n} actuators {self.spacing:g} apart find room for {fit} on the intervals left,"
+                f" {', '.join(f'{low:g} to {high:g}' for low, high in intervals)} m: forbid less or lower the spacing"
             )
-        return stretches
+        return intervals
 
-    def broken(self, positions: np.ndarray, figures) -> dict[str, np.ndarray]:
-        """By name of limit, by how much each of many placements (n_placements, n) breaks it, relative; <= 0 is kept."""
+    def violations(self, positions: np.ndarray, costs: Any) -> dict[str, np.ndarray]:
+        """By name, by how much each of many placements (n_placements, n) exceeds a limit, relative; <= 0 if kept."""
         gaps = np.diff(positions, axis=1).min(axis=1, initial=np.inf)
         return {
-            "effort": _excess(figures.effort, self.effort),
-            "peak force": _excess(figures.peak_force, self.peak_force),
-            "condition": _excess(figures.condition, self.condition),
+            "effort": _excess(costs.effort, self.effort),
+            "peak force": _excess(costs.peak_force, self.peak_force),
+            "condition": _excess(costs.condition, self.condition),
             "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(len(positions)),
         }
 
-    def kept(self, placement: Placement) -> bool:
+    def satisfied_by(self, placement: Placement) -> bool:
         """Whether a placement keeps all of them, its peak force that of all time; its places are taken as allowed."""
-        figures = {name: np.array([getattr(placement, name)]) for name in ("effort", "peak_force", "condition")}
-        broken = self.broken(placement.positions[None], SimpleNamespace(**figures))
-        return all(excess[0] <= KEPT for excess in broken.values())
+        costs = {name: np.array([getattr(placement, name)]) for name in ("effort", "peak_force", "condition")}
+        violations = self.violations(placement.positions[None], SimpleNamespace(**costs))
+        return all(excess[0] <= TOLERANCE for excess in violations.values())
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+FORMER = {"effort_limit": "effort", "peak_limit": "peak_force", "condition_limit": "condition"}
+FORMER |= {name: name for name in ("spacing", "margin", "forbidden", "candidates")}
+
+
+def takes_former_limits(function: Callable[P, R]) -> Callable[P, R]:
+    """The function of (task, limits) with the limits as keywords too, and the placement second, as they were."""
+
+    @wraps(function)
+    def with_former(*args: P.args, **kwargs: P.kwargs) -> R:
+        former = {new: kwargs.pop(old) for old, new in FORMER.items() if old in kwargs}
+        if len(args) > 1 and isinstance(args[1], Placement):
+            kwargs["placement"] = args[1]
+            args = args[:1]  # type: ignore[assignment]
+        if former or not (len(args) > 1 or "limits" in kwargs):
+            warn(f"{function.__name__} takes (task, limits), limits as Limits(...)", DeprecationWarning, stacklevel=2)
+            former["forbidden"] = tuple(former.get("forbidden", ()))  # type: ignore[arg-type]
+            kwargs["limits"] = Limits(**former)  # type: ignore[arg-type]
+        return function(*args, **kwargs)
+
+    return with_former
 
 
 def _excess(values: np.ndarray, limit: float) -> np.ndarray:
@@ -113,14 +157,14 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
     """Which limit cannot be met, or which two not together, and what could be: the words of a refusal."""
     n, length = task.n_controlled, task.modes.length
     if grid is None:
-        grid = np.concatenate([np.linspace(*stretch, 40) for stretch in limits.allowed(length)])
+        grid = np.concatenate([np.linspace(*stretch, 40) for stretch in limits.allowed(length, task.reach[0])])
     rng = np.random.default_rng(0)
     draws = rng.random((DRAWS, grid.size)).argsort(axis=1)[:, :n]
     positions = np.sort(grid[draws], axis=1)
-    figures = batch_figures(task, task.shapes(positions))
-    broken = limits.broken(positions, figures)
-    within = {name: excess <= KEPT for name, excess in broken.items()}
-    measured = {"effort": figures.effort, "peak force": figures.peak_force, "condition": figures.condition}
+    costs = batch_costs(task, task.shapes(positions))
+    violations = limits.violations(positions, costs)
+    within = {name: excess <= TOLERANCE for name, excess in violations.items()}
+    measured = {"effort": costs.effort, "peak force": costs.peak_force, "condition": costs.condition}
     asked = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
     head = f"no placement of {n} actuators meets the limits"
     spaced = within["spacing"]

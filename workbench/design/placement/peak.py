@@ -1,17 +1,17 @@
-"""The largest of a sum of decaying swings over all time, not over samples of it."""
+"""The largest value of a sum of damped exponentials over all time, not over samples of it."""
 
 import numpy as np
 
 SHARE = 1e-6
 MOST_ROUNDS = 80
-MOST_INTERVALS = 500_000  # to be halved: swings that hardly decay leave more
+MOST_INTERVALS = 500_000  # to be halved: exponentials that hardly decay leave more
 
 
 def largest(poles: np.ndarray, amplitudes: np.ndarray, span: float) -> float:
     """max |Re Σ_k a_k e^{λ_k t}| over 0 <= t <= span and all signals, at most a millionth too large, never too small.
 
     On an interval of width w about t, |g| <= |g(t)| + |g'(t)| w/2 + (w²/8) Σ_k |a_k λ_k²| e^{Re λ_k (t - w/2)}: what
-    cannot beat the largest seen is dropped, the rest is halved. Where swings hardly decay and too many are left, the
+    cannot beat the largest seen is dropped, the rest is halved. Where they hardly decay and too many are left, the
     bound on them is returned, which is never too small either.
 
     Args:
@@ -28,8 +28,8 @@ def largest(poles: np.ndarray, amplitudes: np.ndarray, span: float) -> float:
     start = np.tile(width * np.arange(count), len(amplitudes))
     best = 0.0
     for _ in range(MOST_ROUNDS):
-        swings = np.exp(np.outer(start + 0.5 * width, poles)) * amplitudes[signal]
-        value, slope = np.abs(swings.sum(axis=1).real), np.abs((swings @ poles).real)
+        terms = np.exp(np.outer(start + 0.5 * width, poles)) * amplitudes[signal]
+        value, slope = np.abs(terms.sum(axis=1).real), np.abs((terms @ poles).real)
         bend = (size[signal] * np.exp(np.outer(start, decay))) @ np.abs(poles) ** 2
         upper = value + 0.5 * width * slope + 0.125 * width**2 * bend
         best = max(best, value.max())

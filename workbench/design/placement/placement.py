@@ -4,26 +4,25 @@ W_R alone has no useful minimum: the optimiser drives the outer actuators onto t
 forces grow without bound. So a placement here is sought under limits on what the actuators must do.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.interpolate import make_interp_spline
 from scipy.optimize import brentq
 
-from workbench.design.laws.imsc import imsc
-from workbench.design.laws.law import DesignError, Law
-from workbench.design.placement.limits import Limits, conflict
+from workbench.design.laws.law import DesignError
+from workbench.design.placement.limits import Limits, conflict, takes_former_limits
 from workbench.design.placement.scan import scan
-from workbench.design.placement.task import Placement, PlacementTask, placement_task
-from workbench.rig.actuators import Actuator
+from workbench.design.placement.task import Placement, PlacementTask, batch_costs, placement_task
 from workbench.structure.modes import Modes
 from workbench.threads import one_blas_thread
 
-__all__ = ["Limits", "Placement", "PlacementTask", "law_at", "nodes_of_mode", "place", "placement_task", "scan"]
+__all__ = ["Limits", "Placement", "PlacementTask", "nodes_of_mode", "place", "placement_task", "scan"]
+
+Solver = Callable[[np.ndarray, Sequence[tuple[float, float]], float], tuple[np.ndarray, str]]
 
 SPLINE_DEGREE = 7
 PEAK_ROUNDS = 4
@@ -38,36 +37,30 @@ def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
     return np.array([*roots, *x[values == 0.0]]).round(14)
 
 
+@takes_former_limits
 @one_blas_thread
-def place(
-    task: PlacementTask,
-    *,
-    effort_limit: float = np.inf,
-    spacing: float = 0.0,
-    margin: float = 0.0,
-    peak_limit: float = np.inf,
-    condition_limit: float = np.inf,
-    forbidden: Iterable[tuple[float, float]] = (),
-    starts: int = 12,
-    seed: int = 0,
-) -> Placement:
-    """Actuator places of least W_R under limits, by CasADi and IPOPT from many starts.
+def place(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
+    """The law with its actuators where they spill the least W_R under limits, by CasADi and IPOPT from many starts.
+
+    Where the limits name candidate places, every choice of these is evaluated instead.
 
     Args:
         task: from `placement_task`.
-        effort_limit, peak_limit, condition_limit, spacing, margin, forbidden: see `Limits`.
+        limits: to keep.
         starts: random starts besides the evenly spaced places and the nodes of mode n+1.
         seed: of the random starts.
 
     Raises:
         DesignError: limits that no start can meet, with the one that conflicts.
     """
-    limits = Limits(effort_limit, peak_limit, condition_limit, spacing, margin, tuple(forbidden))
-    n, length = task.n_controlled, task.modes.length
-    stretches = limits.room(n, length)
+    if limits.candidates is not None:
+        return scan(task, limits)[0]
+    n, length, (first, last) = task.n_controlled, task.modes.length, task.reach
+    intervals = limits.intervals(n, length, first)
+    margin = max(limits.margin, first)
     solver = _solver(task, limits)
     rng = np.random.default_rng(seed)
-    guesses = [length * (np.arange(n) + 1) / (n + 1)]
+    guesses = [first + (last - first) * (np.arange(n) + 1) / (n + 1)]
     nodes = nodes_of_mode(task.modes, n)
     if nodes.size == n:
         guesses.append(np.sort(nodes))
@@ -75,10 +68,10 @@ def place(
     optima: list[tuple[np.ndarray, float]] = []
     status = "no start ended inside the limits"
     for guess in guesses:
-        # each actuator keeps to the stretch nearest its start
-        homes = [min(stretches, key=partial(_apart, x)) for x in guess]
+        # each actuator keeps to the interval nearest its start
+        homes = [min(intervals, key=partial(_apart, x)) for x in guess]
         positions, message, found = _solved(task, limits, solver, guess, homes)
-        if not np.isfinite(found.residual_work) or not limits.kept(found):
+        if not np.isfinite(found.residual_work) or not limits.satisfied_by(found):
             continue
         if not any(np.abs(positions - p).max() < 1e-4 * length for p, _ in optima):
             optima.append((positions, found.residual_work))
@@ -89,7 +82,9 @@ def place(
     return task.placed(optima[0][0], status, optima)
 
 
-def _solved(task: PlacementTask, limits: Limits, solver, guess, homes) -> tuple[np.ndarray, str, Placement]:
+def _solved(
+    task: PlacementTask, limits: Limits, solver: Solver, guess: np.ndarray, homes: Sequence[tuple[float, float]]
+) -> tuple[np.ndarray, str, Placement]:
     """IPOPT from a guess, its sampled forces held lower by what the peak rises between the samples."""
     share = 1.0
     for _ in range(PEAK_ROUNDS):
@@ -101,24 +96,18 @@ def _solved(task: PlacementTask, limits: Limits, solver, guess, homes) -> tuple[
     return np.sort(positions), message, found
 
 
-def _apart(x: float, stretch: tuple[float, float]) -> float:
-    return max(stretch[0] - x, x - stretch[1], 0.0)
-
-
-def law_at(task: PlacementTask, positions: ArrayLike, *, weight: float) -> Law:
-    """The IMSC law with actuators at the given places."""
-    actuators = [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(np.asarray(positions, float))]
-    return imsc(task.modes, task.n_controlled, actuators, weight=weight)
+def _apart(x: float, interval: tuple[float, float]) -> float:
+    return max(interval[0] - x, x - interval[1], 0.0)
 
 
 # --- CasADi
 
 
-def symbolic_work(task: PlacementTask):
+def symbolic_work(task: PlacementTask) -> ca.Function:
     """CasADi function positions -> (W_R, effort, B⁻¹, ‖B‖²), derivatives exact: shapes as splines of degree seven."""
     n, modes = task.n_controlled, task.modes
-    grid = np.linspace(0.0, modes.length, 60 * modes.n_modes // 4 + 120)
-    spline = make_interp_spline(grid, modes.phi(grid), k=SPLINE_DEGREE)
+    grid = np.linspace(*task.reach, 60 * modes.n_modes // 4 + 120)
+    spline = make_interp_spline(grid, task.shapes(grid), k=SPLINE_DEGREE)
     x = ca.MX.sym("x", n)
     columns = [
         ca.bspline(x[i], ca.DM(spline.c.ravel()), [list(spline.t)], [SPLINE_DEGREE], modes.n_modes, {})
@@ -133,7 +122,7 @@ def symbolic_work(task: PlacementTask):
     return ca.Function("work", [x], outputs, ["positions"], ["work", "effort", "inverse", "size"])
 
 
-def _solver(task: PlacementTask, limits: Limits):
+def _solver(task: PlacementTask, limits: Limits) -> Solver:
     n, length = task.n_controlled, task.modes.length
     function = symbolic_work(task)
 
@@ -142,12 +131,14 @@ def _solver(task: PlacementTask, limits: Limits):
     work, effort, inverse, size = function(float(length) * z)
 
     # objective and constraints, each of order one; those without a limit are left out
-    reference = task.placed(length * (np.arange(n) + 1) / (n + 1), "").residual_work
+    first, last = task.reach
+    even = first + (last - first) * (np.arange(n) + 1) / (n + 1)
+    reference = float(batch_costs(task, task.shapes(even[None])).work[0])
     scale = float(reference) if np.isfinite(reference) and reference > 0 else 1.0
     bounded = [effort / float(limits.effort)] if np.isfinite(limits.effort) else []
     first_force = len(bounded)
     if np.isfinite(limits.peak_force):
-        forces = ca.reshape(inverse @ ca.DM(_telling(task.forces)), -1, 1) / float(limits.peak_force)
+        forces = ca.reshape(inverse @ ca.DM(_extreme_instants(task.forces)), -1, 1) / float(limits.peak_force)
         bounded += [forces, -forces]
     if np.isfinite(limits.condition):
         bounded.append(ca.sumsqr(inverse) * size / float(limits.condition) ** 2)
@@ -166,7 +157,7 @@ def _solver(task: PlacementTask, limits: Limits):
     n_forces = sum(part.shape[0] for part in bounded[first_force:]) - bool(np.isfinite(limits.condition))
     is_force = (np.arange(count) >= first_force) & (np.arange(count) < first_force + n_forces)
 
-    def solve(guess: Sequence[float], homes: Sequence[tuple[float, float]], share: float) -> tuple[np.ndarray, str]:
+    def solve(guess: np.ndarray, homes: Sequence[tuple[float, float]], share: float) -> tuple[np.ndarray, str]:
         low, high = np.clip(np.array(homes).T / length, 1e-3, 1.0 - 1e-3)
         result = solver(
             x0=np.clip(np.asarray(guess) / length, low, high),
@@ -181,7 +172,7 @@ def _solver(task: PlacementTask, limits: Limits):
     return solve
 
 
-def _telling(forces: np.ndarray) -> np.ndarray:
+def _extreme_instants(forces: np.ndarray) -> np.ndarray:
     """The instants that can decide the peak of any combination B⁻¹f: those on the hull of ±f, as directions see it."""
     directions = np.random.default_rng(0).standard_normal((400 * forces.shape[0], forces.shape[0]))
     return forces[:, np.unique(np.abs(directions @ forces).argmax(axis=1))]

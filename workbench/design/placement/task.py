@@ -4,15 +4,18 @@ With IMSC the modal forces do not depend on the places, so W_R = ½ Σ_r E|φ_r(
 transforms f̂_r = f̂(iω_r) known once and for all, in the mean over the disturbances that may come.
 """
 
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from workbench.design.laws.imsc import riccati_gains
-from workbench.design.laws.law import DesignError
+from workbench.design.laws.imsc import imsc, riccati_gains
+from workbench.design.laws.law import DesignError, Law
 from workbench.design.placement.peak import largest
+from workbench.rig.actuators import Actuator
+from workbench.structure.domain import Between
 from workbench.structure.modes import Modes, frozen, modal_state_matrix
 
 SINGULAR_SHARE = 1e-14
@@ -24,10 +27,11 @@ MOST_FORCES = 10_000_000
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Places of the actuators and what they cost.
+    """A control law with its actuators placed, and what it costs.
 
     Attributes:
-        positions: (n_actuators,) m, increasing.
+        positions: (n_actuators,) m, increasing; the middles of actuators that act between two places.
+        law: with the actuators there; None where B is singular.
         residual_work: W_R.
         by_mode: (n_residual,) W_r.
         effort: ∫ FᵀF dt.
@@ -38,6 +42,7 @@ class Placement:
     """
 
     positions: np.ndarray
+    law: Law | None
     residual_work: float
     by_mode: np.ndarray
     effort: float
@@ -62,9 +67,11 @@ class PlacementTask:
         force_gramian: (n, n) E ∫ f fᵀ dt.
         forces: (n, n_instants) modal forces at instants of every disturbance, for their peak.
         poles: (2n,) of the controlled modes, rad/s.
-        swings: (n_places, n, 2n) of the modal forces after a blow at each place, f = Re Σ_k swings e^{λ_k t}.
+        amplitudes: (n_places, n, 2n) of the modal forces after an impulse at each place, f = Re Σ_k a_k e^{λ_k t}.
         span: s, over which their peak is sought.
         envelope: (n,) C_j of ω√E|f̂_j(iω)|² <= C_j above the last frequency; inf where there is no such bound.
+        weight: R of IMSC, (n,).
+        actuator: what is to be placed; its own place and name do not matter.
     """
 
     modes: Modes
@@ -73,31 +80,53 @@ class PlacementTask:
     force_gramian: np.ndarray
     forces: np.ndarray
     poles: np.ndarray
-    swings: np.ndarray
+    amplitudes: np.ndarray
     span: float
     envelope: np.ndarray
+    weight: np.ndarray
+    actuator: Actuator
 
     def shapes(self, positions: ArrayLike, derivative: int = 0) -> np.ndarray:
-        """(..., n_modes) of the modes at places (...)."""
+        """Participation (..., n_modes) of an actuator at places (...), or its derivatives with the place."""
         positions = np.asarray(positions, float)
-        return self.modes.phi(positions.ravel(), derivative).reshape(*positions.shape, self.modes.n_modes)
+        found = participation_along(self.modes, self.actuator, positions.ravel(), derivative)
+        return found.reshape(*positions.shape, self.modes.n_modes)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """Where the middle of an actuator can stand at most, (from, to) m."""
+        half = 0.5 * extent(self.actuator)
+        return half, self.modes.length - half
+
+    def law(self, positions: ArrayLike) -> Law:
+        """The IMSC law with actuators at the places (n_actuators,), m.
+
+        Raises:
+            DesignError: places from which the modes cannot be controlled one by one.
+        """
+        places = np.asarray(positions, float)
+        actuators = [placed_at(self.actuator, f"F{i + 1}", float(x)) for i, x in enumerate(places)]
+        return imsc(self.modes, self.n_controlled, actuators, weight=self.weight)
 
     def placed(self, positions: ArrayLike, status: str, optima=()) -> Placement:
         """A `Placement` of given positions; infinite work where B is singular."""
         positions = np.sort(np.asarray(positions, float))
         shapes = self.shapes(positions)
-        figures = batch_figures(self, shapes[None])
-        peak = np.inf
-        if np.isfinite(figures.work[0]):
-            forces = np.linalg.inv(shapes[:, : self.n_controlled].T) @ self.swings
+        costs = batch_costs(self, shapes[None])
+        peak, law = np.inf, None
+        if np.isfinite(costs.work[0]):
+            forces = np.linalg.inv(shapes[:, : self.n_controlled].T) @ self.amplitudes
             peak = largest(self.poles, forces.reshape(-1, self.poles.size), self.span)
+            with suppress(ValueError):  # B of a condition that no law could be built on
+                law = self.law(positions)
         return Placement(
             positions=positions,
-            residual_work=float(figures.work[0]),
-            by_mode=figures.by_mode[0],
-            effort=float(figures.effort[0]),
+            law=law,
+            residual_work=float(costs.work[0]),
+            by_mode=costs.by_mode[0],
+            effort=float(costs.effort[0]),
             peak_force=peak,
-            condition=float(figures.condition[0]),
+            condition=float(costs.condition[0]),
             status=status,
             local_optima=tuple(optima),
         )
@@ -117,7 +146,7 @@ class PlacementTask:
             raise DesignError("the bound on the tail is for t_f to infinity and frequencies above the closed loop's")
         n, modes = self.n_controlled, self.modes
         inverse = np.abs(np.linalg.inv(self.shapes(positions)[:, :n].T))
-        largest = np.abs(modes.phi(np.linspace(0.0, modes.length, 20 * modes.n_modes))).max()
+        largest = np.abs(self.shapes(np.linspace(*self.reach, 20 * modes.n_modes))).max()
         series = modes.n_modes / (2 * growth - 1) / modes.omega[-1] ** 2
         return float(0.5 * (largest * (inverse @ self.envelope).sum()) ** 2 * series)
 
@@ -131,6 +160,7 @@ def placement_task(
     impulse: float = 1.0,
     chances: ArrayLike | None = None,
     final_time: float = np.inf,
+    actuator: Actuator | None = None,
 ) -> PlacementTask:
     """The task for an impulse (N s) at a place, or at any of several, IMSC with control weight R (5.43).
 
@@ -143,6 +173,7 @@ def placement_task(
         impulse: N s.
         chances: (n_places,) of each place; even unless given.
         final_time: t_f; work is counted up to it.
+        actuator: what is to be placed, a point force unless given; a `piezo_patch` or a moment, with its gain.
 
     Raises:
         DesignError: no residual mode, chances that are none, or a time that is not positive.
@@ -173,7 +204,7 @@ def placement_task(
         unit = unit[:, :, None] * np.eye(n)
     transforms = unit @ rates.T
     roots = np.array([_root((t @ t.conj().T).real) for t in transforms])
-    # one blow has a root of two columns; columns that hold nothing cost time and tell nothing
+    # one impulse has a root of two columns; columns without weight only cost time
     weights = np.abs(roots).max(axis=(0, 1))
     roots = roots[:, :, weights > NOTHING * weights.max()]
     share = (omega**2 + g1) / modes.omega[-1] ** 2
@@ -181,7 +212,7 @@ def placement_task(
     if np.isinf(final_time) and (share < 1).all():
         envelope = np.linalg.norm(rates, axis=0) * np.sqrt(g2**2 + (g1 / modes.omega[-1]) ** 2) / (1 - share)
     span = min(final_time, -np.log(SETTLED) / slowest)
-    # the rate jumps at the blow and the forces with it: instants lie close at first
+    # the rate jumps at the impulse and the forces with it: instants lie close at first
     instants = span * np.linspace(0.0, 1.0, SHOWN_INSTANTS) ** 2
     starts = np.vstack([np.zeros((n, places.size)), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
     values, vectors = np.linalg.eig(a)
@@ -189,11 +220,40 @@ def placement_task(
     motion = np.einsum("ik,kt,kp->ipt", vectors, np.exp(np.outer(values, instants)), held).real
     forces = -(gains @ motion.reshape(2 * n, -1))
     gramian = _force_gramian(a, gains, rates, final_time)
-    swings = -(gains @ vectors) * held.T[:, None, :]
-    swings.flags.writeable = values.flags.writeable = False
+    amplitudes = -(gains @ vectors) * held.T[:, None, :]
+    amplitudes.flags.writeable = values.flags.writeable = False
     return PlacementTask(
-        modes, n, frozen(roots), frozen(gramian), frozen(forces), values, swings, final_time, frozen(envelope)
+        modes=modes,
+        n_controlled=n,
+        roots=frozen(roots),
+        force_gramian=frozen(gramian),
+        forces=frozen(forces),
+        poles=values,
+        amplitudes=amplitudes,
+        span=final_time,
+        envelope=frozen(envelope),
+        weight=frozen(np.broadcast_to(np.asarray(weight, float), n)),
+        actuator=Actuator("F", 0.5 * modes.length) if actuator is None else actuator,
     )
+
+
+def extent(actuator: Actuator) -> float:
+    """Length of an actuator along an interval, m: from the first to the second of two places, else 0."""
+    return float(actuator.at.first - actuator.at.second) if isinstance(actuator.at, Between) else 0.0  # type: ignore
+
+
+def placed_at(actuator: Actuator, name: str, at: float) -> Actuator:
+    """The actuator, renamed, with its middle at x (m)."""
+    half = 0.5 * extent(actuator)
+    return replace(actuator, name=name, at=Between(at + half, at - half) if half else at)
+
+
+def participation_along(modes: Modes, actuator: Actuator, x: np.ndarray, derivative: int = 0) -> np.ndarray:
+    """Modal forces (n_places, n_modes) per unit command of an actuator at x (n_places,), m; derivatives with x."""
+    half, order = 0.5 * extent(actuator), derivative + (actuator.kind == "moment")
+    if half == 0:
+        return actuator.gain * modes.phi(x, order)
+    return actuator.gain * (modes.phi(x + half, order) - modes.phi(x - half, order))
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
@@ -212,7 +272,7 @@ def _force_gramian(a: np.ndarray, gains: np.ndarray, rates: np.ndarray, final_ti
 
 
 @dataclass(frozen=True, eq=False)
-class Figures:
+class Costs:
     """What many placements cost: each (n_placements,), inf where B is singular; by_mode (n_placements, n_residual).
 
     The peak force is that at the task's instants: never more than the true one, and a little less.
@@ -225,7 +285,7 @@ class Figures:
     condition: np.ndarray
 
 
-def batch_figures(task: PlacementTask, shapes: np.ndarray) -> Figures:
+def batch_costs(task: PlacementTask, shapes: np.ndarray) -> Costs:
     """All that is asked of many placements at once, from `shapes` (n_placements, n_actuators, n_modes)."""
     inverse, singular = _inverses(task, shapes)
     n = task.n_controlled
@@ -238,7 +298,7 @@ def batch_figures(task: PlacementTask, shapes: np.ndarray) -> Figures:
     )
     condition = np.linalg.norm(inverse, axis=(1, 2)) * np.linalg.norm(shapes[:, :, :n], axis=(1, 2))
     by_mode[singular] = np.inf
-    return Figures(
+    return Costs(
         np.where(singular, np.inf, by_mode.sum(axis=1)),
         by_mode,
         *(np.where(singular, np.inf, x) for x in (effort, peak, condition)),

@@ -1,4 +1,4 @@
-"""Several laws on the same structure after the same blow, on one yardstick."""
+"""Several laws on the same structure after the same impulse: cost, effort, spillover and poles side by side."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ class Compared:
         object.__setattr__(self, "poles", frozen(self.poles, complex))
 
     @property
-    def most_fed(self) -> int | None:
+    def most_excited(self) -> int | None:
         """Zero-based index of the residual mode that takes the most work; None where no mode is residual."""
         residual = self.work.residual
         return residual[int(np.argmax(self.work.residual_work))] if residual else None

@@ -1,4 +1,4 @@
-"""Which residual mode a design unsettles on the full plant, and by which path from sensor to actuator.
+"""Which residual mode a design destabilises on the full plant, and by which path from sensor to actuator.
 
 Without mode r the rest of the loop answers readings y with forces T(s) y. Mode r closes that loop at s = λ + Δ:
 
@@ -20,17 +20,17 @@ from workbench.structure.modes import Modes
 
 SECANT_STEPS = 40
 TWIN = 1e-12
-SUSPECTS = 12  # residual modes, the most moved, whose absence is tried
+SUSPECTS = 12  # residual modes, the most shifts, whose absence is tried
 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """How far one actuator, fed by the sensors at one place, moves a mode's pole.
+    """How far one actuator, driven by the sensors at one place, shifts a mode's pole.
 
     Attributes:
         actuator: name.
         sensor_at: place of the sensors, m; all the channels read there count together.
-        shift: its share of the exact movement, rad/s; the real part is what it adds to the growth.
+        shift: its share of the exact shift, rad/s; the real part is what it adds to the growth.
         first_order: the same from the open-loop pole.
     """
 
@@ -41,14 +41,14 @@ class Path:
 
 
 @dataclass(frozen=True, eq=False)
-class Moved:
-    """What a controller does to one residual mode.
+class PoleShift:
+    """The pole of one residual mode, without control and in the full closed loop.
 
     Attributes:
         mode: zero-based index.
         pole: open loop, upper half plane, rad/s.
         closed_pole: of the full closed loop.
-        paths: the most destabilising first; their shifts add up to the movement.
+        paths: the most destabilising first; their shifts add up to that of the pole.
     """
 
     mode: int
@@ -58,12 +58,12 @@ class Moved:
 
     @property
     def shift(self) -> complex:
-        """Movement of the pole, rad/s."""
+        """Shift of the pole, rad/s."""
         return self.closed_pole - self.pole
 
     @property
     def first_order(self) -> complex:
-        """The movement to first order; far from `shift` where the spillover is not small."""
+        """The shift to first order; far from `shift` where the spillover is not small."""
         return sum(path.first_order for path in self.paths)
 
 
@@ -73,17 +73,17 @@ class Explanation:
 
     Attributes:
         loop: of all modes.
-        moved: every residual mode, the least stable first.
+        shifts: every residual mode, the least stable first.
         reduced_margin: of the loop of the controlled modes alone, 1/s.
-        culprit: the residual mode that unsettles the loop: one that grows, else the one without which the loop is
-            stable (a residual mode can stay stable itself and make a controlled one grow). None where the loop is
-            stable, and where no single mode is to blame, as when the reduced model fails already.
+        destabilising: the residual mode that makes the loop unstable: one that grows, else the one without which the
+            loop is stable (a residual mode can stay stable itself and make a controlled one grow). None where the loop
+            is stable, and where no single mode accounts for it, as when the reduced model fails already.
     """
 
     loop: ClosedLoop
-    moved: tuple[Moved, ...]
+    shifts: tuple[PoleShift, ...]
     reduced_margin: float
-    culprit: Moved | None
+    destabilising: PoleShift | None
 
     @property
     def poles(self) -> np.ndarray:
@@ -97,7 +97,7 @@ class Explanation:
 
 
 def explain(modes: Modes, controller: Controller) -> Explanation:
-    """The poles of the whole, and what moved each residual mode, by path.
+    """The poles of the full closed loop, and what shifts that of each residual mode, by path.
 
     Args:
         modes: of the fuller plant; those that the law does not control are residual.
@@ -107,30 +107,30 @@ def explain(modes: Modes, controller: Controller) -> Explanation:
     residual = [r for r in range(modes.n_modes) if r not in controller.law.controlled]
     poles = loop.poles
     upper = poles[poles.imag > 0]
-    moved = []
+    shifts = []
     if residual:
         rest = _Rest(modes, controller)
         at = [_OneMode(rest, r) for r in residual]
         far = np.abs(np.array([mode.closed_pole() for mode in at])[:, None] - upper[None, :])
         for i, k in zip(*linear_sum_assignment(far), strict=True):
             closed = complex(upper[k])
-            moved.append(Moved(residual[i], at[i].pole, closed, at[i].paths(closed)))
-    moved.sort(key=lambda m: -m.closed_pole.real)
+            shifts.append(PoleShift(residual[i], at[i].pole, closed, at[i].paths(closed)))
+    shifts.sort(key=lambda m: -m.closed_pole.real)
     alone = close_with(modes.select(controller.law.controlled), controller)
-    return Explanation(loop, tuple(moved), alone.margin, _behind(modes, controller, loop, moved))
+    return Explanation(loop, tuple(shifts), alone.margin, _behind(modes, controller, loop, shifts))
 
 
-def _behind(modes: Modes, controller: Controller, loop: ClosedLoop, moved: list[Moved]) -> Moved | None:
-    """The residual mode that unsettles a loop: one that grows, else one without which the loop is stable."""
-    if loop.stable or not moved:
+def _behind(modes: Modes, controller: Controller, loop: ClosedLoop, shifts: list[PoleShift]) -> PoleShift | None:
+    """The residual mode that destabilises a loop: one that grows, else one without which the loop is stable."""
+    if loop.stable or not shifts:
         return None
-    if moved[0].closed_pole.real > 0:
-        return moved[0]
+    if shifts[0].closed_pole.real > 0:
+        return shifts[0]
 
-    def margin_without(one: Moved) -> float:
+    def margin_without(one: PoleShift) -> float:
         return close_with(modes.select([r for r in range(modes.n_modes) if r != one.mode]), controller).margin
 
-    suspects = sorted(moved, key=lambda m: -abs(m.shift))[:SUSPECTS]
+    suspects = sorted(shifts, key=lambda m: -abs(m.shift))[:SUSPECTS]
     margins = [margin_without(one) for one in suspects]
     best = int(np.argmax(margins))
     return suspects[best] if margins[best] > 0 else None

@@ -1,4 +1,4 @@
-"""The smallest change that settles a loop that spillover unsettles: less gain, a place moved, sensors more.
+"""The smallest change that stabilises a loop that spillover destabilises: a lower gain, a place moved, added sensors.
 
 Every change is a new design, and every margin is that of the new loop on the full plant, recomputed.
 """
@@ -25,7 +25,7 @@ HALVINGS = 14
 
 @dataclass(frozen=True, eq=False)
 class Remedy:
-    """The smallest change of one kind that settles the loop.
+    """The smallest change of one kind that stabilises the loop.
 
     Attributes:
         kind: "gain", "actuator", "sensor" or "sensors added".
@@ -108,7 +108,7 @@ def remedies(
     return tuple(found)
 
 
-def sensors_that_suffice(
+def sufficient_sensors(
     modes: Modes,
     redesign: Redesign,
     actuators: Sequence[Actuator],

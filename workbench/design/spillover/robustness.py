@@ -1,7 +1,7 @@
-"""How a design fares on the structures that the identification leaves possible.
+"""Robustness of a design to the errors of identification: the share of perturbed models that stay stable.
 
 Frequencies and damping ratios are drawn from their covariance, shapes from theirs at the sensors, carried everywhere by
-the modes themselves: φ_r + Σ_s e_rs φ_s. A design survives a draw where the loop of all its modes is stable.
+the modes themselves: φ_r + Σ_s e_rs φ_s.
 """
 
 from collections.abc import Mapping
@@ -21,8 +21,8 @@ LEAST_OMEGA = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Survival:
-    """A design on many possible structures.
+class Robustness:
+    """A design on many perturbed models.
 
     Attributes:
         margins: (n_draws,) stability margin of each, 1/s.
@@ -38,7 +38,7 @@ class Survival:
 
     @property
     def share(self) -> float:
-        """Of the draws that the design survives."""
+        """Share of the perturbed models on which the loop of all modes is stable."""
         return float(np.mean(self.margins > 0))
 
     @property
@@ -47,7 +47,7 @@ class Survival:
         return float(np.sqrt(self.share * (1 - self.share) / self.margins.size))
 
     def spread(self, level: float = 0.9) -> tuple[float, float, float]:
-        """W_R of the surviving draws: lower end of the interval, median, upper end; nan where none survives."""
+        """W_R of the stable draws: lower end of the interval, median, upper end; nan where none is stable."""
         there = self.work[np.isfinite(self.work)]
         if not there.size:
             return np.nan, np.nan, np.nan
@@ -109,8 +109,8 @@ def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:
     return Modes(omega, c, lambda x, d: modes.shapes(x, d) @ blend, modes.domain, modes.essential)
 
 
-def wrong_by(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> list[Modes]:
-    """Structures unlike the model by a relative standard error, where no identification tells how unlike they may be.
+def perturbed_modes(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> list[Modes]:
+    """Models perturbed by a relative standard error, where no identification gives their covariance.
 
     Frequencies and damping ratios are off by it each; every shape has some of all others in it, in mean square this
     share of its own size.
@@ -127,15 +127,15 @@ def wrong_by(modes: Modes, error: float, *, count: int = 100, seed: int = 0) -> 
     return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
 
 
-def survival_of(possible: list[Modes], design: Controller | Law) -> float:
+def stable_share(possible: list[Modes], design: Controller | Law) -> float:
     """Share of the structures on which a design is stable."""
     return float(np.mean([close_with(modes, design).stable for modes in possible]))
 
 
 @one_blas_thread
-def survive(
+def robustness(
     possible: list[Modes], designs: Mapping[str, Controller | Law], *, state: np.ndarray, final_time: float
-) -> dict[str, Survival]:
+) -> dict[str, Robustness]:
     """Each design on each possible structure.
 
     Args:
@@ -152,5 +152,5 @@ def survive(
             margins[i] = loop.margin
             if margins[i] > 0:
                 work[i] = finite_spillover(loop, state, final_time).residual_total
-        found[name] = Survival(margins, work)
+        found[name] = Robustness(margins, work)
     return found

@@ -13,7 +13,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import on_off
 from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state
-from workbench.design.spillover.judge import judge, judge_on_off
+from workbench.design.spillover.performance import on_off_performance, performance
 from workbench.design.spillover.spillover import effort, quadratic_cost
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -36,7 +36,7 @@ STATE = np.r_[np.zeros(6), impulse_state(MODES, 6.3)[6:8], np.zeros(4)]
 def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
     sensors = [Sensor("a", 2.2), Sensor("b", 7.1)]
     controller = kalman(MODES, LAW, sensors, disturbance=1.0, noise=0.1)
-    told = judge(close_with(MODES, controller), STATE, weight=3.0, final_time=40.0)
+    told = performance(close_with(MODES, controller), STATE, weight=3.0, final_time=40.0)
     shapes = MODES.phi([a.at for a in ACTUATORS]).T
     seen = np.hstack([MODES.phi([s.at for s in sensors]), np.zeros((2, 6))])
     plant = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.diag(MODES.omega**2), -MODES.damping]])
@@ -55,14 +55,14 @@ def test_figures_of_a_loop_with_an_observer_are_those_of_its_motion():
 
 
 def test_in_the_long_run_the_figures_are_those_of_the_lyapunov_equation():
-    told = judge(close_loop(MODES, LAW), STATE, weight=3.0, final_time=2000.0)
+    told = performance(close_loop(MODES, LAW), STATE, weight=3.0, final_time=2000.0)
     assert told.cost == pytest.approx(quadratic_cost(MODES, LAW, STATE, 3.0))
     assert told.effort == pytest.approx(effort(MODES, LAW, STATE))
 
 
 def test_a_loop_that_is_unstable_has_no_figures():
     strong = coupled_lqr(MODES, 2, ACTUATORS, weight=1e-4)
-    told = judge(
+    told = performance(
         close_with(MODES, filtered(strong, displacement_filter(MODES.select([0, 1]), [9.0], 1.0))),
         STATE,
         weight=1.0,
@@ -70,12 +70,12 @@ def test_a_loop_that_is_unstable_has_no_figures():
     )
     assert told.margin < 0 and np.isinf([told.cost, told.effort, told.spilled]).all()
     with pytest.raises(DesignError, match="final time must be positive and finite; got inf"):
-        judge(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
+        performance(close_loop(MODES, LAW), STATE, weight=1.0, final_time=np.inf)
 
 
 def test_an_idle_relay_leaves_the_energy_of_free_decay():
     relay = on_off(MODES, 2, ACTUATORS, force=1.0, dead_band=1e3)
-    told = judge_on_off(MODES, relay, STATE, weight=3.0, final_time=40.0)
+    told = on_off_performance(MODES, relay, STATE, weight=3.0, final_time=40.0)
     time = np.linspace(0.0, 40.0, 40_001)
     plant = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.diag(MODES.omega**2), -MODES.damping]])
     motion = control.initial_response(control.ss(plant, np.zeros((12, 1)), np.eye(12), 0), time, STATE).outputs

@@ -1,4 +1,4 @@
-"""A design judged on the full plant: cost, effort, spillover and margin of one motion, however the state is known."""
+"""Performance of a design on the full plant: cost, effort, spillover and stability margin, with any estimator."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,7 @@ INSTANTS = 20_001
 
 
 @dataclass(frozen=True)
-class Judged:
+class Performance:
     """What a design does up to the final time; cost, effort and W_R are infinite where the loop is unstable.
 
     Attributes:
@@ -32,7 +32,7 @@ class Judged:
     margin: float
 
 
-def judge(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Judged:
+def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: float) -> Performance:
     """A linear loop, exactly: every figure is a quadratic form of the state, its integral one matrix.
 
     Args:
@@ -45,7 +45,7 @@ def judge(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: flo
     modes, n = loop.modes, loop.modes.n_modes
     margin = loop.margin
     if not loop.stable:
-        return Judged(np.inf, np.inf, np.inf, margin)
+        return Performance(np.inf, np.inf, np.inf, margin)
     state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
     moments = second_moments(loop.matrix, state, final_time)
     own = list(loop.law.controlled)
@@ -54,10 +54,12 @@ def judge(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_time: flo
     rest = [r for r in range(n) if r not in own]
     push = input_matrix(modes, loop.law.actuators)[rest] @ loop.feedback
     spilled = float(sum(row @ moments[:, n + r] for row, r in zip(push, rest)))
-    return Judged(float(energy) + weight * effort, effort, spilled, margin)
+    return Performance(float(energy) + weight * effort, effort, spilled, margin)
 
 
-def judge_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: float, final_time: float) -> Judged:
+def on_off_performance(
+    modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: float, final_time: float
+) -> Performance:
     """The same of on-off control, whose motion is exact and whose integrals are sums over it."""
     _check(weight, final_time)
     time = np.linspace(0.0, final_time, INSTANTS)
@@ -65,7 +67,9 @@ def judge_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: floa
     own = list(law.controlled)
     effort = float(np.trapezoid((response.forces**2).sum(axis=0), time))
     energy = float(np.trapezoid(2.0 * response.energy[own].sum(axis=0), time))
-    return Judged(energy + weight * effort, effort, on_off_work(modes, law, state, final_time).residual_total, np.nan)
+    return Performance(
+        energy + weight * effort, effort, on_off_work(modes, law, state, final_time).residual_total, np.nan
+    )
 
 
 def _check(weight: float, final_time: float) -> None:

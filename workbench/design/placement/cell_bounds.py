@@ -1,0 +1,504 @@
+"""Bounds of the spillover work on cells of places, from intervals of the modal shapes.
+
+A cell is an interval of half-width h_j about c_j for each actuator. With b(x) the participation of the controlled modes
+in a force at x, M = B⁻¹ at the centre and z_r = φ_rᵀ M, what mode r takes is, without approximation,
+
+    Y_r(x) = Y_r(c) + Σ_j d_rj(x_j) F_rj(x),   d_rj(x) = φ_r(x) - z_rᵀ b(x),   F_r(x) = B(x)⁻¹ T_r,
+
+where d_rj is zero at c_j: an error of the forces F costs only to second order. With E = M ΔB, |E| <= Ē on the cell,
+|F - F(c)| <= (I - Ē)⁻¹ Ē |F(c)| where the spectral radius of Ē is below 1 (Neumann's series, entry by entry). W_R is
+½ ‖Y‖² and ‖Y‖ >= vᵀ Y for any unit vector v, here that of the least ‖Y‖ to first order in the cell; the linear part is
+minimised over the cell under each limit linearised alike (a linear programme of one constraint, solved by its dual).
+
+Near a singular B the limits decide alone: with tr(B⁻¹ S B⁻ᵀ) <= L², no unit vector u has ‖S^-½ B u‖ < 1/L.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.task import PlacementTask
+from workbench.structure.modes import frozen
+
+LEVELS = 12  # halvings of the length of the structure: its 1/8192 to each side
+INSTANTS = 48  # of the modal forces, for their peak
+SINGULAR = 1e-13  # pivot of B over its largest entry
+SWEEPS = 3  # of the descent to the least ‖Y‖ to first order
+FLAT = 1e-12  # a limited square form whose least eigenvalue over the largest is below has no inverse
+
+
+@dataclass(frozen=True, eq=False)
+class Intervals:
+    """The modal shapes on every interval of the halved length; interval i halves into 2i + 1 and 2i + 2.
+
+    Attributes:
+        centre, half: (n_intervals,) m.
+        value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
+        most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and rate of change of φ'' on the interval.
+    """
+
+    centre: np.ndarray
+    half: np.ndarray
+    value: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    most_bend: np.ndarray
+    most_rate: np.ndarray
+
+    @classmethod
+    def of(cls, task: PlacementTask) -> "Intervals":
+        """On a grid of which every centre is a point; between its points by the rates of change seen there."""
+        first, last = task.reach
+        leaves = 2**LEVELS
+        grid = np.linspace(first, last, 2 * leaves + 1)
+        step = grid[1] - grid[0]
+        value, slope, bend = (task.shapes(grid, derivative) for derivative in (0, 1, 2))
+        rate = np.abs(np.diff(bend, axis=0)) / step
+        varied = np.abs(np.diff(rate, axis=0, prepend=rate[:1], append=rate[-1:]))
+        rate = rate + np.maximum(varied[:-1], varied[1:])
+        steep = np.maximum(np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])), np.abs(np.diff(slope, axis=0)) / step)
+        steep = steep + 0.5 * step * rate
+        most_bend, most_rate = (np.maximum(part[::2], part[1::2]) for part in (steep, rate))
+        levels = [(most_bend, most_rate)]
+        for _ in range(LEVELS):
+            levels.append(tuple(np.maximum(part[::2], part[1::2]) for part in levels[-1]))  # type: ignore[arg-type]
+        at = np.concatenate([(2 * np.arange(2**k) + 1) * 2 ** (LEVELS - k) for k in range(LEVELS + 1)])
+        half = np.concatenate([np.full(2**k, 0.5 * (last - first) / 2**k) for k in range(LEVELS + 1)])
+        most_bend, most_rate = (np.concatenate([level[i] for level in reversed(levels)]) for i in (0, 1))
+        return cls(*(frozen(part) for part in (grid[at], half, value[at], slope[at], bend[at], most_bend, most_rate)))
+
+
+class CellBounds:
+    """Of cells (n_cells, n_actuators) of intervals: lower bounds of √W_R, and whether the limits leave any place.
+
+    Attributes:
+        intervals: the halved length.
+    """
+
+    def __init__(self, task: PlacementTask, limits: Limits) -> None:
+        n = task.n_controlled
+        self.intervals = Intervals.of(task)
+        forces = task.forces[:, :: max(1, task.forces.shape[1] // INSTANTS)]
+        # what is limited, as tr(B⁻¹ S B⁻ᵀ) <= L²: the effort; n times the square of the peak, above any mean of the
+        # forces' squares; and the condition, L = limit / ‖B‖
+        squares: list[tuple[np.ndarray, float]] = []
+        if np.isfinite(limits.effort):
+            squares.append((task.force_gramian, np.sqrt(limits.effort)))
+        if np.isfinite(limits.peak_force):
+            weight = 1.0 / np.maximum((forces**2).sum(axis=0), 1e-12 * (forces**2).sum(axis=0).max())
+            squares.append(((forces * weight / weight.sum()) @ forces.T, np.sqrt(n) * limits.peak_force))
+        if np.isfinite(limits.condition):
+            squares.append((np.eye(n), np.inf))
+        roots, inverses = np.zeros((len(squares), n, n)), np.zeros((len(squares), n, n))
+        for i, (matrix, _) in enumerate(squares):
+            values, vectors = np.linalg.eigh(matrix)
+            values = np.maximum(values, 0.0)
+            roots[i] = vectors * np.sqrt(values)
+            if values[0] > FLAT * values[-1]:
+                inverses[i] = (vectors / np.sqrt(values)).T
+        table = self.intervals
+        self._arguments = (
+            table.half,
+            table.value,
+            table.slope,
+            table.bend,
+            table.most_bend,
+            table.most_rate,
+            np.ascontiguousarray(task.roots),
+            roots,
+            inverses.any(axis=(1, 2)),
+            np.einsum("skl,il->isk", inverses, table.slope[:, :n]),
+            np.linalg.norm(np.einsum("skl,il->isk", np.abs(inverses), table.most_bend[:, :n]), axis=2),
+            np.array([limit for _, limit in squares]),
+            float(limits.condition),
+            np.ascontiguousarray(forces if np.isfinite(limits.peak_force) else forces[:, :0]),
+            float(limits.peak_force),
+        )
+
+    def __call__(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Lower bounds of √W_R (inf where the limits leave no place), √W_R at the centres, and the axis to halve."""
+        lower, work = np.empty(len(cells)), np.empty(len(cells))
+        axis = np.empty(len(cells), np.int64)
+        _bounds(cells, *self._arguments, lower, work, axis)
+        return lower, work, axis
+
+
+@njit(cache=True, nogil=True)
+def _inverse(matrix, inverse, least):
+    """Gauss-Jordan with pivots; whether every pivot is above the least. The matrix is destroyed."""
+    n = matrix.shape[0]
+    for i in range(n):
+        for j in range(n):
+            inverse[i, j] = 1.0 if i == j else 0.0
+    for k in range(n):
+        best = k
+        for i in range(k + 1, n):
+            if abs(matrix[i, k]) > abs(matrix[best, k]):
+                best = i
+        pivot = matrix[best, k]
+        if not abs(pivot) > least:
+            return False
+        if best != k:
+            for j in range(n):
+                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
+                inverse[k, j], inverse[best, j] = inverse[best, j], inverse[k, j]
+        for j in range(n):
+            matrix[k, j] /= pivot
+            inverse[k, j] /= pivot
+        for i in range(n):
+            factor = matrix[i, k]
+            if i != k and factor != 0.0:
+                for j in range(n):
+                    matrix[i, j] -= factor * matrix[k, j]
+                    inverse[i, j] -= factor * inverse[k, j]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _least_linear(cost, h, direction, slack):
+    """min cᵀδ over |δ| <= h with aᵀδ <= slack, by its dual; inf where no δ keeps the constraint."""
+    n = cost.size
+    reach = 0.0
+    for j in range(n):
+        reach += abs(direction[j]) * h[j]
+    if reach < -slack:
+        return np.inf
+    best = -np.inf
+    for k in range(-1, n):
+        multiplier = 0.0
+        if k >= 0:
+            if direction[k] == 0.0:
+                continue
+            multiplier = -cost[k] / direction[k]
+            if multiplier <= 0.0:
+                continue
+        value = -multiplier * slack
+        for j in range(n):
+            value -= abs(cost[j] + multiplier * direction[j]) * h[j]
+        best = max(best, value)
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _bounds(
+    cells,
+    halves,
+    value,
+    slope,
+    bend,
+    most_bend,
+    most_rate,
+    transforms,
+    roots,
+    regular,
+    root_slope,
+    root_bend,
+    square_limits,
+    condition,
+    forces,
+    peak,
+    lower,
+    work,
+    axis,
+):
+    n_cells, n = cells.shape
+    n_residual, _, n_columns = transforms.shape
+    n_squares, n_instants = roots.shape[0], forces.shape[1]
+    h = np.empty(n)
+    b, matrix = np.empty((n, n)), np.empty((n, n))
+    m, rate, curved, change = np.empty((n, n)), np.empty((n, n)), np.empty((n, n)), np.empty((n, n))
+    neumann, error = np.empty((n, n)), np.empty((n, n))
+    z, first, second = np.empty((n_residual, n)), np.empty((n_residual, n)), np.empty((n_residual, n))
+    p, p_error = np.empty((n, n_columns)), np.empty((n, n_columns))
+    y, rest = np.empty((n_residual, n_columns)), np.empty((n_residual, n_columns))
+    linear = np.empty((n_residual, n_columns, n))
+    rest_by = np.empty((n_residual, n_columns, n))
+    least_y, shift, cost, score = np.empty((n_residual, n_columns)), np.empty(n), np.empty(n), np.empty(n)
+    directions, slacks = np.empty((n_squares + 1, n)), np.empty(n_squares + 1)
+    corner = np.empty((n, n))
+    weighed, u, v, carried = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
+    for cell in range(n_cells):
+        node = cells[cell]
+        lower[cell], work[cell] = 0.0, np.inf
+        widest, largest, frame = 0, 0.0, 0.0
+        for j in range(n):
+            h[j] = halves[node[j]]
+            if h[j] > h[widest]:
+                widest = j
+            for k in range(n):
+                b[k, j] = value[node[j], k]
+                matrix[k, j] = b[k, j]
+                largest = max(largest, abs(b[k, j]))
+                frame += b[k, j] ** 2
+        axis[cell] = widest
+        if not _inverse(matrix, m, SINGULAR * largest):
+            continue
+        frame = np.sqrt(frame)
+
+        # how the forces change over the cell: E = M ΔB
+        for i in range(n):
+            for j in range(n):
+                a, c, d, e = 0.0, 0.0, 0.0, 0.0
+                for k in range(n):
+                    a += m[i, k] * slope[node[j], k]
+                    c += m[i, k] * bend[node[j], k]
+                    d += abs(m[i, k]) * most_rate[node[j], k]
+                    e += abs(m[i, k]) * most_bend[node[j], k]
+                rate[i, j] = a
+                curved[i, j] = 0.5 * h[j] ** 2 * min(abs(c) + h[j] * d, e)
+                change[i, j] = abs(a) * h[j] + curved[i, j]
+        for j in range(n):
+            score[j] = 0.0
+            for i in range(n):
+                score[j] += change[i, j]
+            if score[j] > score[axis[cell]]:
+                axis[cell] = j
+
+        # no place in the cell has a ‖B‖ below this
+        least_frame = frame
+        for j in range(n):
+            a = 0.0
+            for k in range(n):
+                a += (abs(slope[node[j], k]) + h[j] * most_bend[node[j], k]) ** 2
+            least_frame -= h[j] * np.sqrt(a)
+        least_frame = max(least_frame, 0.0)
+
+        # limits that a nearly singular B breaks
+        open_ = True
+        for s in range(n_squares):
+            limit = square_limits[s]
+            if np.isinf(limit):
+                limit = condition / least_frame if least_frame > 0 else np.inf
+            slacks[s] = limit
+            column, size = 0, -1.0
+            for c in range(n):
+                a = 0.0
+                for i in range(n):
+                    d = 0.0
+                    for k in range(n):
+                        d += m[i, k] * roots[s, k, c]
+                    weighed[i, c] = d
+                    a += d * d
+                if a > size:
+                    column, size = c, a
+            for i in range(n):
+                v[i] = weighed[i, column]
+            a = 0.0
+            for c in range(n):
+                u[c] = 0.0
+                for i in range(n):
+                    u[c] += weighed[i, c] * v[i]
+                a += u[c] ** 2
+            if not regular[s]:
+                continue
+            # S^-½ B v = u at the centre; a norm is convex, so its linear part is largest at a corner of the cell
+            a = np.sqrt(a)
+            d, e = 0.0, 0.0
+            for c in range(n):
+                u[c] /= a
+            for i in range(n):
+                v[i] = 0.0
+                for c in range(n):
+                    v[i] += weighed[i, c] * u[c]
+                d += v[i] ** 2
+                e += abs(v[i]) * 0.5 * h[i] ** 2 * root_bend[node[i], s]
+                for c in range(n):
+                    corner[i, c] = v[i] * h[i] * root_slope[node[i], s, c]
+                    u[c] += corner[i, c]
+            largest_square = 0.0
+            for step in range(1, 2**n + 1):
+                a = 0.0
+                for c in range(n):
+                    a += u[c] ** 2
+                largest_square = max(largest_square, a)
+                # Gray's code: one sign turns at a time
+                i = 0
+                while i < n - 1 and not (step >> i) & 1:
+                    i += 1
+                for c in range(n):
+                    corner[i, c] = -corner[i, c]
+                    u[c] += 2.0 * corner[i, c]
+            if np.sqrt(d) > limit * (np.sqrt(largest_square) + e):
+                open_ = False
+        if not open_:
+            lower[cell] = np.inf
+            continue
+
+        # Neumann's series, where it converges: (I - Ē) w = 1 with w > 0 makes I - Ē an M-matrix
+        for i in range(n):
+            for j in range(n):
+                matrix[i, j] = (1.0 if i == j else 0.0) - change[i, j]
+        if not _inverse(matrix, neumann, 1e-12):
+            continue
+        converges = True
+        for i in range(n):
+            a = 0.0
+            for j in range(n):
+                a += neumann[i, j]
+                converges = converges and neumann[i, j] >= 0.0
+            converges = converges and a >= 1.0
+        if not converges:
+            continue
+        for i in range(n):
+            for j in range(n):
+                error[i, j] = 0.0
+                for k in range(n):
+                    error[i, j] += neumann[i, k] * change[k, j]
+
+        # the limits to first order: aᵀδ <= slack
+        for s in range(n_squares):
+            energy = 0.0
+            for i in range(n):
+                for c in range(n):
+                    d = 0.0
+                    for k in range(n):
+                        d += m[i, k] * roots[s, k, c]
+                    weighed[i, c] = d
+                    energy += d * d
+            energy = np.sqrt(energy)
+            for j in range(n):
+                directions[s, j] = 0.0
+            remainder = 0.0
+            for c in range(n):
+                for k in range(n):
+                    carried[k] = 0.0
+                    for j in range(n):
+                        carried[k] += error[k, j] * abs(weighed[j, c])
+                for i in range(n):
+                    share = weighed[i, c] / energy
+                    for j in range(n):
+                        directions[s, j] -= share * rate[i, j] * weighed[j, c]
+                        remainder += abs(share) * (curved[i, j] * abs(weighed[j, c]) + change[i, j] * carried[j])
+            slacks[s] = slacks[s] - energy + remainder
+            reach = 0.0
+            for j in range(n):
+                reach += abs(directions[s, j]) * h[j]
+            if reach < -slacks[s]:
+                open_ = False
+        n_constraints = n_squares
+        worst = -np.inf
+        for t in range(n_instants):
+            for i in range(n):
+                a = 0.0
+                for k in range(n):
+                    a += m[i, k] * forces[k, t]
+                u[i] = a
+            for k in range(n):
+                v[k] = 0.0
+                for j in range(n):
+                    v[k] += error[k, j] * abs(u[j])
+            for i in range(n):
+                reach, remainder = 0.0, 0.0
+                for j in range(n):
+                    reach += abs(rate[i, j] * u[j]) * h[j]
+                    remainder += curved[i, j] * abs(u[j]) + change[i, j] * v[j]
+                if abs(u[i]) - reach - remainder > peak:
+                    open_ = False
+                if abs(u[i]) - remainder > worst:
+                    worst = abs(u[i]) - remainder
+                    n_constraints = n_squares + 1
+                    slacks[n_squares] = peak - worst
+                    for j in range(n):
+                        directions[n_squares, j] = -np.sign(u[i]) * rate[i, j] * u[j]
+        if not open_:
+            lower[cell] = np.inf
+            continue
+
+        # Y, linear in the places but for a rest
+        total = 0.0
+        for r in range(n_residual):
+            for k in range(n):
+                a = 0.0
+                for i in range(n):
+                    a += value[node[i], n + r] * m[i, k]
+                z[r, k] = a
+            for j in range(n):
+                a, c = slope[node[j], n + r], bend[node[j], n + r]
+                d, e = most_rate[node[j], n + r], most_bend[node[j], n + r]
+                for k in range(n):
+                    a -= z[r, k] * slope[node[j], k]
+                    c -= z[r, k] * bend[node[j], k]
+                    d += abs(z[r, k]) * most_rate[node[j], k]
+                    e += abs(z[r, k]) * most_bend[node[j], k]
+                first[r, j] = a
+                second[r, j] = 0.5 * h[j] ** 2 * min(abs(c) + h[j] * d, e)
+            for q in range(n_columns):
+                for i in range(n):
+                    a = 0.0
+                    for k in range(n):
+                        a += m[i, k] * transforms[r, k, q]
+                    p[i, q] = a
+                y[r, q], rest[r, q] = 0.0, 0.0
+                for i in range(n):
+                    a = 0.0
+                    for j in range(n):
+                        a += error[i, j] * abs(p[j, q])
+                    p_error[i, q] = a
+                    y[r, q] += value[node[i], n + r] * p[i, q]
+                    linear[r, q, i] = first[r, i] * p[i, q]
+                    rest_by[r, q, i] = second[r, i] * abs(p[i, q]) + (h[i] * abs(first[r, i]) + second[r, i]) * a
+                    rest[r, q] += rest_by[r, q, i]
+                total += y[r, q] ** 2
+                least_y[r, q] = y[r, q]
+        work[cell] = np.sqrt(0.5 * total)
+
+        # the least ‖Y‖ to first order, coordinate by coordinate
+        for j in range(n):
+            shift[j] = 0.0
+        for _ in range(SWEEPS):
+            for j in range(n):
+                a, d = 0.0, 0.0
+                for r in range(n_residual):
+                    for q in range(n_columns):
+                        a += linear[r, q, j] * least_y[r, q]
+                        d += linear[r, q, j] ** 2
+                if d > 0.0:
+                    target = min(max(shift[j] - a / d, -h[j]), h[j])
+                    for r in range(n_residual):
+                        for q in range(n_columns):
+                            least_y[r, q] += linear[r, q, j] * (target - shift[j])
+                    shift[j] = target
+        found = 0.0
+        for attempt in range(2):
+            size = 0.0
+            for r in range(n_residual):
+                for q in range(n_columns):
+                    if attempt == 1:
+                        least_y[r, q] = y[r, q]
+                    size += least_y[r, q] ** 2
+            if size == 0.0:
+                continue
+            size = np.sqrt(size)
+            centre, remainder = 0.0, 0.0
+            for j in range(n):
+                cost[j] = 0.0
+            for r in range(n_residual):
+                for q in range(n_columns):
+                    a = least_y[r, q] / size
+                    centre += a * y[r, q]
+                    remainder += abs(a) * rest[r, q]
+                    for j in range(n):
+                        cost[j] += a * linear[r, q, j]
+            least = 0.0
+            for j in range(n):
+                least -= abs(cost[j]) * h[j]
+            for s in range(n_constraints):
+                least = max(least, _least_linear(cost, h, directions[s], slacks[s]))
+            bound = (centre + least - remainder) / np.sqrt(2.0)
+            if attempt == 0 or bound > found:
+                found = max(found, bound)
+                for j in range(n):
+                    score[j] = abs(cost[j]) * h[j]
+                    for r in range(n_residual):
+                        for q in range(n_columns):
+                            score[j] += 2.0 * abs(least_y[r, q]) / size * rest_by[r, q, j]
+        lower[cell] = found
+        for j in range(n):
+            a = 0.0
+            for i in range(n):
+                a += change[i, j]
+            score[j] *= 1.0 + a
+            if score[j] > score[axis[cell]] * 1.0000001:
+                axis[cell] = j
