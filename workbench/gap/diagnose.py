@@ -7,9 +7,11 @@ from threadpoolctl import threadpool_limits
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.force_localisation import placed
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.workers import Workers
+from workbench.gap.report.budget import Budget, budget_of
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.shrinkage import Shrinkage, measure
@@ -20,6 +22,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 RIVAL = 0.01  # probability from which a rival is worth an experiment
+TOLERANCE = 0.01  # of the signal: a gap that is worth no cause
 HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
 
 
@@ -34,6 +37,7 @@ def diagnose(
     workers: int | None = None,
     settle: float = 0.0,
     free_nominal: bool = False,
+    tolerance: float = TOLERANCE,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -49,7 +53,9 @@ def diagnose(
         workers: processes that share the work, this one included; None for one a core.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
-        free_nominal: fit the nominal frequencies, damping and modal mass along with every candidate from the first.
+        free_nominal: fit errors of the nominal model beside every effect from the first.
+        tolerance: of the signal's rms: a gap beyond the noise that is smaller in every record is reported, and not
+            explained; nor is one below a tenth of the noise.
 
     Raises:
         ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
@@ -73,13 +79,20 @@ def diagnose(
             sharing.aside(lambda: placed(nominal.without(_faulty(found.seen)))) as place,
             sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
         ):
-            attribution = attribute(found, catalogue=catalogue, report=report, free_nominal=free_nominal)
+            attribution = attribute(
+                found, catalogue=catalogue, report=report, free_nominal=free_nominal, tolerance=tolerance
+            )
             corrected = apply_all(rig, attribution.best.effects)
             shrinkage = measure(rig, corrected, validation, settle=settle)
             outcome = _outcome(attribution, shrinkage)
-            effects = attribution.best.effects if outcome in ("none", "explained") else ()
+            errors = next((e for e in attribution.best.effects if e.kind is NOMINAL_ERRORS), None)
+            named = tuple(e for e in attribution.best.effects if e is not errors)
+            effects = named if outcome in ("none", "explained") else ()
             faulty = _faulty(attribution.best.effects)
             as_seen = faulty == _faulty(found.seen)
+            budget = budget_of(
+                rig, effects, errors, validation or records, noise_found=attribution.noise, settle=settle
+            )
             return Verdict(
                 case=name,
                 outcome=outcome,
@@ -91,8 +104,9 @@ def diagnose(
                 nominal=rig,
                 attribution=attribution,
                 readiness=ready(),
+                budget=budget,
                 experiment=_next(rig, attribution, sharing),
-                notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome)),
+                notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome, budget)),
             )
 
 
@@ -112,7 +126,8 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None) -> bool:
     """
     if shrinkage is None or _unpredictable(found):
         return False
-    left = any(shrinkage.after[n] ** 2 > (1.0 + LEFT) * shrinkage.floor[n] ** 2 for n in shrinkage.after)
+    noise_power = max(found.noise_ratio, 1.0) ** 2
+    left = any(shrinkage.after[n] ** 2 > (1.0 + LEFT) * noise_power * shrinkage.floor[n] ** 2 for n in shrinkage.after)
     return left and shrinkage.overall < HELD_OUT
 
 
@@ -142,11 +157,14 @@ def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
     return None
 
 
-def _notes(found: Attribution, outcome: str) -> tuple[str, ...]:
+def _notes(found: Attribution, outcome: str, budget: Budget) -> tuple[str, ...]:
     names = _unpredictable(found)
     notes = []
     if outcome != found.outcome:
         notes.append("The nearest set explains the records it was fitted to, but not those it has not seen.")
+    remark = budget.noise_remark
+    if remark:
+        notes.append(remark)
     if "random_disturbance" in names:
         notes.append("A random disturbance leaves a remainder that no model can predict; its statistics were fitted.")
     if "sensor_quantisation" in names:

@@ -18,7 +18,8 @@ class BetweenSamples:
 
     Attributes:
         omega, damping: (n_modes,) of each mode alone.
-        start: (2, n_modes, n_intervals) displacement and velocity where each interval begins.
+        start: (2, n_modes, n_intervals) displacement and velocity where each interval begins; the last one begins with
+            the last sample.
         forces: (2, n_modes, n_intervals) p_0 and p_1.
         sample_time: s.
         rests: whether the motion begins at rest.
@@ -60,7 +61,9 @@ class BetweenSamples:
         gram += SETTLED * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(2)
         change = np.swapaxes(by_force, 1, 2) @ np.linalg.solve(gram, np.moveaxis(weight * missing, 1, 0))
         ends = np.moveaxis(change, 1, 0) + beside[:, :-1]
-        start = np.stack([displacement[:, :-1], velocity[:, :-1]])
+        # after the last sample its force is held
+        ends = np.concatenate([ends, np.stack([beside[:, -1:]] * 2)], axis=2)
+        start = np.stack([displacement, velocity])
         return cls(omega, own, start, ends, sample_time, not start[:, :, 0].any())
 
     def earlier(self, order: int, shape: np.ndarray, delay: float) -> np.ndarray:
@@ -68,12 +71,13 @@ class BetweenSamples:
 
         Args:
             order: 0 for displacement, 1 for velocity, 2 for acceleration.
+            delay: s; negative, by less than a sample, for what is read ahead.
         """
         n_intervals = self.start.shape[2]
         back = delay / self.sample_time
         whole = int(np.ceil(round(back, 9)))
         within = self.sample_time * (whole - back)
-        interval = np.arange(n_intervals + 1) - whole
+        interval = np.arange(n_intervals) - whole
         read = self._at(order, shape, within)[np.clip(interval, 0, n_intervals - 1)]
         early = np.flatnonzero(interval < 0)
         for k in early:  # before the record: at rest, or by the first interval drawn on backwards

@@ -28,7 +28,7 @@ class Sensor:
         gain: reading per truth.
         bias: constant offset.
         drift: offset gained over a record, from 0 at its first sample.
-        delay: s.
+        delay: s; negative, by less than a sample, where its clock is ahead of that of the inputs.
         time_constant: of a first-order lag, s.
         limit: readings stop at ± this.
         step: readings are multiples of this; 0 for none.
@@ -52,7 +52,9 @@ class Sensor:
         object.__setattr__(self, "at", same_place(self.at))
         if self.quantity not in MEASURED:
             raise ValueError(f"sensor {self.name}: quantity is one of {', '.join(MEASURED)}; got {self.quantity!r}")
-        for quantity in ("noise_std", "delay", "time_constant", "step"):
+        if not np.isfinite(self.delay):
+            raise ValueError(f"sensor {self.name}: delay must be finite; got {self.delay}")
+        for quantity in ("noise_std", "time_constant", "step"):
             if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
                 raise ValueError(f"sensor {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
         if not self.limit > 0:

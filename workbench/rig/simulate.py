@@ -86,9 +86,12 @@ class Motion:
     damping: np.ndarray
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
-        """The motion at any time, s."""
-        q, v, forces = self.displacement, self.velocity, self.forces
-        return BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time)
+        """The motion at any time, s; worked out once, since sensors of many delays may read one motion."""
+        if "_between_samples" not in self.__dict__:
+            q, v, forces = self.displacement, self.velocity, self.forces
+            found = BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time)
+            object.__setattr__(self, "_between_samples", found)
+        return self.__dict__["_between_samples"]
 
     @cached_property
     def acceleration(self) -> np.ndarray:

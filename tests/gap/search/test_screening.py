@@ -78,7 +78,7 @@ def test_what_the_numbers_of_a_given_effect_make_up_for_is_no_move(rig, search):
     given = (Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": 2000.0}),)
     evidence = Evidence.of(given[0].apply(rig), search.data, 20)
     found = Weighed.of(search, given, evidence)
-    along = slopes(rig, given, search.first_ahead)
+    along = slopes(rig, given, search.first_ahead)[1]
     assert np.abs(found.left @ along).max() < 1e-6 * np.linalg.norm(found.left) * np.linalg.norm(along)
     assert found.likeliest()[0].label == "sensor_gain[d3]"
     best = one_more(search, given, evidence, found)[0]

@@ -24,7 +24,7 @@ class Parameter:
         low, high: bounds, in the unit.
         logarithmic: fitted as its logarithm; for what is positive by nature.
         scale: a typical size, which makes the steps of a fit comparable.
-        prior_std: where the value at the start is believed, how far its free coordinate may stray.
+        prior_std: standard deviation of a normal prior on the free coordinate, centred at 0; None for none.
     """
 
     name: str
@@ -85,7 +85,7 @@ class Kind:
         targets: rig -> what it can act on: input or output names, "all", an end; (None,) where there is no choice.
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
-        last: whether it acts on the modes that all other effects have made.
+        first: whether it changes the nominal model itself, before any other effect acts on it.
     """
 
     name: str
@@ -96,7 +96,7 @@ class Kind:
     targets: Callable[[Rig], tuple] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
-    last: bool = False
+    first: bool = False
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -141,7 +141,7 @@ class Effect:
 
     @property
     def label(self) -> str:
-        return self.kind.name if self.target is None else f"{self.kind.name}[{self.target}]"
+        return f"{self.kind.name}[{self.target}]" if isinstance(self.target, str | int) else self.kind.name
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
@@ -150,7 +150,7 @@ def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
 
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
-    """The rig with every effect in it, in order, those that come last at the end."""
-    for effect in sorted(effects, key=lambda e: e.kind.last):
+    """The rig with every effect in it, in order, errors of the nominal model before all others."""
+    for effect in sorted(effects, key=lambda e: not e.kind.first):
         rig = effect.apply(rig)
     return rig

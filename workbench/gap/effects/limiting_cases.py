@@ -4,15 +4,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
-import numpy as np
-
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind, key_of, place_values
-from workbench.gap.effects.nominal import NOMINAL_FIGURES
+from workbench.gap.effects.effect import COORDINATES, Effect, key_of, place_values
 from workbench.gap.effects.nonlinear import BOUC_WEN, CLEARANCE, COULOMB_FRICTION
 from workbench.gap.effects.structural import (
     GROUND_SPRING,
-    MODAL_DAMPING,
-    MODULUS_ERROR,
     POINT_DAMPER,
     SUPPORT_ROTATION,
     TRUNCATED_MODES,
@@ -28,7 +23,7 @@ def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
 
     A clearance of no gap and a hysteretic spring that never yields are springs; friction far below its smoothing
     speed is a viscous damper; a hysteretic spring that always slides is friction; a spring beside a hinge is a hinge
-    that resists turning, by k a²; nominal figures that are off alike are one; one mode fewer is fewer.
+    that resists turning, by k a²; one mode fewer is fewer.
     """
     v = effect.values
     if effect.kind is COULOMB_FRICTION:
@@ -40,8 +35,6 @@ def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
         return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": v["stiffness"]}),)
     if effect.kind is GROUND_SPRING:
         return _turned_by(effect, rig)
-    if effect.kind is NOMINAL_FIGURES:
-        return (_all_alike(MODULUS_ERROR, effect, "frequency", 2.0), _all_alike(MODAL_DAMPING, effect, "damping", 1.0))
     if effect.kind is TRUNCATED_MODES and isinstance(effect.target, int) and effect.target - 1 > rig.modes.n_modes:
         return (Effect(TRUNCATED_MODES, effect.target - 1, {}),)
     return ()
@@ -55,12 +48,6 @@ def _turned_by(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
     if arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
         return ()
     return (Effect(SUPPORT_ROTATION, end, {"rotational_stiffness": v["stiffness"] * arm**2}),)
-
-
-def _all_alike(kind: Kind, figures: Effect, name: str, power: float) -> Effect:
-    """One factor for all modes instead of one each."""
-    factors = [np.log(value) for figure, value in figures.values.items() if figure.startswith(name)]
-    return Effect(kind, None, {"factor": float(np.exp(power * np.mean(factors)))})
 
 
 def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:

@@ -1,47 +1,165 @@
-"""Nominal figures that are merely a little off: frequencies, damping, modal mass; held near what was handed in."""
+"""Small errors of the nominal model: uncertain parameters with normal priors, marginalised beside every effect."""
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Kind, Parameter
-from workbench.gap.effects.structural import solved_once
+from workbench.gap.effects.effect import Effect, Kind, Parameter
+from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
 from workbench.rig.rig import Rig
+from workbench.structure.damping import ModalDamping
+from workbench.structure.modes import Shapes
+from workbench.structure.profile import Profile
 
-FREQUENCY_STD, DAMPING_STD, MASS_STD = 0.01, 0.25, 0.02
+WAVES = 9  # cosines of a smooth variation along the structure: the constant, and up to eight half waves
+PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
+MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
+WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
 
 
-def _names(n_modes: int) -> list[tuple[str, float, float]]:
-    """(name, standard deviation of its logarithm, largest factor) of every figure."""
-    figures = [(f"frequency_{r + 1}", FREQUENCY_STD, 1.06) for r in range(n_modes)]
-    figures += [(f"damping_{r + 1}", DAMPING_STD, 3.0) for r in range(n_modes)]
-    return [*figures, ("modal_mass", MASS_STD, 1.2)]
+@dataclass(frozen=True)
+class NominalPrior:
+    """Prior standard deviations of what may be a little off in a nominal model; 0 for what is exact.
+
+    Attributes:
+        stiffness, mass: relative, of each cosine along a structure whose profiles are known; of the modal mass else.
+        frequency: relative, of each natural frequency by itself.
+        damping: of the logarithm of each damping ratio.
+        delay: of each sensor, in samples.
+        sample_time: s.
+    """
+
+    stiffness: float = 0.0
+    mass: float = 0.0
+    frequency: float = 0.0
+    damping: float = 0.0
+    delay: float = 0.0
+    sample_time: float = 1.0
+
+    @property
+    def groups(self) -> tuple[str, ...]:
+        """Names of the groups that are uncertain."""
+        return tuple(name for name in GROUPS if getattr(self, name) > 0)
 
 
-def _adjusted(rig: Rig, _, values: dict[str, float]) -> Rig:
-    modes = rig.modes
-    n = min(modes.n_modes, len(values) // 2)
-    frequency, damping = np.ones(modes.n_modes), np.ones(modes.n_modes)
-    frequency[:n] = [values[f"frequency_{r + 1}"] for r in range(n)]
-    damping[:n] = [values[f"damping_{r + 1}"] for r in range(n)]
-    scale = np.sqrt(frequency * damping)
-    shapes, root = modes.shapes, np.sqrt(values["modal_mass"])
-    scaled = shapes if root == 1 else lambda located, derivative: shapes(located, derivative) / root
-    changed = replace(
-        modes, omega=modes.omega * frequency, damping=modes.damping * np.outer(scale, scale), shapes=scaled
+GROUPS = ("stiffness", "mass", "frequency", "damping", "delay")
+
+
+def group_of(parameter: str) -> str:
+    """The group that a parameter of the nominal errors belongs to."""
+    return parameter.split("_", 1)[0]
+
+
+def _parameters(rig: Rig, prior: NominalPrior) -> tuple[Parameter, ...]:
+    return tuple(_each(rig, prior))
+
+
+def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
+    def believed(name: str, std: float, unit: float, most: float = np.inf) -> Parameter:
+        reach = min(WIDEST * max(std, unit), most)
+        return Parameter(name, "", -reach, reach, scale=unit, prior_std=max(std / unit, 1e-6))
+
+    waves = WAVES if rig.structure is not None else 1
+    if prior.stiffness and rig.structure is not None:
+        yield from (believed(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
+    if prior.mass:
+        yield from (believed(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
+    modes = range(1, rig.modes.n_modes + 1)
+    if prior.frequency:
+        yield from (believed(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in modes)
+    if prior.damping:
+        yield from (believed(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
+    if prior.delay:
+        yield from (believed(f"delay_{s.name}", prior.delay, DELAY_UNIT, MOST_AHEAD) for s in rig.sensors)
+
+
+def _varied(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
+    """The profile times exp(Σ a_k cos(k π x / L))."""
+    if not amplitudes.any():
+        return profile
+    waves = np.pi * np.arange(amplitudes.size) / length
+    return Profile(
+        lambda x: profile.function(x) * np.exp(np.cos(np.multiply.outer(x, waves)) @ amplitudes), profile.breaks
     )
-    return replace(rig, modes=changed)
 
 
-NOMINAL_FIGURES = Kind(
-    name="nominal_figures",
+def _numbered(values: dict[str, float], group: str) -> np.ndarray:
+    return np.array([value for name, value in values.items() if group_of(name) == group])
+
+
+def _off_profiles(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
+    """The rig with the errors of its profiles, or of its modal mass."""
+    stiffness, mass = _numbered(values, "stiffness"), _numbered(values, "mass")
+    structure, modes = rig.structure, rig.modes
+    if structure is None:
+        factor = float(np.exp(-0.5 * mass[0])) if mass.any() else 1.0
+        return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, factor))) if mass.any() else rig
+    profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
+    changed: dict[str, Any] = {
+        name: _varied(getattr(structure, name), amplitudes, structure.length)
+        for name, amplitudes in profiles.items()
+        if amplitudes.any()
+    }
+    if not changed:
+        return rig
+    structure = replace(structure, **changed)
+    return replace(rig, structure=structure, modes=structure.modes(modes.n_modes, tolerance=RESOLUTION))
+
+
+_with_profiles = solved_once(_off_profiles)
+
+
+def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
+    """The rig with the errors in its structure and modes; only those of the profiles ask for new modes."""
+    along = {name: value for name, value in values.items() if group_of(name) in ("stiffness", "mass")}
+    rig = _with_profiles(rig, prior, along)
+    frequency, damping = _numbered(values, "frequency"), _numbered(values, "damping")
+    if not (frequency.any() or damping.any()):
+        return rig
+    structure, modes = rig.structure, rig.modes
+    stretch, more = np.exp(_padded(frequency, modes.n_modes)), np.exp(_padded(damping, modes.n_modes))
+    if structure is not None and isinstance(structure.damping, ModalDamping):
+        structure = replace(structure, damping=ModalDamping(modes.zeta * more))
+    root = np.sqrt(stretch * more)
+    modes = replace(modes, omega=modes.omega * stretch, damping=modes.damping * np.outer(root, root))
+    return replace(rig, structure=structure, modes=modes)
+
+
+def _scaled(shapes: Shapes, factor: float) -> Shapes:
+    return lambda located, derivative: factor * shapes(located, derivative)
+
+
+_solved = solved_once(_off_structure)
+
+
+def _off(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
+    """The rig with the errors in its structure, modes and sensors."""
+    rig = _solved(rig, prior, values)
+    late = {f"delay_{s.name}": s for s in rig.sensors if values.get(f"delay_{s.name}")}
+    if not late:
+        return rig
+    delays = {s: s.delay + values[name] * prior.sample_time for name, s in late.items()}
+    return replace(rig, sensors=tuple(replace(s, delay=delays[s]) if s in delays else s for s in rig.sensors))
+
+
+def _padded(values: np.ndarray, size: int) -> np.ndarray:
+    """The values with zeros behind them, or cut: (size,)."""
+    return np.r_[values, np.zeros(max(size - values.size, 0))][:size]
+
+
+def nominal_errors(rig: Rig, prior: NominalPrior) -> Effect:
+    """Errors of the nominal model, all of them zero, to be fitted beside effects."""
+    return Effect(NOMINAL_ERRORS, prior, {p.name: 0.0 for p in _parameters(rig, prior)})
+
+
+NOMINAL_ERRORS = Kind(
+    name="nominal_errors",
     path="structure",
-    parameters=lambda rig, _: tuple(
-        Parameter(name, "", 1.0 / most, most, logarithmic=True, prior_std=std)
-        for name, std, most in _names(rig.modes.n_modes)
-    ),
-    apply=solved_once(_adjusted),
-    starts=lambda evidence, _: [{name: 1.0 for name, _, _ in _names(evidence.rig.modes.n_modes)}],
-    phrase="nominal frequencies and damping ratios that are a little off",
-    last=True,
+    parameters=_parameters,
+    apply=_off,
+    starts=lambda evidence, _: [],
+    phrase="small errors of the nominal model",
+    first=True,
 )

@@ -62,6 +62,10 @@ class FitData:
         """The same yardstick with other substeps."""
         return replace(self, substeps=substeps)
 
+    def with_noise(self, noise: np.ndarray) -> "FitData":
+        """The same yardstick with other standard deviations of the sensors' noise (n_outputs,)."""
+        return replace(self, noise=noise)
+
     def through(self, whitener: ForceFilter, follower: Follower) -> "FitData":
         """The same yardstick beside a random force."""
         return replace(self, whitener=whitener, follower=follower)

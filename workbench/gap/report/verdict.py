@@ -9,9 +9,10 @@ import numpy as np
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
-from workbench.gap.effects.nominal import NOMINAL_FIGURES
+from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
 from workbench.gap.localisation.where import Where
+from workbench.gap.report.budget import Budget
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
 from workbench.gap.report.shrinkage import Shrinkage
@@ -19,6 +20,7 @@ from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 
+SHOWN = 0.005  # of the gap: what is less is not worth a word
 BESIDE = 0.02  # of the extent: as near as a place is asked for
 
 
@@ -29,7 +31,9 @@ class Verdict:
     Attributes:
         case: its name.
         outcome: "none" (no gap beyond noise), "explained", "part" (explained in part) or "unknown".
-        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown".
+        effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; errors of
+            the nominal model among it, where they were fitted beside.
+        budget: of the gap: shares of each effect, of errors of the nominal model, of noise and of what is unexplained.
         alternatives: (label of a rival set, probability), best first.
         where: the gap taken apart.
         shrinkage: on validation records; None without any.
@@ -51,13 +55,14 @@ class Verdict:
     nominal: Rig
     attribution: Attribution
     readiness: Readiness
+    budget: Budget
     experiment: Experiment | None = None
     notes: tuple[str, ...] = ()
 
     @property
     def _told(self) -> tuple[Effect, ...]:
         """The effects, rounding or clipping of every sensor told once."""
-        told = [e for e in self.effects if e.kind is not NOMINAL_FIGURES] or list(self.effects)
+        told = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
         for kind, field in ((SENSOR_QUANTISATION, "step"), (SENSOR_CLIPPING, "limit")):
             same = [e for e in told if e.kind is kind]
             if len(same) == len(self.nominal.sensors) > 1:
@@ -80,35 +85,62 @@ class Verdict:
         return any(domain.separation(effect.at, self.where.at) < near for effect in acting)
 
     @property
-    def nominal_figures(self) -> dict[str, float | None]:
-        """Factors on the nominal figures that were fitted along with the effects; empty where none were."""
-        freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES]
-        return _rounded_all(freed[0].values) if freed else {}
+    def nominal_errors(self) -> Effect | None:
+        """Errors of the nominal model that were fitted beside the effects; None where none were."""
+        return next((effect for effect in self.effects if effect.kind is NOMINAL_ERRORS), None)
 
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
+        named = [_described(effect, self.nominal) for effect in self._told]
+        words = " and ".join(named)
         if self.outcome == "none":
-            return "There is no gap beyond the noise of the sensors."
-        words = " and ".join(_described(effect, self.nominal) for effect in self._told)
+            if self.nominal_errors is None:
+                return "There is no gap beyond the noise of the sensors."
+            return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if any(effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION) for effect in self.effects):
-            verb = "accounts" if len(self._told) == 1 else "account"
+            verb = "accounts" if len(named) == 1 else "account"
             text = f"{words} {verb} for the gap, part of which nothing can predict."
         elif self.outcome == "explained":
-            text = f"{words} explain{'s' if len(self._told) == 1 else ''} {closed}the gap"
-            freed = [e for e in self.effects if e.kind is NOMINAL_FIGURES and e not in self._told]
-            text += f", with nominal figures a little off ({_off_by(freed[0])})" if freed else ""
-            text += self._not_excluded
+            shares = list(self.budget.effects.values())
+            if len(named) == 1:
+                text = f"{words} causes {_percent(sum(shares))} of the gap"
+            else:
+                each = " and ".join(_percent(share) for share in shares)
+                text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
+            text += self._rest + self._not_excluded
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
             if not any_beyond(self.effects):
-                text += f"; the nearest, {words}, would close {closed or 'part of '}it."
+                text += f"; the nearest, {words}, would close {closed or 'part of '}it." if words else "."
             elif self.alternatives:
                 text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
             else:
                 text += f"; {words} explains {closed}it."
         return text[0].upper() + text[1:]
+
+    @property
+    def _rest(self) -> str:
+        """What the effects do not cause, in words."""
+        parts = []
+        if self.nominal_errors is not None and self.budget.nominal >= SHOWN:
+            parts.append(f"{_percent(self.budget.nominal)} are small errors of the model{self._errors_in_words}")
+        if self.budget.unexplained >= SHOWN:
+            parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
+        if self.budget.noise >= SHOWN:
+            parts.append(f"{_percent(self.budget.noise)} is noise")
+        return "; " + ", ".join(parts) if parts else ""
+
+    @property
+    def _errors_in_words(self) -> str:
+        """Such as: (stiffness 0.4 %, damping 12 %)."""
+        sizes = self.budget.errors
+        words = [
+            f"{n.removesuffix('_percent')} {v:.2g} %" for n, v in sizes.items() if n.endswith("percent") and v > 0.01
+        ]
+        words += [f"sensors off by {v:.2g} ms" for n, v in sizes.items() if n == "delays_ms" and v > 0]
+        return f" ({', '.join(words)})" if words else ""
 
     @property
     def _not_excluded(self) -> str:
@@ -147,7 +179,12 @@ class Verdict:
                 "alike": [list(pair[:2]) for pair in self.readiness.alike],
             },
             "next_experiment": None if self.experiment is None else self.experiment.sentence,
-            "nominal_figures": self.nominal_figures,
+            "budget": self.budget.to_json(),
+            "nominal": _rounded_all(dict(self.budget.errors)),
+            "noise": {
+                "stated": [_rounded(v) for v in self.budget.noise_stated],
+                "found": [_rounded(v) for v in self.budget.noise_found],
+            },
             "notes": list(self.notes),
         }
 
@@ -220,9 +257,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
         if name not in COORDINATES
     ]
     text = effect.kind.words
-    if effect.kind is NOMINAL_FIGURES:
-        text += f" ({_off_by(effect)})"
-    elif effect.kind.name == "truncated_modes":
+    if effect.kind.name == "truncated_modes":
         text += f" ({effect.target} are needed, {nominal.modes.n_modes} are kept)"
     elif numbers:
         text += f" ({', '.join(n.strip() for n in numbers)})"
@@ -245,14 +280,10 @@ def place_in_words(where: Any, deviations: Mapping[str, float]) -> str:
     return f"at {where}" if isinstance(where, str) else f"at x = {_with_deviation(where, deviations.get('at', 0.0))}"
 
 
-def _off_by(figures: Effect) -> str:
-    """How far the nominal figures are off: frequencies -0.5 to 0.6 %, damping ratios -10 to 13 %."""
-    ranges = []
-    for one, more, name in (("frequency", "frequencies", "frequency"), ("damping ratio", "damping ratios", "damping")):
-        percent = [100.0 * (value - 1.0) for figure, value in figures.values.items() if figure.startswith(name)]
-        ends = f"{min(percent):.2g}", f"{max(percent):.2g}"
-        ranges.append(f"{one if len(percent) == 1 else more} {' to '.join(dict.fromkeys(ends))} %")
-    return ", ".join(ranges)
+def _percent(share: float) -> str:
+    """A share in per cent, with a digit more where it is small or nearly all."""
+    percent = 100.0 * share
+    return f"{percent:.1f} %" if 0.05 <= percent < 9.95 or 99.05 <= percent < 99.95 else f"{percent:.0f} %"
 
 
 def _with_deviation(value: float, deviation: float) -> str:

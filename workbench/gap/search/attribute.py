@@ -12,25 +12,28 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
+from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.beside_nominal import decide_beside_nominal, decide_with_figures_freed
 from workbench.gap.search.beside_random import decide_on_random
 from workbench.gap.search.decide import decide
 from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.one_law import one_law, unless_another, weighed_against
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
+from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 FINALISTS = 8  # single effects that are fitted to whole records
 BRIEFLY = 2  # iterations, where there may be no effect at all
 SHOWN = 7  # others that are, where they are to be shown beside them
+A_TENTH = 1.1**2 - 1.0  # of the noise by amplitude, as a share of its power
 ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
 
 
@@ -49,6 +52,7 @@ class Attribution:
         ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
         evidence: of the nominal rig.
         search: what was searched in, the records with the noise of rounded sensors among it.
+        noise: (n_outputs,) standard deviation of each sensor's noise as it was found, in its unit.
     """
 
     outcome: str
@@ -60,6 +64,12 @@ class Attribution:
     ahead: tuple[Fit, ...]
     evidence: Evidence
     search: Search
+    noise: np.ndarray
+
+    @property
+    def noise_ratio(self) -> float:
+        """Noise found over noise stated, the median of all sensors."""
+        return float(np.median(self.noise / self.search.data.noise))
 
     @cached_property
     def singles(self) -> tuple[Fit, ...]:
@@ -136,6 +146,7 @@ def attribute(
     catalogue: tuple[Kind, ...] = CATALOGUE,
     report: Callable[[str, float], None] = lambda text, share: None,
     free_nominal: bool = False,
+    tolerance: float = 0.0,
 ) -> Attribution:
     """Find the effects that turn the residual of a rig on its fit records into noise.
 
@@ -147,8 +158,9 @@ def attribute(
         found: before any effect is guessed.
         catalogue: kinds of effects to try.
         report: told (what, share done) as the search proceeds.
-        free_nominal: fit the nominal figures along with every candidate from the first, for a model that is known to be
-            a little off; otherwise they are freed where no set explains the records without.
+        free_nominal: fit errors of the nominal model beside every effect from the first, for a model that is known to
+            be a little off; otherwise where no single effect explains the records without.
+        tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.
     """
     seen, evidence = found.seen, found.evidence
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
@@ -160,8 +172,10 @@ def attribute(
     decision: Decision | None = None
     singles: list[Fit] = []
     ahead: list[Fit] = []
-    if free_nominal and not search.explains(start):
-        decision, singles = decide_with_figures_freed(search, start)
+    if not seen and _is_small(found.nominal, tolerance):
+        decision = Decision("none", start)
+    elif free_nominal and not search.explains(start):
+        decision = _beside_nominal_errors(search)
     elif not search.explains(start) and not _of_one_sensor(start):
         decision, singles = decide_on_random(search, evidence)
     if decision is None:
@@ -174,10 +188,12 @@ def attribute(
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, ahead, weighed, evidence)
-    outcome, best, random, rivals = decision
+    outcome, best, random, rivals, noise = decision
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
+    if random is None:
+        best = with_intervals(search.rig, best, search.data, workers)
     report("done", 1.0)
     return Attribution(
         outcome=outcome,
@@ -189,7 +205,29 @@ def attribute(
         ahead=tuple(ahead),
         evidence=found.nominal,
         search=search,
+        noise=noise_of(search, best) if noise is None and random is None else _stated(search, noise),
     )
+
+
+def _is_small(nominal: Evidence, tolerance: float) -> bool:
+    """Whether the gap beyond the noise is within a tolerance, or a tenth of the noise, in every record."""
+    for record, residual in zip(nominal.data.counted, nominal.residuals, strict=True):
+        scale = record.outputs.std(axis=1, keepdims=True)
+        floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
+        if float(((residual / scale) ** 2).mean()) - floor > max(tolerance**2, A_TENTH * floor):
+            return False
+    return tolerance > 0
+
+
+def _stated(search: Search, noise: np.ndarray | None) -> np.ndarray:
+    return search.data.noise if noise is None else noise
+
+
+def noise_of(search: Search, best: Fit) -> np.ndarray:
+    """Standard deviation of each sensor's noise (n_outputs,), by what a set leaves."""
+    rig = apply_all(search.rig, best.effects)
+    both = zip(search.data.counted, search.data.predictions(rig), strict=True)
+    return noise_found([record.outputs - predicted for record, predicted in both])
 
 
 def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
@@ -214,15 +252,29 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
 
 
 def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighed, evidence: Evidence) -> Decision:
-    """What a second effect explains, or one law that the catalogue does not hold, or figures that are a little off."""
+    """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
+    beside = Stepwise(search)
+    if beside.explains(beside.last):
+        return beside.decision()
     law = one_law(search, evidence)
     pairs = Pairs(search)
     explained = pairs.at_once(weighed)
     if law is not None:
         return weighed_against(law, search, pairs.decision(start))
-    if explained or pairs.by_exchange():
+    if explained:
         return pairs.decision(start)
-    return decide_beside_nominal(search, start, pairs) or pairs.one_by_one(start, ahead)
+    beside.run()
+    decision = beside.decision()
+    if decision.outcome != "explained" and pairs.by_exchange():
+        return pairs.decision(start)
+    return decision
+
+
+def _beside_nominal_errors(search: Search) -> Decision:
+    """What holds beside errors of the nominal model."""
+    beside = Stepwise(search)
+    beside.run()
+    return beside.decision()
 
 
 def _telling(data: FitData, start: Fit) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all, key_of
 from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
@@ -66,13 +67,18 @@ def finite_residual(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.nd
 class _Problem:
     """The residual as a function of the free coordinates of all parameters of all effects."""
 
-    def __init__(self, rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()):
+    def __init__(
+        self,
+        rig: Rig,
+        effects: Sequence[Effect],
+        data: FitData,
+        held: Sequence[Effect] = (),
+        workers: Workers = ALONE,
+    ):
+        self.workers = workers
         self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
         self.coarse = data.stepped(min(SLOPE_SUBSTEPS, data.substeps))
-        self.parameters: list[tuple[int, Parameter]] = []
-        base = rig
-        for i, effect in enumerate(self.effects):
-            self.parameters += [(i, p) for p in effect.parameters(base)]
+        self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
         floor = [
             1e-2 if p.logarithmic or p.name in COORDINATES else 1e-3 * abs(z) + 1e-9
@@ -84,7 +90,6 @@ class _Problem:
         # a believed value is one more measurement: of itself, by its own standard deviation
         self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
         self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
-        self.centre = np.array([self.parameters[j][1].to_free(1.0) for j in self.believed])
 
     @cached_property
     def is_coarsened(self) -> bool:
@@ -102,7 +107,7 @@ class _Problem:
         residual = finite_residual(self.rig, (*self.at(free), *self.held), data)
         if residual is None or not self.believed:
             return residual
-        return np.r_[residual, (free[self.believed] - self.centre) / self.prior_std]
+        return np.r_[residual, free[self.believed] / self.prior_std]
 
     def near(self, free: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, bool]:
         """The residual that slopes start from, and whether it is by coarser steps of time, as it is for a stepped rig.
@@ -114,8 +119,9 @@ class _Problem:
 
     def jacobian(self, free: np.ndarray, residual: np.ndarray, coarsely: bool) -> np.ndarray:
         """Differences from the residual that `near` gives."""
-        columns = []
-        for j, (_, parameter) in enumerate(self.parameters):
+
+        def column(j: int) -> np.ndarray:
+            parameter = self.parameters[j][1]
             step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
             moved = free.copy()
             moved[j] += step
@@ -125,26 +131,36 @@ class _Problem:
             if beside is None:
                 moved[j] = 2.0 * free[j] - moved[j]
                 beside = self.residual(moved, coarsely=coarsely)
-            columns.append(np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j]))
+            return np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j])
+
+        columns = self.workers.map(column, range(len(self.parameters)))
         return np.array(columns).reshape(-1, residual.size).T
 
 
-def slopes(rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = ()) -> np.ndarray:
-    """How the residual moves with each number of effects, in its free coordinate: (n_values, n_numbers).
+def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parameter]]:
+    """The parameters of effects in the order in which they are fitted, each with the index of its effect."""
+    return [(i, parameter) for i, effect in enumerate(effects) for parameter in effect.parameters(rig)]
+
+
+def slopes(
+    rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = (), workers: Workers = ALONE
+) -> tuple[np.ndarray, np.ndarray]:
+    """The residual (n_values,), and its derivative by each parameter of effects, in its free coordinate.
 
     Raises:
         ValueError: the rig cannot be simulated with these effects.
     """
-    problem = _Problem(rig, effects, data, held)
+    problem = _Problem(rig, effects, data, held, workers)
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
-    return problem.jacobian(problem.start, *problem.near(problem.start, residual))[: data.n_values]
+    jacobian = problem.jacobian(problem.start, *problem.near(problem.start, residual))
+    return residual[: data.n_values], jacobian[: data.n_values]
 
 
-def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData) -> np.ndarray:
+def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData, workers: Workers = ALONE) -> np.ndarray:
     """The slopes along the numbers of believed effects, each in units of its belief."""
-    return slopes(rig, effects, data) * _Problem(rig, effects, data).prior_std
+    return slopes(rig, effects, data, workers=workers)[1] * _Problem(rig, effects, data).prior_std
 
 
 def fit(
@@ -155,6 +171,7 @@ def fit(
     held: Sequence[Effect] = (),
     iterations: int = 25,
     tolerance: float = 1e-5,
+    workers: Workers = ALONE,
 ) -> Fit:
     """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
 
@@ -165,8 +182,9 @@ def fit(
         held: effects that are there too, and stay as they are.
         iterations: at most.
         tolerance: relative decrease of the cost at which to stop.
+        workers: processes that share the sensitivities, where they are many.
     """
-    problem = _Problem(rig, effects, data, held)
+    problem = _Problem(rig, effects, data, held, workers)
     free = problem.start.copy()
     residual = problem.residual(free)
     if residual is None:

@@ -15,6 +15,7 @@ class Decision(NamedTuple):
     best: Fit
     random: RandomForceFit | None = None
     rivals: tuple[tuple[Fit, float], ...] = ()
+    noise: np.ndarray | None = None
 
 
 def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) -> Decision:

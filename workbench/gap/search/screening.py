@@ -77,7 +77,7 @@ class Weighed:
             moves[row] = moves[i]
         moves = moves[: len(telling)]
         if given and telling:
-            basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[thin])
+            basis, _ = np.linalg.qr(slopes(search.rig, given, data, held=search.held)[1][thin])
             left = left - basis @ (basis.T @ left)
             for row in moves:
                 row -= basis @ (basis.T @ row)

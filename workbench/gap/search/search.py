@@ -11,6 +11,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Follower
+from workbench.gap.prediction.noise import logging_noise_power
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
@@ -116,8 +117,13 @@ class Search:
 
     def beside(self, figures: Effect) -> "Search":
         """The same search beside believed figures, which give way to every candidate to first order."""
-        data = self.data.giving_way(sensitivity(self.rig, (figures,), self.data))
+        data = self.data.giving_way(sensitivity(self.rig, (figures,), self.data, self.workers))
         return replace(self, data=data, held=(figures,))
+
+    @cached_property
+    def logging_noise(self) -> np.ndarray:
+        """Power that noise of the logged inputs leaves (n_records, n_outputs); see `logging_noise_power`."""
+        return logging_noise_power(self.rig, self.data)
 
     @cached_property
     def ahead(self) -> FitData:
@@ -131,7 +137,7 @@ class Search:
 
     def _ahead(self, data: FitData) -> FitData:
         data = data.following(self.rig)
-        return data.giving_way(sensitivity(self.rig, self.held, data)) if self.held else data
+        return data.giving_way(sensitivity(self.rig, self.held, data, self.workers)) if self.held else data
 
     def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
         """`function(search, candidate)` of each, in their order."""

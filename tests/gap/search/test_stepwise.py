@@ -1,0 +1,115 @@
+"""A nominal model that is a little wrong everywhere: small errors are kept apart from effects that the model lacks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
+from workbench.gap.prediction.noise import noise_found
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.search.fit import cost_of, fit, sensitivity
+from workbench.rig.elements import CoulombFriction
+from workbench.rig.rig import Rig
+from workbench.structure.damping import ModalDamping
+
+NOISE = 1e-5
+DAMPING = np.array([1.1, 0.95, 1.08, 0.9])
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(n_modes=4)
+
+
+def off(rig: Rig) -> Rig:
+    """The rig with a smooth variation of its stiffness and mass, and each damping ratio off by itself."""
+    beam, length = rig.structure, rig.modes.length
+    real = replace(
+        beam,
+        bending_stiffness=lambda x: beam.bending_stiffness(x) * (1.0 + 0.02 * np.cos(2 * np.pi * x / length)),
+        mass_per_length=lambda x: beam.mass_per_length(x) * (1.0 - 0.015 * np.cos(np.pi * x / length)),
+        damping=ModalDamping(0.01 * DAMPING),
+    )
+    return replace(rig, structure=real, modes=real.modes(rig.modes.n_modes))
+
+
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real, name, level, seed):
+        rng = np.random.default_rng(seed)
+        return record_of(real, np.repeat(level * rng.normal(size=200), 5)[None], rng, name=name, substeps=8)
+
+    return make
+
+
+@pytest.fixture(scope="module")
+def records(measured):
+    return lambda real: [measured(real, "low", 0.1, 0), measured(real, "high", 1.0, 1)]
+
+
+def test_residual_gives_way_to_errors_as_a_fit_of_them_would(rig, records):
+    """To first order the projected cost is what least squares over the errors, with their priors, leaves."""
+    data = FitData(tuple(records(off(rig))), np.full(4, NOISE))
+    errors = nominal_errors(rig, NominalPrior(stiffness=0.02, mass=0.02, damping=0.2))
+    freed = fit(rig, (errors,), data).effects
+    jacobian, residual = sensitivity(rig, freed, data), data.residual(apply_all(rig, freed))
+    projected = data.giving_way(jacobian)
+    k = jacobian.shape[1]
+    stacked = np.linalg.lstsq(np.r_[jacobian, np.eye(k)], np.r_[residual, np.zeros(k)], rcond=None)[0]
+    left = residual - jacobian @ stacked
+    expected = (left @ left + stacked @ stacked) / residual.size
+    assert cost_of(rig, freed, projected) == pytest.approx(expected, rel=1e-6)
+    # and an error that others can stand for nearly vanishes
+    moved = (replace(freed[0], values={**freed[0].values, "damping_1": freed[0].values["damping_1"] + 0.05}),)
+    assert cost_of(rig, moved, data) > 3.0 > 1.2 > cost_of(rig, moved, projected)
+
+
+def test_small_errors_alone_are_no_effect(rig, measured, records):
+    real = off(rig)
+    verdict = diagnose(rig, records(real), validation=[measured(real, "held out", 0.6, 9)])
+    assert verdict.outcome == "none" and [e.kind for e in verdict.effects] == [NOMINAL_ERRORS]
+    assert verdict.to_json()["effects"] == [] and "small errors of the nominal model" in verdict.sentence
+    budget = verdict.budget
+    assert budget.nominal > 0.99 and budget.unexplained < 0.002
+    assert budget.nominal + budget.unexplained + budget.noise == pytest.approx(1.0)
+    found = np.exp([verdict.nominal_errors.values[f"damping_{r}"] for r in (1, 2, 3)])
+    np.testing.assert_allclose(found, DAMPING[:3], rtol=0.02)
+
+
+def test_friction_beside_small_errors(rig, measured, records):
+    """Fitted before it is known, the damping ratios would take the friction for theirs."""
+    truth = CoulombFriction(1.37, 0.004, 1e-3)
+    real = off(replace(rig, elements=(truth,)))
+    verdict = diagnose(rig, records(real), validation=[measured(real, "held out", 0.6, 9)])
+    (named,) = (e for e in verdict.effects if e.kind is not NOMINAL_ERRORS)
+    assert verdict.outcome == "explained" and named.kind.name == "coulomb_friction"
+    force, at = named.values["force"], named.values["at"]
+    assert abs(force - truth.force) < 3.0 * named.deviations["force"] + 1e-3 * truth.force
+    assert abs(at - truth.at) < 0.01 and verdict.shrinkage.overall > 0.98
+    assert sum(verdict.budget.effects.values()) + verdict.budget.nominal > 0.99
+
+
+def test_noise_that_was_stated_too_small_is_found(rig, measured):
+    """The noise is 1.7 times the stated one and nothing hides: no effect is named, and the noise is remarked."""
+    stated = replace(rig, sensors=tuple(replace(s, noise_std=NOISE / 1.7) for s in rig.sensors))
+    verdict = diagnose(stated, [measured(rig, "low", 0.1, 3), measured(rig, "high", 1.0, 4)])
+    assert verdict.outcome == "none" and not verdict.to_json()["effects"]
+    assert verdict.budget.noise_ratio == pytest.approx(1.7, rel=0.05)
+    assert any("1.7 times the stated" in note for note in verdict.notes)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9])
+def test_noise_is_found_beside_resonances_and_in_colours(memory):
+    """White or coloured noise beside a narrow resonance a hundred times as strong; colour costs a quarter."""
+    from scipy.signal import lfilter
+
+    rng = np.random.default_rng(5)
+    noise = lfilter([np.sqrt(1 - memory**2)], [1.0, -memory], rng.standard_normal((3, 2, 4000)), axis=2)
+    ringing = np.sin(0.4 * np.arange(4000)) * np.exp(-np.arange(4000) / 2000)
+    records = [noise[0] + 10 * ringing, noise[1] + 30 * ringing, noise[2]]
+    assert noise_found(records) == pytest.approx([1.0, 1.0], rel=0.25 if memory else 0.08)
+    if memory == 0.0:
+        assert noise_found(records[:2]) == pytest.approx([1.0, 1.0], rel=0.15)

@@ -1,0 +1,57 @@
+"""A late sensor reads what a prompt one read before, between samples too."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+FINE = 10
+
+
+@pytest.fixture(scope="module")
+def rig():
+    beam = Beam(
+        length=2.0,
+        mass_per_length=1.0,
+        bending_stiffness=4.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    sensors = [Sensor(quantity, 0.7, quantity) for quantity in ("displacement", "velocity", "acceleration")]
+    return Rig(beam.modes(4), [Actuator("F", 0.45)], sensors)
+
+
+@pytest.mark.parametrize("elements", [(), (CubicSpring(1.1, 50.0),)], ids=["linear", "cubic"])
+@pytest.mark.parametrize("share", [-0.4, 0.3, 0.5, 0.9, 1.4])
+def test_a_late_sensor_reads_the_motion_between_samples(rig, elements, share):
+    """Truth: the same motion on a grid ten times as fine. The fourth mode has eight samples a period."""
+    dt = 2 * np.pi / rig.modes.omega[3] / 8.0
+    rng = np.random.default_rng(1)
+    inputs = rng.standard_normal((1, 200))
+    rig = replace(rig, elements=elements)
+    fine = simulate(rig, np.repeat(inputs, FINE, axis=1), sample_time=dt / FINE, substeps=8).outputs
+    late = replace(rig, sensors=tuple(replace(s, delay=share * dt) for s in rig.sensors))
+    read = simulate(late, inputs, sample_time=dt, substeps=80).outputs
+    back = round(share * FINE)
+    if back < 0:
+        expected = np.array([y[-back::FINE] for y in fine])
+    else:
+        expected = np.array([np.r_[np.zeros(back), y][: y.size][::FINE] for y in fine])
+    error = np.abs(read - expected)[:, 2:].max(axis=1) / np.abs(expected).max(axis=1)
+    assert (error < (2e-3, 2e-3, 1e-2)).all(), error
+
+
+def test_a_sensor_late_by_whole_samples_is_shifted(rig):
+    inputs = np.random.default_rng(2).standard_normal((1, 100))
+    late = replace(rig, sensors=tuple(replace(s, delay=0.02) for s in rig.sensors))
+    read, prompt = (simulate(r, inputs, sample_time=0.01).outputs for r in (late, rig))
+    np.testing.assert_allclose(read[:, 2:], prompt[:, :-2], atol=1e-12 * np.abs(prompt).max())

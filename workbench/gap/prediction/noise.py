@@ -1,0 +1,77 @@
+"""The noise of each sensor, found from what a fitted model leaves of several records."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from workbench.gap.prediction.residuals import FitData
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import simulate
+
+MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
+LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
+REACH, QUIET = 5, 0.25  # bands to either side, and their quantile: modes leave a quarter of them free of peaks
+LOWER = 0.67  # deviations by which that quantile lies below the mean
+LOUD = 0.5  # of the mean square: peaks that hold less are not worth leaving out
+
+
+def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Standard deviation of each sensor's noise (n_outputs,), in the sensors' units.
+
+    Noise is as strong in every record, while what a model lacks goes with the level; so the noise is at most the least
+    of all records; and errors of a model make peaks about its modes, so the noise is at most what lies under them in
+    a spectrum that is smooth otherwise, white or coloured.
+
+    Args:
+        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+    """
+    return np.sqrt(np.min([_power(residual) for residual in residuals], axis=0))
+
+
+def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
+    """Mean square (n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors' noise.
+
+    For white noise of each input, as strong as the input itself; inputs at rest have none. The structure smooths it,
+    so one draw of a record's length tells its power to a few per cent.
+
+    Args:
+        rig: nominal.
+        data: fit records.
+    """
+    rng = np.random.default_rng(0)
+    rows = []
+    for record in data.counted:
+        rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
+        noise = rms * rng.standard_normal(record.inputs.shape)
+        response = simulate(replace(rig, elements=()), noise, sample_time=record.sample_time).outputs
+        rows.append((response**2).mean(axis=1) / data.noise**2)
+    return np.array(rows)
+
+
+def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np.ndarray) -> float:
+    """Noise of the logged inputs as a share of their rms: what accounts for the median of what exceeds the sensors'.
+
+    Args:
+        by_channel: (n_records, n_outputs) mean squares of what is left, in units of the stated noise.
+        sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
+        per_unit: of `logging_noise_power`.
+    """
+    share = np.median(np.maximum(by_channel - sensor_noise, 0.0) / np.maximum(per_unit, 1e-300))
+    return float(min(np.sqrt(share), MOST_LOGGED))
+
+
+def _power(residual: np.ndarray) -> np.ndarray:
+    """Mean square (n_outputs,), or that under the peaks of the spectrum where it is far less."""
+    whole = (residual**2).mean(axis=1)
+    n_outputs, n_samples = residual.shape
+    window = np.hanning(n_samples)
+    spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
+    bands = max(spectrum.shape[1] // LINES, 1)
+    means = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
+    reach = min(REACH, (bands - 1) // 2)
+    around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
+    floor = np.quantile(around, QUIET, axis=2) * (1.0 + LOWER / np.sqrt(LINES))
+    under = np.minimum(means, floor).mean(axis=1)
+    return np.where(under < LOUD * whole, under, whole)

@@ -1,0 +1,180 @@
+"""The budget of a gap: how much of it each effect causes, small errors of the model, noise, and nothing known."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.nominal import group_of
+from workbench.gap.effects.ports import SENSOR_QUANTISATION
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import simulate
+
+REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
+IN_PERCENT = ("stiffness", "mass", "frequency", "damping")
+PLURAL = {"stiffness": "stiffness", "mass": "mass", "frequency": "frequencies", "damping": "damping"}
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """Shares of the mean square of the nominal residual, which sum to one.
+
+    Attributes:
+        effects: share that each named effect takes away, by label, in the order in which they count.
+        nominal: share that small errors of the nominal model take away beyond them.
+        unexplained: share that is left and is not noise.
+        noise: share of the sensors' noise.
+        by_record: the same four shares (n_shares,) of each record by name, effects first.
+        errors: root mean squares of the small errors: "frequencies_percent", "delays_ms" and so on.
+        noise_stated, noise_found: (n_outputs,) standard deviation of each sensor's noise, in its unit.
+        sensors: (n_outputs,) names.
+    """
+
+    effects: Mapping[str, float]
+    nominal: float
+    unexplained: float
+    noise: float
+    by_record: Mapping[str, np.ndarray] = field(repr=False)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    noise_stated: tuple[float, ...] = ()
+    noise_found: tuple[float, ...] = ()
+    sensors: tuple[str, ...] = ()
+
+    @property
+    def noise_ratio(self) -> float:
+        """Noise found over noise stated, the median of all sensors."""
+        return float(np.median(np.array(self.noise_found) / np.array(self.noise_stated)))
+
+    @property
+    def noise_remark(self) -> str | None:
+        """A remark where the noise found and the noise stated disagree."""
+        ratio = self.noise_ratio
+        if 1.0 / REMARKED < ratio < REMARKED:
+            return None
+        return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
+
+    def to_json(self) -> dict:
+        """Plain numbers, as the case format asks for them."""
+        return {
+            "effects": {label: _rounded(share) for label, share in self.effects.items()},
+            "nominal": _rounded(self.nominal),
+            "unexplained": _rounded(self.unexplained),
+            "noise": _rounded(self.noise),
+        }
+
+
+def budget_of(
+    rig: Rig,
+    effects: Sequence[Effect],
+    errors: Effect | None,
+    records: Sequence[Record],
+    *,
+    noise_found: np.ndarray,
+    settle: float = 0.0,
+    substeps: int = 8,
+) -> Budget:
+    """Take the mean square of the nominal residual apart.
+
+    Each sensor counts by the standard deviation of its readings, as in the gap of a record. Effects come in the order
+    of what they take away, each beside those before it. What effects and errors of the nominal model take away
+    together is shared between them by the mean over both orders (Shapley 1953): beside large errors, an effect alone
+    may take away nothing, and beside it they take away the less.
+
+    Args:
+        rig: nominal.
+        effects: that were named.
+        errors: of the nominal model, where they were fitted.
+        records: held out of the fit, or those fitted where none were.
+        noise_found: (n_outputs,).
+        settle: seconds at the start of each record that do not count.
+        substeps: of a sample, where the rig is not linear.
+    """
+
+    def squares(chosen: Sequence[Effect]) -> np.ndarray:
+        """Mean square (n_records,) of what is left with these effects."""
+        real = apply_all(rig, chosen)
+        return np.array([_mean_square(real, record, settle, substeps) for record in records])
+
+    nominal = squares(())
+    order, rows, left = _in_order(effects, nominal, squares)
+    if errors is not None:
+        with_errors, alone = squares((*order, errors)), squares((errors,))
+        by_effects = 0.5 * ((nominal - left) + (alone - with_errors))
+        split = np.array(rows).reshape(len(order), len(records))
+        rows = list(split * (by_effects / np.where(split.sum(axis=0) == 0, 1.0, split.sum(axis=0))))
+        rows.append(nominal - with_errors - np.sum(rows, axis=0))
+        left = with_errors
+    else:
+        rows.append(np.zeros_like(left))
+    noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
+    rest = left - noise
+    for i, effect in enumerate(order):  # what no model can predict is theirs
+        if effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION):
+            rows[i], rest = rows[i] + rest, np.zeros_like(rest)
+    shares = np.array([*rows, rest, noise])
+    whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)
+    whole = whole / max(whole.sum(), 1e-300)
+    by_record = {r.name: shares[:, i] / max(nominal[i], 1e-300) for i, r in enumerate(records)}
+    return Budget(
+        effects={effect.label: float(share) for effect, share in zip(order, whole, strict=False)},
+        nominal=float(whole[-3]),
+        unexplained=float(whole[-2]),
+        noise=float(whole[-1]),
+        by_record=by_record,
+        errors=sizes_of(errors),
+        noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
+        noise_found=tuple(noise_found.tolist()),
+        sensors=tuple(s.name for s in rig.sensors),
+    )
+
+
+def _in_order(effects, nominal, squares) -> tuple[list[Effect], list[np.ndarray], np.ndarray]:
+    """Effects by what they take away, what each takes away of every record, and what they leave."""
+    waiting, order, rows, left = list(effects), [], [], nominal
+    while waiting:
+        trials = [squares((*order, effect)) for effect in waiting]
+        best = int(np.argmin([trial.sum() for trial in trials]))
+        rows.append(left - trials[best])
+        left = trials[best]
+        order.append(waiting.pop(best))
+    return order, rows, left
+
+
+def _mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> float:
+    lead = round(settle / record.sample_time)
+    measured = record.outputs[:, lead:]
+    predicted = simulate(rig, record.inputs, sample_time=record.sample_time, substeps=substeps).outputs[:, lead:]
+    return float((((measured - predicted) / _scale(measured)) ** 2).mean())
+
+
+def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
+    measured = record.outputs[:, round(settle / record.sample_time) :]
+    return float(((noise[:, None] / _scale(measured)) ** 2).mean())
+
+
+def _scale(measured: np.ndarray) -> np.ndarray:
+    scale = measured.std(axis=1, keepdims=True)
+    return np.where(scale > 0, scale, 1.0)
+
+
+def sizes_of(errors: Effect | None) -> dict[str, float]:
+    """Root mean squares of the errors of a nominal model, by group; of delays about their mean, in ms."""
+    if errors is None:
+        return {}
+    values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*IN_PERCENT, "delay")}
+    sizes = {
+        f"{PLURAL[group]}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
+        for group in IN_PERCENT
+        if values[group]
+    }
+    if values["delay"]:
+        sample_time = getattr(errors.target, "sample_time", 1.0)
+        sizes["delays_ms"] = 1e3 * sample_time * float(np.sqrt(np.mean(np.square(values["delay"]))))
+    return sizes
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")

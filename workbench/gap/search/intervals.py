@@ -1,0 +1,74 @@
+"""Standard deviations of fitted parameters that hold where the model is a little wrong too."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.gap.effects.effect import Effect
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.search.fit import Fit, parameters_of, slopes
+from workbench.rig.rig import Rig
+
+BLOCKS = 12  # a record: long beside the correlation of what is left, many enough to scatter
+NEUTRAL = {"factor": 1.0, "gain": 1.0}  # what changes nothing; 0 for all others
+NO_STRENGTH = ("at", "x", "y", "phase", "width", "frequency", "exponent", "smoothing_speed", "yield_displacement")
+STANDS_OUT = 2.0  # deviations
+
+
+def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE) -> Fit:
+    """The fit with standard deviations by which 95 % intervals hold although what is left is not white.
+
+    With J the sensitivities, r what is left, in units of the noise, and P the precision of the priors,
+
+        cov = A⁻¹ (Σ_b J_bᵀ r_b r_bᵀ J_b + s² P) A⁻¹,    A = Jᵀ J + s² P,    s² = max(|r|² / n, 1)
+
+    over blocks b of each record (White, Econometrica 48 (1980) 817; blocks after Liang & Zeger, Biometrika 73 (1986)
+    13), or s² A⁻¹ where that is larger.
+
+    Args:
+        rig: nominal.
+        found: effects, and errors of the nominal model where they were fitted too.
+        data: fit records.
+        workers: processes that share the work.
+    """
+    residual, jacobian = slopes(rig, found.effects, data, workers=workers)
+    if jacobian.shape[1] == 0:
+        return found
+    parameters = parameters_of(rig, found.effects)
+    level = max(float(residual @ residual) / residual.size, 1.0)
+    priors = np.array([0.0 if p.prior_std is None else 1.0 / p.prior_std**2 for _, p in parameters])
+    scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
+    jacobian, priors = jacobian / scale, priors / scale**2
+    inverse = np.linalg.pinv(jacobian.T @ jacobian + level * np.diag(priors), rcond=1e-12, hermitian=True)
+    scores = _scores(residual, jacobian, data)
+    spread = inverse @ (scores.T @ scores + level * np.diag(priors)) @ inverse
+    variances = np.maximum(np.diag(spread), level * np.diag(inverse)).clip(0.0)
+    deviations: list[dict[str, float]] = [{} for _ in found.effects]
+    for (i, parameter), deviation in zip(parameters, np.sqrt(variances) / scale, strict=True):
+        value = found.effects[i].values[parameter.name]
+        deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
+    effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
+    return replace(found, effects=tuple(effects))
+
+
+def _scores(residual: np.ndarray, jacobian: np.ndarray, data: FitData) -> np.ndarray:
+    """J_bᵀ r_b of every block: (n_blocks, n_parameters)."""
+    rows, start = [], 0
+    for record in data.counted:
+        n_outputs, n_samples = record.outputs.shape
+        part = slice(start, start + n_outputs * n_samples)
+        products = (residual[part, None] * jacobian[part]).reshape(n_outputs, n_samples, -1).sum(axis=0)
+        rows += [block.sum(axis=0) for block in np.array_split(products, min(BLOCKS, n_samples))]
+        start = part.stop
+    return np.array(rows)
+
+
+def is_significant(effect: Effect) -> bool:
+    """Whether any parameter beside the place stands out of its standard deviation; true where none was fitted."""
+    fitted = [
+        (value - NEUTRAL.get(name, 0.0), effect.deviations[name])
+        for name, value in effect.values.items()
+        if name not in NO_STRENGTH and effect.deviations.get(name, 0.0) > 0
+    ]
+    return not fitted or any(abs(strength) > STANDS_OUT * deviation for strength, deviation in fitted)
