@@ -30,6 +30,7 @@ ENGINES = {
     "casadi": {"design/placement/placement.py"},
     "matplotlib": {"draw/"},
     "pyuff": {"records/uff_file.py", "records/uff_modes.py"},
+    "nptdms": {"records/tdms_file.py"},
     "h5py": {"records/hdf5_file.py"},
     "typer": {"cli/"},
     "rich": {"cli/"},

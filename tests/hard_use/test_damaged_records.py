@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from workbench.cli.app import app
 from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_record, write_record
+from workbench.records.limits import Limits
 from workbench.records.record import Channel, Record
 
 ENDINGS = (".csv", ".npz", ".mat", ".h5", ".uff")
@@ -111,14 +112,15 @@ WAVE = np.array([1.0, -2.0, 3.0, -4.0, 5.0, 6.0])
         ("time,a\n0,1\n0.5,2\n1,3\n", {"a": [1, 2, 3]}),
         ("a,time\n1,0\n2,0.5\n", "sample_rate_hz"),
         ("time;a\n0;1\n0.5;2\n", {"a": [1, 2]}),
-        ("time;a\n0,0;1,5\n0,5;2,5\n", "not a number"),
+        ("time;a\n0,0;1,5\n0,5;2,5\n", {"a": [1.5, 2.5]}),
         ("time a\n0 1\n0.5   2\n", {"a": [1, 2]}),
         ("\ufefftime,a\n0,1\n0.5,2\n", {"a": [1, 2]}),
         ("time,a\r\n0,1\r\n0.5,2\r\n", {"a": [1, 2]}),
         ("time,a\r0,1\r0.5,2\r", {"a": [1, 2]}),
         ('time,"a, b"\n0,1\n0.5,2\n', {"a, b": [1, 2]}),
         ("# made by hand\ntime,a\n\n0,1\n# halt\n0.5,2\n", {"a": [1, 2]}),
-        ("time,a\ns,m\n0,1\n0.5,2\n", "'s' is not a number"),
+        ("time,a\ns,m\n0,1\n0.5,2\n", {"a": [1, 2]}),
+        ("time,a\ns,x\n0,1\n0.5,2\n", "'s' is not a number"),
         ("time,a\n0.5,2\n0,1\n1,3\n", "not uniformly sampled"),
         ("time,a\n0,1\n0,1\n0,1\n", "not uniformly sampled"),
         ("time,a\n1,1\n0.5,2\n0,3\n", "not uniformly sampled"),
@@ -181,7 +183,7 @@ ARRAYS = [
     ({"t": TIME, "time": TIME, "a": WAVE}, "two arrays of times"),
     ({"t": TIME, "a": np.where(WAVE == 3, np.nan, WAVE)}, "row 3: nan"),
     ({"t": TIME[::-1], "a": WAVE}, "not uniformly"),
-    ({"a": WAVE}, "tells no time"),
+    ({"a": WAVE}, "no sample instants"),
     ({"t": TIME, "record_channel_0": WAVE}, "do not belong together"),
     ({"t": TIME, "record_channel_0": WAVE, "record_header": "{}"}, "damaged"),
     ({"t": np.zeros(0), "a": np.zeros(0)}, "0 samples|no signals|0\\)"),
@@ -260,12 +262,12 @@ def test_what_is_huge_or_lies_elsewhere_is_not_read(tmp_path, ending, make, word
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ("import os, signal\ndef load(path): os.kill(os.getpid(), signal.SIGSEGV)\n", r"crashed on it \(SIGSEGV\)"),
-        ("def load(path):\n    while True: pass\n", "no end within 1 s"),
-        ("import numpy\ndef load(path): return {'a': numpy.ones(2**33)}\n", "more than 1.5 GiB"),
-        ("import os\ndef load(path): os._exit(9)\n", "process that reads it failed"),
-        ("def load(path): print('noise'); raise KeyError\n", "cannot be read as MAT: KeyError"),
-        ("import numpy\ndef load(path): return {'a': numpy.array([{}, 0])}\n", None),
+        ("import os, signal\ndef load(*_): os.kill(os.getpid(), signal.SIGSEGV)\n", r"crashed on it \(SIGSEGV\)"),
+        ("def load(path, limits):\n    while True: pass\n", "no end within [15] s"),
+        ("import numpy\ndef load(path, limits): return {'a': numpy.ones(2**33)}\n", "more than 1 GiB"),
+        ("import os\ndef load(path, limits): os._exit(9)\n", "process that reads it failed"),
+        ("def load(path, limits): print('noise'); raise KeyError\n", "cannot be read as MAT: KeyError"),
+        ("import numpy\ndef load(path, limits): return {'a': numpy.array([{}, 0])}\n", None),
     ],
     ids=["crash", "hang", "memory", "exit", "error", "objects"],
 )
@@ -274,14 +276,13 @@ def test_a_reader_that_crashes_hangs_or_devours_is_survived(tmp_path, monkeypatc
 
     (tmp_path / "hostile_reader.py").write_text(body)
     monkeypatch.setattr(confined, "ROOT", str(tmp_path))
-    monkeypatch.setattr(confined, "LEAST_SECONDS", 1.0)
-    path = tmp_path / "x.mat"
+    path, limits = tmp_path / "x.mat", Limits(seconds=1.0)
     path.write_bytes(b"x")
     if words is None:
-        assert confined.load_confined("hostile_reader", path) == {}  # no pickles
+        assert confined.load_confined("hostile_reader", path, limits) == {}  # no pickles
     else:
         with pytest.raises(RecordFileError, match=words):
-            confined.load_confined("hostile_reader", path)
+            confined.load_confined("hostile_reader", path, limits)
 
 
 def test_no_file_beside_the_record_runs(tmp_path, monkeypatch):

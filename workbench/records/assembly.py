@@ -1,18 +1,45 @@
-"""A record out of the signals, times and description that a file held."""
+"""A record out of the signals, times and description that a file held.
+
+What other programs write is brought to SI and to equal time steps, with a remark for each change.
+"""
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from workbench.records.checksum import KEY, checksum
 from workbench.records.file_error import RecordFileError
 from workbench.records.record import Channel, Record
+from workbench.records.units import Unit, split_unit, unit_named
 
-UNIFORM = 1e-3
+UNIFORM = 1e-3  # of the time step
+# Steps between half and twice the median are resampled; a longer one is a gap, which nothing measured can fill.
+SHORTEST, LONGEST = 0.5, 2.0
+FINEST_ROUNDING = 10  # decimals of a second
+FEWEST_ODD = 3  # steps that differ from the others, where instants were rounded
 KINDS = ("input", "output")
+
+
+@dataclass(frozen=True, eq=False)
+class Sampling:
+    """When a record was sampled.
+
+    Attributes:
+        start, step: of its equal steps, s.
+        times: (n_samples,) the instants, where they are unequal and the signals are to be resampled; else None.
+        remarks: what was taken for granted or will be changed.
+    """
+
+    start: float
+    step: float
+    times: np.ndarray | None = None
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -25,7 +52,7 @@ class Description:
         sampling: (start, step), s; None where the times alone tell.
     """
 
-    channels: Mapping[str, Mapping]
+    channels: Mapping[str, Mapping[str, Any]]
     name: str | None = None
     sampling: tuple[float, float] | None = None
 
@@ -61,26 +88,34 @@ def record_of(
         if bad.any():
             row = int(np.argmax(bad))
             raise RecordFileError(f"{path}, channel {_name(key)!r}, row {row + 1}: {values[row]} is not a number")
-    start, step = _sampling(path, time, n_samples, told, sample_rate_hz)
-    names = [_name(key) for key in signals]
+    sampling = _sampling(path, time, n_samples, told, sample_rate_hz)
+    units = _units(key for key in signals if key not in told.channels)
+    names = {key: split_unit(_name(key))[0] if key in units else _name(key) for key in signals}
     for name in inputs:
-        if name not in names:
-            raise RecordFileError(f"{path} has no channel {name!r} to be an input; it has {', '.join(names)}")
-    kinds = {key: "input" if _name(key) in inputs else _kind(key, told) for key in signals}
+        if name not in names.values() and name not in map(_name, signals):
+            known = ", ".join(names.values())
+            raise RecordFileError(f"{path} has no channel {name!r} to be an input; it has {known}")
+    kinds = {key: "input" if names[key] in inputs or _name(key) in inputs else _kind(key, told) for key in signals}
     keys = {kind: [key for key in signals if kinds[key] == kind] for kind in KINDS}
     if not keys["output"]:
         raise RecordFileError(f"{path} holds inputs only; at least one output is needed")
-    rows = {kind: np.array([signals[key] for key in keys[kind]]) for kind in KINDS}
-    channels = {kind: tuple(_channel(path, key, told) for key in keys[kind]) for kind in KINDS}
+    rows = {kind: _rows([signals[key] for key in keys[kind]], [units.get(key) for key in keys[kind]], sampling)
+            for kind in KINDS}  # fmt: skip
+    channels = {
+        kind: tuple(_channel(path, names[key], told.channels.get(key, {}), units.get(key)) for key in keys[kind])
+        for kind in KINDS
+    }
+    remarks = [_unit_remark(names[key], split_unit(_name(key))[1], unit) for key, unit in units.items()]
     try:
         return Record(
-            sample_time=step,
+            sample_time=sampling.step,
             outputs=rows["output"],
             output_channels=channels["output"],
             inputs=rows["input"],
             input_channels=channels["input"],
-            start_time=start,
+            start_time=sampling.start,
             name=told.name or path.stem,
+            remarks=(*filter(None, remarks), *sampling.remarks),
         )
     except ValueError as error:
         raise RecordFileError(f"{path}: {error}") from error
@@ -106,7 +141,7 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
 
 def _n_samples(path: Path, time: np.ndarray | None, signals: Mapping[str, np.ndarray]) -> int:
     lengths = [values.size for values in signals.values()]
-    most = time.size if time is not None else max(set(lengths), key=lengths.count)
+    most = time.size if time is not None else Counter(lengths).most_common(1)[0][0]
     for key, length in zip(signals, lengths):
         if length != most:
             raise RecordFileError(f"{path}, channel {_name(key)!r} has {length} samples; the others have {most}")
@@ -135,43 +170,113 @@ def legible(path: Path, name: str) -> str:
     return name
 
 
-def _channel(path: Path, key: str, told: Description) -> Channel:
-    name, facts = legible(path, _name(key)), told.channels.get(key, {})
+def _channel(path: Path, name: str, facts: Mapping[str, Any], unit: Unit | None) -> Channel:
+    if unit is not None:
+        return Channel(legible(path, name), unit.quantity, unit.si)
+    quantity, symbol, at, noise = (facts.get(fact) for fact in ("quantity", "unit", "at", "noise_std"))
     try:
-        return Channel(name, facts.get("quantity", ""), facts.get("unit", ""), facts.get("at"), facts.get("noise_std"))
+        if not all(text is None or isinstance(text, str) for text in (quantity, symbol)):
+            raise TypeError(f"quantity and unit are words; got {quantity!r} and {symbol!r}")
+        if not all(number is None or isinstance(number, int | float) for number in (noise,)):
+            raise TypeError(f"noise_std is a number; got {noise!r}")
+        return Channel(legible(path, name), quantity or "", symbol or "", at, noise)
     except (TypeError, ValueError) as error:
         raise RecordFileError(f"{path}, channel {name!r}: {error}") from error
 
 
+def _units(keys: Iterable[str]) -> dict[str, Unit]:
+    """The units that names of signals end in; none for names that would be alike without them."""
+    split = {key: split_unit(_name(key)) for key in keys}
+    alike = Counter(base for base, _ in split.values())
+    found = {key: unit_named(text) for key, (base, text) in split.items() if text and alike[base] == 1}
+    return {key: unit for key, unit in found.items() if unit is not None and unit.quantity != "time"}
+
+
+def _unit_remark(name: str, written: str, unit: Unit) -> str:
+    if unit.si == "counts":
+        return f"{name}: in counts, whose size nobody says; modes have no scale"
+    return "" if unit.factor == 1.0 else f"{name}: {written} taken as {unit.factor:g} {unit.si}"
+
+
+def _rows(signals: Sequence[np.ndarray], units: Sequence[Unit | None], sampling: Sampling) -> np.ndarray:
+    """The signals one below the other, in SI and at equal steps; read-only, so that a record takes them as they are."""
+    rows = np.array(signals, float)
+    for row, unit in zip(rows, units, strict=True):
+        if unit is not None and unit.factor != 1.0:
+            row *= unit.factor
+        if sampling.times is not None:
+            row[:] = CubicSpline(sampling.times, row)(sampling.start + sampling.step * np.arange(row.size))
+    rows.flags.writeable = False
+    return rows
+
+
 def _sampling(
     path: Path, time: np.ndarray | None, n_samples: int, told: Description, sample_rate_hz: float | None
-) -> tuple[float, float]:
+) -> Sampling:
     if sample_rate_hz is not None and not 0 < sample_rate_hz < np.inf:
         raise RecordFileError(f"{path}: sample_rate_hz must be positive; got {sample_rate_hz}")
     if time is None:
         if sample_rate_hz is None:
-            raise RecordFileError(f"{path} tells no time; give sample_rate_hz")
-        return 0.0, 1.0 / sample_rate_hz
+            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz (--sample-rate-hz)")
+        return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {int(np.argmax(~np.isfinite(time))) + 1}: not a number")
-    with np.errstate(over="ignore", invalid="ignore"):
-        steps = np.diff(time)
-        step = float(np.median(steps))
-        even = np.abs(steps - step) <= UNIFORM * abs(step)
-    if not (0 < step < np.inf and even.all()):
-        row = int(np.argmin(even)) + 2
-        raise RecordFileError(
-            f"{path} is not uniformly sampled: row {row} comes {steps[row - 2]:g} s after the one before, the others"
-            f" {step:g} s; resample it first"
-        )
-    if sample_rate_hz is not None and abs(sample_rate_hz * step - 1.0) > UNIFORM:
-        raise RecordFileError(f"{path} is sampled at {1 / step:g} Hz, not at {sample_rate_hz:g} Hz")
+    sampling = _of_times(path, time, mend=told.sampling is None)
+    if sample_rate_hz is not None and abs(sample_rate_hz * sampling.step - 1.0) > UNIFORM:
+        raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
     if told.sampling is None:
-        return float(time[0]), float((time[-1] - time[0]) / (n_samples - 1))
+        return sampling
     start, said = told.sampling
+    step = sampling.step
     if not (abs(said - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
         raise RecordFileError(
             f"{path}: its description says a start at {start:g} s and steps of {said:g} s, its times {time[0]:g} s and"
             f" {step:g} s; mend or remove the description"
         )
-    return start, said
+    return replace(sampling, start=start, step=said)
+
+
+def _of_times(path: Path, time: np.ndarray, *, mend: bool) -> Sampling:
+    """Start and step of sample instants; unequal ones are rounded, or to be resampled, where they may be mended."""
+    start, n_samples = float(time[0]), time.size
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.diff(time)
+        median = float(np.median(steps))
+        even = np.abs(steps - median) <= UNIFORM * abs(median)
+        mean = float((time[-1] - time[0]) / (n_samples - 1))
+    if 0 < median < np.inf and even.all():
+        return Sampling(start, mean)
+    shortest, longest = float(steps.min()), float(steps.max())
+    if mend and 0 < mean < np.inf and shortest >= 0:
+        rounded = _rounded(time, steps)
+        if rounded is not None:
+            return rounded
+        if SHORTEST * median <= shortest and longest <= LONGEST * median and shortest > 0:
+            remark = f"unequal time steps, {shortest:g} to {longest:g} s: resampled every {mean:g} s by cubic splines"
+            return Sampling(start, mean, time, (remark,))
+    row = int(np.argmax(np.abs(np.nan_to_num(steps / median if median else steps, posinf=1e300, neginf=-1e300) - 1.0)))
+    raise RecordFileError(
+        f"{path} is not uniformly sampled: row {row + 2} comes {steps[row]:g} s after the one before, the others"
+        f" {median:g} s; fill the gap, or cut the record there"
+    )
+
+
+def _rounded(time: np.ndarray, steps: np.ndarray) -> Sampling | None:
+    """Equal steps whose instants were rounded to a power of ten when they were written; None where they were not."""
+    rounding = next((r for r in (10.0**-d for d in range(FINEST_ROUNDING)) if _are_multiples(time, r)), None)
+    if rounding is None:
+        return None
+    wholes = np.round(steps / rounding)
+    index = np.arange(time.size)
+    step, start = np.polyfit(index, time, 1)
+    # one or two odd steps are samples that are missing, not rounding
+    odd = wholes.size - Counter(wholes.tolist()).most_common(1)[0][1]
+    if odd < FEWEST_ODD or np.abs(time - (start + step * index)).max() > 0.6 * rounding:
+        return None
+    remark = f"times rounded to {rounding:g} s: taken as evenly sampled at {1 / step:.6g} Hz"
+    return Sampling(float(start), float(step), remarks=(remark,))
+
+
+def _are_multiples(time: np.ndarray, unit: float) -> bool:
+    scaled = time / unit
+    return bool(np.abs(scaled - np.round(scaled)).max() <= 1e-9 * max(np.abs(scaled).max(), 1.0))

@@ -1,16 +1,16 @@
 """Readers of other people's formats, each run in a process of its own, within limits of time and memory.
 
 A compiled reader can crash, hang or ask for all memory on bytes that no program wrote, and nothing inside the same
-process can catch that. The arrays come back as an NPZ without pickles, so nothing that is sent can run here.
+process can catch that. The arrays come back in a file, as an NPZ without pickles, so nothing that is sent can run here.
 """
 
-import io
 import json
 import math
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from importlib import import_module
 from pathlib import Path
@@ -19,13 +19,13 @@ from typing import Any
 import numpy as np
 
 from workbench.records.file_error import RecordFileError, unreadable
-from workbench.records.limits import MOST_MEMORY, check_arrays
+from workbench.records.limits import DEFAULT, Limits, check_arrays
 
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4
-LEAST_SECONDS = 8.0  # of processor time, so that a busy machine damages no file
-PATIENCE = 5.0  # as many times as long by the clock
-BYTES_PER_SECOND = 2e6  # of the slowest format, numbers as text
+LONGEST_REFUSAL = 10_000  # bytes
+PATIENCE = 5.0  # as many times as long by the clock as of processor time: a busy machine damages no file
+OVERHEAD = 2**29  # bytes of address space that the interpreter and its libraries take
 # -P keeps the working folder out of the path: a file there called numpy.py must not run
 CHILD = (
     "import sys; sys.path.append(sys.argv[1]); from workbench.records import confined; confined.serve(*sys.argv[2:])"
@@ -33,52 +33,61 @@ CHILD = (
 ROOT = str(Path(__file__).resolve().parents[2])
 
 
-def load_confined(module: str, path: Path) -> dict[str, np.ndarray]:
-    """The arrays that `load(path)` of a module finds in a file, by name and in its order.
+def load_confined(module: str, path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
+    """The arrays that `load(path, limits)` of a module finds in a file, by name and in its order.
 
     Raises:
         RecordFileError: the reader refused the file, crashed on it, took too long, or needed too much memory.
     """
-    seconds = LEAST_SECONDS + path.stat().st_size / BYTES_PER_SECOND
+    seconds = limits.seconds
     threads = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # each reserves address space
-    try:
-        ended = subprocess.run(
-            [sys.executable, "-P", "-c", CHILD, ROOT, module, str(path), str(seconds)],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=PATIENCE * seconds,
-            env=os.environ | threads,
-        )
-    except subprocess.TimeoutExpired:
-        raise RecordFileError(
-            f"{path} is damaged: its reader came to no end within {PATIENCE * seconds:.0f} s"
-        ) from None
-    if ended.returncode == 0:
-        with np.load(io.BytesIO(ended.stdout), allow_pickle=False) as archive:
-            return {name: archive[f"array_{i}"] for i, name in enumerate(json.loads(str(archive[NAMES])))}
-    if ended.returncode == REFUSED:
-        raise RecordFileError(ended.stdout.decode(errors="replace"))
+    with tempfile.TemporaryFile() as found:
+        try:
+            ended = subprocess.run(
+                [sys.executable, "-P", "-c", CHILD, ROOT, module, str(path), str(limits.memory), str(seconds)],
+                stdin=subprocess.DEVNULL,
+                stdout=found,
+                stderr=subprocess.PIPE,
+                timeout=PATIENCE * seconds,
+                env=os.environ | threads,
+            )
+        except subprocess.TimeoutExpired:
+            raise RecordFileError(
+                f"{path} is damaged or too large: its reader came to no end within {PATIENCE * seconds:.0f} s"
+            ) from None
+        found.seek(0)
+        if ended.returncode == 0:
+            with np.load(found, allow_pickle=False) as archive:
+                return {name: archive[f"array_{i}"] for i, name in enumerate(json.loads(str(archive[NAMES])))}
+        if ended.returncode == REFUSED:
+            raise RecordFileError(found.read(LONGEST_REFUSAL).decode(errors="replace"))
     if ended.returncode == NO_MEMORY:
-        raise RecordFileError(f"{path} is damaged or too large: it needs more than {MOST_MEMORY / 2**30:g} GiB to read")
+        raise RecordFileError(
+            f"{path} is damaged or too large: it needs more than {limits.memory / 2**30:g} GiB to read; cut the record,"
+            " take fewer channels, or allow more memory"
+        )
     if ended.returncode < 0:
         name = signal.Signals(-ended.returncode).name
         if name == "SIGXCPU":
-            raise RecordFileError(f"{path} is damaged: its reader came to no end within {seconds:.0f} s")
+            raise RecordFileError(
+                f"{path} is damaged or too large: its reader came to no end within {seconds:.0f} s; cut the record, or"
+                " write it as HDF5 or NPZ"
+            )
         raise RecordFileError(f"{path} is damaged: its reader crashed on it ({name})")
     said = ended.stderr.decode(errors="replace").strip().splitlines() or ["it says nothing"]
     raise RecordFileError(f"{path} cannot be read: the process that reads it failed: {said[-1]}")
 
 
-def serve(module: str, name: str, seconds: str) -> None:
+def serve(module: str, name: str, memory: str, seconds: str) -> None:
     """Read in this process, write the arrays, or why there are none, to its output, and end it."""
     out = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # some readers print
-    _confine(float(seconds))
-    path = Path(name)
+    limits, path = Limits(float(memory), float(seconds)), Path(name)
+    _confine(limits)
     try:
-        arrays = {key: np.asarray(values) for key, values in import_module(module).load(path).items()}
+        arrays = {key: np.asarray(values) for key, values in import_module(module).load(path, limits).items()}
         arrays = {key: values for key, values in arrays.items() if values.dtype.kind in "fiubcU"}
-        check_arrays(path, arrays.values())
+        check_arrays(path, arrays.values(), limits)
         sent: dict[str, Any] = {f"array_{i}": values for i, values in enumerate(arrays.values())}
         np.savez(out, **(sent | {NAMES: np.array(json.dumps([*arrays]))}))
         code = 0
@@ -92,14 +101,14 @@ def serve(module: str, name: str, seconds: str) -> None:
     os._exit(code)  # without the clean-up of libraries that a damaged file may have upset
 
 
-def _confine(seconds: float) -> None:
+def _confine(limits: Limits) -> None:
     try:
         import resource
     except ImportError:  # Windows knows no such limits; the limit by the clock holds there too
         return
-    used = math.ceil(time.process_time() + seconds)
+    used = math.ceil(time.process_time() + limits.seconds)
     for limit, value in (
-        (resource.RLIMIT_AS, MOST_MEMORY),
+        (resource.RLIMIT_AS, int(limits.memory) + OVERHEAD),
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_CPU, used),
     ):

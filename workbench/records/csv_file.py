@@ -1,67 +1,61 @@
-"""CSV: a header line of names, plain or behind #, one row a sample; the first column is time where it is called so."""
+"""Text tables: one row a sample, one column a signal; the first column is time where it is called so.
+
+Written here as CSV; read in whatever layout an instrument writes (`table_layout.py`). Numbers are parsed a block of
+lines at a time, so that a file of any length takes the memory of its numbers and of one block.
+"""
 
 import csv
 import json
-from array import array
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
+from datetime import datetime
+from io import TextIOBase
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from workbench.records.file_error import RecordFileError
-from workbench.records.limits import check_counts
+from workbench.records.limits import DEFAULT, Deadline, Limits, check_counts
 from workbench.records.named_arrays import Signals
+from workbench.records.table_layout import LONGEST_LINE, MARK, Layout, check_length, check_row, encoding_of, layout_of
+from workbench.records.units import split_unit, time_factor
 
-MARK = "# record "
-TIME_NAMES = ("t", "time", "time [s]", "t [s]", "time_s")
-LONGEST_LINE = 1_000_000  # characters
-
-
-def read(path: Path) -> Signals:
-    """(time or None, signals by name, header text or None)."""
-    header_text: str | None = None
-    names: list[str] = []
-    comment = ""
-    cells = array("d")
-    delimiter = ","
-    for number, line in _lines(path):
-        if line.startswith(MARK):
-            header_text = line[len(MARK) :]
-            continue
-        if not line.strip() or line.startswith("#"):
-            comment = line if line.strip() else comment
-            continue
-        if not names:
-            delimiter = next((d for d in ",;\t" if d in line), " ")
-            names = _fields(line, delimiter)
-            # Programs that put comments before numbers, as numpy's savetxt, put the names into the last of them.
-            behind = comment and all(map(_is_number, names))
-            told = _fields(comment.lstrip("# "), delimiter) if behind else []
-            if len(told) != len(names):
-                names = _names(path, number, names)
-                continue
-            names = _names(path, number, told)
-        row = _fields(line, delimiter)
-        if len(row) != len(names):
-            raise RecordFileError(f"{path}, row {number} has {len(row)} fields; the header has {len(names)}")
-        try:
-            cells.extend(map(_number, row))
-        except ValueError:
-            name, cell = next((n, c) for n, c in zip(names, row) if not _is_number(c))
-            text = cell if len(cell) < 40 else f"{cell[:40]}..."
-            raise RecordFileError(f"{path}, channel {name!r}, row {number}: {text!r} is not a number") from None
-        if number % 1000 == 0:
-            check_counts(path, len(names), len(cells))
-    if not names:
-        raise RecordFileError(f"{path} holds no rows")
-    check_counts(path, len(names), len(cells))
-    columns = np.frombuffer(cells, float).reshape(-1, len(names)).T if cells else np.empty((len(names), 0))
-    signals = dict(zip(names, columns))
-    timed = names[0].lower() in TIME_NAMES
-    return (signals.pop(names[0]) if timed else None), signals, header_text
+BLOCK = 2**21  # characters
+BLANK_LINES = re.compile(r"\n[ \t]*(?=\n)")
+COMMENT_LINES = re.compile(r"^#.*\n?", re.MULTILINE)
+DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
-def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
+def read(path: Path, limits: Limits = DEFAULT) -> Signals:
+    """(time or None, signals by name, header text or None); units stand in brackets behind the names.
+
+    Raises:
+        RecordFileError: rows that do not fit the names, or more than the limits allow.
+    """
+    with path.open(encoding=encoding_of(path), newline=None) as file:
+        layout = layout_of(path, file)
+        blocks = [*_blocks(path, file, layout, limits)] if layout.first is not None else []
+    n_columns = len(layout.names) + (layout.n_stamps > 0)
+    columns = [np.concatenate([block[:, i] for block in blocks]) if blocks else np.empty(0) for i in range(n_columns)]
+    del blocks
+    names = [
+        f"{name} [{unit}]" if unit and not split_unit(name)[1] else name
+        for name, unit in zip_longest(layout.names, layout.units)
+    ]
+    signals = dict(zip(names, columns[layout.n_stamps > 0 :]))
+    if layout.n_stamps:
+        return columns[0], signals, layout.header
+    first = next(iter(signals))
+    factor = time_factor(first)
+    if factor is None:
+        return None, signals, layout.header
+    time = signals.pop(first)
+    return (time if factor == 1.0 else factor * time), signals, layout.header
+
+
+def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
     """Write with all digits, so that reading gives the same numbers."""
     with path.open("w", newline="", encoding="utf-8") as file:
         file.write(MARK + json.dumps(header) + "\n")
@@ -70,39 +64,105 @@ def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
         writer.writerows(zip(*(map(repr, map(float, column)) for column in (time, *signals.values())), strict=True))
 
 
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        number = 0
-        while line := file.readline(LONGEST_LINE):
-            number += 1
-            if len(line) == LONGEST_LINE:
-                raise RecordFileError(f"{path}, row {number} has more than {LONGEST_LINE} characters: is it a table?")
-            yield number, line
+def _blocks(path: Path, file: TextIOBase, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
+    """The numbers of the table, (n_rows, n_columns) a block of lines, time stamps as seconds since the first."""
+    assert layout.first is not None
+    deadline, clock = Deadline(path, limits), _Clock(path)
+    number, rest = layout.first[0], layout.first[1] + "\n"
+    n_numbers, n_columns = 0, len(layout.names) + (layout.n_stamps > 0)
+    while True:
+        text = file.read(BLOCK)
+        block = rest + text
+        end = block.rfind("\n") + 1 if text else len(block)
+        block, rest = block[:end], block[end:]
+        check_length(path, number + block.count("\n"), rest)
+        lines = _lines(path, block)
+        n_numbers += n_columns * len(lines)
+        check_counts(path, n_columns, n_numbers, limits)
+        if lines:
+            yield _numbers(path, layout, number, block, lines, clock)
+        if not text:
+            return
+        number += block.count("\n")
+        deadline.check()
 
 
-def _fields(line: str, delimiter: str) -> list[str]:
-    row = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True, strict=True))
-    return [cell for cell in row if cell] if delimiter == " " else row
+def _lines(path: Path, block: str) -> list[str]:
+    """The lines with numbers."""
+    if "#" in block:
+        if f"\n{MARK}" in f"\n{block}":
+            raise RecordFileError(f"{path} is damaged: the description of its channels stands below its numbers")
+        block = COMMENT_LINES.sub("", block)
+    if "\n\n" in block or "\n " in block or "\n\t" in block:
+        block = BLANK_LINES.sub("", f"\n{block}")
+    return [line for line in block.split("\n") if line and not line.isspace()]
 
 
-def _names(path: Path, number: int, row: list[str]) -> list[str]:
-    names = [name.strip() for name in row]
-    if all(_is_number(name) for name in names):
-        raise RecordFileError(f"{path}, row {number}: a header line of names is needed before the numbers")
-    if len(set(names)) != len(names) or not all(names):
-        raise RecordFileError(f"{path}: the names of the header must differ and not be empty; got {names}")
-    return names
-
-
-def _number(text: str) -> float:
-    if "_" in text:  # Python's, and nobody else's
-        raise ValueError
-    return float(text)
-
-
-def _is_number(text: str) -> bool:
+def _numbers(path: Path, layout: Layout, number: int, block: str, lines: list[str], clock: "_Clock") -> np.ndarray:
+    delimiter = None if layout.delimiter == " " else layout.delimiter
+    tails = lines
+    if layout.n_stamps:
+        split = [line.split(delimiter, layout.n_stamps) for line in lines]
+        tails = [parts[-1] for parts in split]
+    if layout.trailing:
+        tails = [line.rstrip(" ").removesuffix(layout.delimiter) for line in tails]
+    if layout.decimal_comma:
+        tails = [line.replace(",", ".") for line in tails]
     try:
-        _number(text)
-    except ValueError:
-        return False
-    return True
+        if any(map(LONGEST_LINE.__le__, map(len, lines))):
+            raise ValueError
+        numbers = np.loadtxt(tails, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
+        if numbers.shape != (len(lines), len(layout.names)):
+            raise ValueError
+    except ValueError:  # which row and field is at fault is found line by line
+        numbers = np.array([*_row_by_row(path, layout, number, block)])
+    if not layout.n_stamps:
+        return numbers
+    times = clock.seconds([" ".join(parts[: layout.n_stamps]) for parts in split])
+    return np.column_stack([times, numbers])
+
+
+def _row_by_row(path: Path, layout: Layout, number: int, block: str) -> Iterator[list[float]]:
+    for row, line in enumerate(block.split("\n"), start=number):
+        check_length(path, row, line)
+        if line and not line.isspace() and not line.startswith("#"):
+            yield check_row(path, layout, row, line)
+
+
+class _Clock:
+    """Seconds since the first time stamp of a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._start: np.datetime64 | None = None
+        self._last: np.datetime64 | None = None
+
+    def seconds(self, stamps: list[str]) -> np.ndarray:
+        """Of dates with times of day, or of times of day alone, which may pass midnight once.
+
+        Raises:
+            RecordFileError: a stamp that is none.
+        """
+        try:
+            times = np.array([_iso(stamp) for stamp in stamps], "datetime64[ns]")
+        except ValueError as error:
+            raise RecordFileError(f"{self._path}: a time stamp cannot be read: {error}") from error
+        self._start = times[0] if self._start is None else self._start
+        last = times[0] if self._last is None else self._last
+        passed = np.diff(times, prepend=last) < np.timedelta64(0, "ns")
+        if stamps[0][2:3] == ":" or stamps[0][1:2] == ":":
+            times = times + np.cumsum(passed) * np.timedelta64(1, "D")
+        self._last = times[-1]
+        return (times - self._start) / np.timedelta64(1, "ns") * 1e-9
+
+
+def _iso(stamp: str) -> str:
+    """A time stamp as ISO 8601 writes it; a time of day is one of 1970-01-01."""
+    stamp = stamp.strip(' "').replace(",", ".").removesuffix("Z")
+    date, _, clock = stamp.replace("T", " ").partition(" ")
+    if not clock:
+        date, clock = "1970-01-01", date
+    for form in DATES:
+        if ("." in date[:3] and form[2] == ".") or ("/" in date and "/" in form):
+            date = datetime.strptime(date, form).date().isoformat()
+    return f"{date}T{clock.strip():0>8}" if clock.strip()[1:2] != ":" else f"{date}T0{clock.strip()}"

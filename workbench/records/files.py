@@ -1,4 +1,4 @@
-"""Records on disk: CSV, NPZ, MAT, HDF5 and UFF 58, through one door each way.
+"""Records on disk: text tables, NPZ, MAT, HDF5, UFF 58, TDMS and WAV, through one door each way.
 
 What a format has no room for (places, noise, which signals are inputs) travels as a JSON text: in a comment of a CSV,
 an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it tells a file that was
@@ -7,11 +7,11 @@ changed since. Files of other programs have none of it: their signals are all ou
 
 from pathlib import Path
 
-from workbench.records import csv_file, hdf5_file, mat_file, npz_file, uff_file
+from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
 from workbench.records.assembly import legible, record_of
 from workbench.records.checksum import KEY, checksum
 from workbench.records.file_error import RecordFileError, unreadable
-from workbench.records.limits import check_size
+from workbench.records.limits import DEFAULT, Limits, check_size
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Record
 from workbench.records.transfer_assembly import complex_columns, holds_transfer, transfer_of
@@ -26,21 +26,30 @@ FORMATS = {
     ".hdf5": hdf5_file,
     ".uff": uff_file,
     ".unv": uff_file,
+    ".tdms": tdms_file,
+    ".wav": wav_file,
 }
+READ_ONLY = (".tdms", ".wav")
 
 
-def read_record(path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = ()) -> Record:
-    """Read a record; the format goes by the file's ending.
+def read_record(
+    path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = (), limits: Limits = DEFAULT
+) -> Record:
+    """A record from a file; the format goes by its ending.
+
+    Units behind the names, `Acc [g]`, become SI, and unequal time steps equal ones: `Record.remarks` says so.
 
     Args:
-        path: of a .csv, .txt, .npz, .mat, .h5, .hdf5, .uff or .unv file.
-        sample_rate_hz: where the file itself tells no time.
+        path: of a .csv, .txt, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
+        sample_rate_hz: where the file itself has no time.
         inputs: names of the signals that went in, where the file does not say.
+        limits: of memory and processor time.
 
     Raises:
-        RecordFileError: naming file, channel and row, and what would be right; transfer functions.
+        RecordFileError: naming file, channel and row, and what would be right; transfer functions; more than the
+            limits allow.
     """
-    found = read_measured(path, sample_rate_hz=sample_rate_hz, inputs=inputs)
+    found = read_measured(path, sample_rate_hz=sample_rate_hz, inputs=inputs, limits=limits)
     if isinstance(found, TransferFunctions):
         raise RecordFileError(
             f"{path} is complex: it holds transfer functions, no record. Their modes are found by `workbench identify`,"
@@ -50,17 +59,17 @@ def read_record(path: str | Path, *, sample_rate_hz: float | None = None, inputs
 
 
 def read_measured(
-    path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = ()
+    path: str | Path, *, sample_rate_hz: float | None = None, inputs: tuple[str, ...] = (), limits: Limits = DEFAULT
 ) -> Record | TransferFunctions:
-    """Read what a file holds: a record, or transfer functions where it is complex.
+    """What a file holds: a record, or transfer functions where it is complex.
 
     Transfer functions are complex arrays of MAT, NPZ or HDF5, shape ([n_outputs, [n_references,]] n_frequencies) with
     the axes in any order, beside their lines (`frequency_hz`, `f`, ..., or `omega`) or a sample rate; data sets 58 of
     UFF of the function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`.
 
     Args:
-        path, inputs: as `read_record`.
-        sample_rate_hz: where the file itself tells no time, or no lines: they then go from zero to half of it.
+        path, inputs, limits: as `read_record`.
+        sample_rate_hz: where the file itself has no time, or no lines: they then go from zero to half of it.
 
     Raises:
         RecordFileError: naming file, channel and row, and what would be right.
@@ -74,12 +83,13 @@ def read_measured(
     check_size(path)
     try:
         if module is csv_file:
-            time, signals, header = csv_file.read(path)
+            time, signals, header = csv_file.read(path, limits)
             arrays = complex_columns(signals)
         else:
-            arrays = module.arrays(path)
+            arrays = module.arrays(path, limits)
             if not holds_transfer(arrays):
                 time, signals, header = signals_of(path, arrays)
+                arrays = {}
     except RecordFileError:
         raise
     except Exception as error:  # every reader of another's file has its own ways to fail
@@ -101,6 +111,9 @@ def write_record(record: Record, path: str | Path) -> Path:
     """
     path = Path(path)
     module = _format(path)
+    if path.suffix.lower() in READ_ONLY:
+        written = ", ".join(sorted(set(FORMATS) - set(READ_ONLY)))
+        raise RecordFileError(f"{path}: {path.suffix} is read, not written; use one of {written}")
     signals = {_key(kind, legible(path, channel.name)): row for kind, channel, row in _rows(record)}
     header = {
         "name": record.name,

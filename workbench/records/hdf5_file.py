@@ -1,28 +1,31 @@
 """HDF5: one dataset a signal at the top of the file, `t` or `time` for the instants."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
-from workbench.records.limits import check_counts
+from workbench.records.limits import BYTES_PER_NUMBER, DEFAULT, Limits, check_counts
 from workbench.records.named_arrays import HEADER, numbered
 
 
-def arrays(path: Path) -> dict[str, np.ndarray]:
+def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
     """What the file holds, by name."""
-    return load_confined(__name__, path)
+    return load_confined(__name__, path, limits)
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
-    """The datasets of the file itself, and its header; to be called in a process of its own."""
+def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+    """The datasets of numbers in the file itself, sizes known first, and its header; for a process of its own."""
     with h5py.File(path, "r") as file:
         names = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
         found = {name: file[name] for name in names if isinstance(file[name], h5py.Dataset)}
-        check_counts(path, len(found), sum(int(dataset.size or 0) for dataset in found.values()))
+        found = {name: dataset for name, dataset in found.items() if _is_numeric(dataset)}
+        check_counts(path, len(found), sum(map(_numbers, found.values())), limits)
         for name, dataset in found.items():
             if dataset.is_virtual or dataset.external:
                 raise RecordFileError(
@@ -33,7 +36,23 @@ def load(path: Path) -> dict[str, np.ndarray]:
     return arrays if header is None else arrays | {HEADER: np.array(str(header))}
 
 
-def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
+def is_hdf5(path: Path) -> bool:
+    """Whether the file is one of HDF5, whatever its ending."""
+    return bool(h5py.is_hdf5(path))
+
+
+def _is_numeric(dataset: Any) -> bool:
+    """Numbers, and no text that MATLAB keeps as such."""
+    return dataset.dtype.base.kind in "fiubc" and dataset.attrs.get("MATLAB_class", b"double") not in (b"char", b"cell")
+
+
+def _numbers(dataset: Any) -> int:
+    """Numbers in a dataset, each of whose elements may be an array."""
+    size = int(dataset.size or 0)
+    return max(size, -(-size * dataset.dtype.itemsize // (2 * BYTES_PER_NUMBER)))
+
+
+def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
     """Write numbered datasets, each with its name; the header is an attribute of the file."""
     with h5py.File(path, "w") as file:
         file.create_dataset("t", data=time)

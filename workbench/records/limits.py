@@ -1,16 +1,64 @@
-"""How much a file may hold."""
+"""How much a file may hold, and how long it may take to read."""
 
+import time
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from workbench.records.file_error import RecordFileError
 
-MOST_NUMBERS = 2**25  # a quarter of a gibibyte; each of the few copies that reading makes is as large
+COPIES = 4  # of a record, at most, in memory while it is read
+BYTES_PER_NUMBER = 8
 MOST_BYTES = 2**30
 MOST_CHANNELS = 10_000
-MOST_MEMORY = 3 * 2**29  # bytes of address space for a reader in a process of its own
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What reading a file may take.
+
+    Attributes:
+        memory: bytes; the record itself may have a quarter of them.
+        seconds: of processor time.
+    """
+
+    memory: float = 2.0**30
+    seconds: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name in ("memory", "seconds"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"the limit of {name} must be positive; got {getattr(self, name)}")
+
+    @property
+    def most_numbers(self) -> int:
+        """Numbers that a record may have."""
+        return int(self.memory / (COPIES * BYTES_PER_NUMBER))
+
+
+DEFAULT = Limits()
+
+
+class Deadline:
+    """The end of the time that a file may take, counted from the making of this."""
+
+    def __init__(self, path: Path, limits: Limits) -> None:
+        self._path, self._seconds = path, limits.seconds
+        self._end = time.process_time() + limits.seconds
+
+    def check(self) -> None:
+        """Refuse to go on after the end.
+
+        Raises:
+            RecordFileError: the time is up.
+        """
+        if time.process_time() > self._end:
+            raise RecordFileError(
+                f"{self._path} takes more than {self._seconds:g} s to read: cut the record, take fewer channels, or"
+                " write it as HDF5 or NPZ"
+            )
 
 
 def check_size(path: Path) -> None:
@@ -27,25 +75,26 @@ def check_size(path: Path) -> None:
         )
 
 
-def check_arrays(path: Path, arrays: Iterable[np.ndarray]) -> None:
+def check_arrays(path: Path, arrays: Iterable[np.ndarray], limits: Limits = DEFAULT) -> None:
     """Refuse arrays that are too many or too large.
 
     Raises:
-        RecordFileError: more than `MOST_CHANNELS` arrays, or `MOST_NUMBERS` numbers in all.
+        RecordFileError: more than `MOST_CHANNELS` arrays, or more numbers in all than the memory allows.
     """
     sizes = [np.size(values) for values in arrays]
-    check_counts(path, len(sizes), sum(sizes))
+    check_counts(path, len(sizes), sum(sizes), limits)
 
 
-def check_counts(path: Path, n_channels: int, n_numbers: int) -> None:
+def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT) -> None:
     """Refuse what would hold too many channels or numbers, before it is read.
 
     Raises:
-        RecordFileError: more than `MOST_CHANNELS` or `MOST_NUMBERS`.
+        RecordFileError: more than `MOST_CHANNELS`, or more numbers than the memory allows.
     """
     if n_channels > MOST_CHANNELS:
         raise RecordFileError(f"{path} holds {n_channels} channels; at most {MOST_CHANNELS} are read")
-    if n_numbers > MOST_NUMBERS:
+    if n_numbers > limits.most_numbers:
         raise RecordFileError(
-            f"{path} holds {n_numbers} numbers; at most {MOST_NUMBERS} are read: cut the record or take fewer channels"
+            f"{path} holds {n_numbers} numbers; at most {limits.most_numbers} are read within"
+            f" {limits.memory / 2**30:g} GiB: cut the record, take fewer channels, or allow more memory"
         )

@@ -1,25 +1,37 @@
-"""MAT files up to version 7.2: one vector a signal, `t` or `time` for the instants."""
+"""MAT files: one vector a signal, `t` or `time` for the instants; those of version 7.3 are HDF5."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from scipy.io import loadmat, savemat
+from scipy.io import loadmat, savemat, whosmat
 
+from workbench.records import hdf5_file
 from workbench.records.confined import load_confined
+from workbench.records.limits import DEFAULT, Limits, check_counts
 from workbench.records.named_arrays import HEADER, numbered
 
+NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
 
-def arrays(path: Path) -> dict[str, np.ndarray]:
+
+def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
     """What the file holds, by name."""
-    return load_confined(__name__, path)
+    return load_confined(__name__, path, limits)
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of the file; to be called in a process of its own."""
-    return {name: values for name, values in loadmat(path, appendmat=False).items() if not name.startswith("__")}
+def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+    """The arrays of numbers and texts in the file, sizes known first; to be called in a process of its own."""
+    if hdf5_file.is_hdf5(path):
+        return hdf5_file.load(path, limits)
+    held = whosmat(path, appendmat=False)
+    wanted = [name for name, _, kind in held if kind in (*NUMERIC, "char")]
+    check_counts(path, len(wanted), sum(int(np.prod(shape, dtype=object)) for _, shape, _ in held), limits)
+    return {name: values for name, values in loadmat(path, appendmat=False, variable_names=wanted).items()
+            if not name.startswith("__")}  # fmt: skip
 
 
-def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
+def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
     """Write numbered vectors and the header as text: names in a MAT file are identifiers."""
     savemat(path, {"t": time, **numbered(signals), HEADER: json.dumps(header)}, appendmat=False)

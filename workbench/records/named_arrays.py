@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 from workbench.records.file_error import RecordFileError
+from workbench.records.units import time_factor
 
 HEADER = "record_header"
 NUMBERED = "record_channel_"
-TIMES = ("t", "time")
 
 Signals = tuple[np.ndarray | None, dict[str, np.ndarray], str | None]
 
@@ -27,7 +27,8 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
         RecordFileError: an array that is no row of samples, two of times, or numbered channels without their header.
     """
     header = str(np.ravel(arrays[HEADER])[0]) if HEADER in arrays and np.size(arrays[HEADER]) else None
-    time, signals = None, {}
+    time: np.ndarray | None = None
+    signals: dict[str, np.ndarray] = {}
     for name, values in arrays.items():
         if values.dtype.kind == "c" and values.size > 1:
             raise RecordFileError(f"{path}, channel {name!r} is complex: is it a transfer function?")
@@ -35,14 +36,16 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
             continue
         if values.ndim > 1 and 1 not in values.shape:
             raise RecordFileError(f"{path}, channel {name!r} has shape {values.shape}; one row of samples is needed")
-        if name not in TIMES:
-            signals[name] = values.reshape(-1).astype(float)
+        row = values.reshape(-1).astype(float, copy=False)
+        factor = time_factor(name)
+        if factor is None:
+            signals[name] = row
         elif time is None:
-            time = values.reshape(-1).astype(float)
+            time, first = (row if factor == 1.0 else factor * row), name
         else:
-            raise RecordFileError(f"{path} holds two arrays of times, {' and '.join(TIMES)}; leave one out")
-    counted = [f"{NUMBERED}{i}" for i in range(len(signals))]
+            raise RecordFileError(f"{path} holds two arrays of times, {first} and {name}; leave one out")
     if any(name.startswith(NUMBERED) for name in signals):
+        counted = [f"{NUMBERED}{i}" for i in range(len(signals))]
         if header is None or sorted(signals) != sorted(counted):
             raise RecordFileError(f"{path} is damaged: its channels and their description do not belong together")
         signals = dict(zip(_keys(path, header), (signals[name] for name in counted)))

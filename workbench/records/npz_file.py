@@ -2,39 +2,75 @@
 
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from numpy.lib import format as npy
 
 from workbench.records.file_error import RecordFileError, unreadable
-from workbench.records.limits import check_counts
+from workbench.records.limits import DEFAULT, Deadline, Limits, check_counts
 from workbench.records.named_arrays import HEADER
 
+ENDING = ".npy"
+LONGEST_TEXT = 2**22  # characters
 
-def arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of an archive, after a look at how large they are.
+
+def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
+    """The arrays of an archive, once the headers of all of them have said how large they are.
 
     Raises:
-        RecordFileError: no archive, a damaged one, a pickle, or more than is read.
+        RecordFileError: no archive, a damaged one, a pickle, or more than the limits allow.
     """
+    deadline = Deadline(path, limits)
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()
-        names = [member.filename for member in members]
-        if len(set(names)) != len(names):
-            raise RecordFileError(f"{path} is damaged: it holds an array twice")
-        check_counts(path, len(members), sum(member.file_size for member in members) // 8)
-        with np.load(path, allow_pickle=False) as held:
-            return {name: np.asarray(held[name]) for name in held.files}
+            names = [member.filename.removesuffix(ENDING) for member in members]
+            if len(set(names)) != len(names):
+                raise RecordFileError(f"{path} is damaged: it holds an array twice")
+            check_counts(path, len(members), 0, limits)
+            n_numbers = 0
+            for member in members:
+                with archive.open(member) as file:
+                    n_numbers += _numbers(path, member, *_declared(file))
+                check_counts(path, len(members), n_numbers, limits)
+                deadline.check()
+            found = {}
+            for name, member in zip(names, members):
+                with archive.open(member) as file:
+                    found[name] = npy.read_array(file, allow_pickle=False)
+                deadline.check()
+            return found
     except RecordFileError:
         raise
     except Exception as error:  # damaged archives fail in many ways
         raise unreadable(path, error) from error
 
 
-def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
+def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
     """Write all arrays and the header as text."""
     held: dict[str, Any] = {"t": time, **signals, HEADER: np.array(json.dumps(header))}
     with path.open("wb") as file:
         np.savez(file, **held)
+
+
+def _declared(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type that an array's header declares."""
+    version = npy.read_magic(file)
+    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
+    shape, _, dtype = read(file)
+    return shape, dtype
+
+
+def _numbers(path: Path, member: zipfile.ZipInfo, shape: tuple[int, ...], dtype: np.dtype) -> int:
+    """How many numbers an array takes, of eight bytes each."""
+    size = 1
+    for extent in shape:
+        size *= int(extent)
+    if size < 0 or size * dtype.itemsize > member.file_size:
+        raise RecordFileError(f"{path} is damaged: {member.filename} holds fewer numbers than it declares")
+    if dtype.kind in "US" and size * dtype.itemsize > 4 * LONGEST_TEXT:
+        raise RecordFileError(f"{path}: {member.filename} is a text of more than {LONGEST_TEXT} characters")
+    return size * max(1, -(-dtype.itemsize // 8)) if dtype.kind not in "US" else 0

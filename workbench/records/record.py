@@ -63,6 +63,7 @@ class Record:
         input_channels: one `Channel` a row of `inputs`.
         start_time: time of the first sample, s.
         name: how messages and plots call it.
+        remarks: what reading the file changed: units, time steps.
 
     Raises:
         ValueError: shapes that do not fit, repeated names, empty or non-finite signals (channel and sample named).
@@ -75,6 +76,7 @@ class Record:
     input_channels: tuple[Channel, ...] = ()
     start_time: float = 0.0
     name: str = "record"
+    remarks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         outputs = frozen(np.atleast_2d(self.outputs))
@@ -166,6 +168,7 @@ class Record:
             input_channels=self.input_channels,
             start_time=float(time[keep][0]),
             name=self.name,
+            remarks=self.remarks,
         )
 
     def only(self, outputs: Sequence[str]) -> "Record":
@@ -184,6 +187,7 @@ class Record:
             input_channels=self.input_channels,
             start_time=self.start_time,
             name=self.name,
+            remarks=self.remarks,
         )
 
     def to_control(self) -> "control.TimeResponseData":

@@ -8,6 +8,7 @@ import pyuff
 
 from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
+from workbench.records.limits import DEFAULT, Limits
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_assembly import TOLD
 
@@ -20,12 +21,12 @@ MARK = b"    -1"
 OURS = ('{"kind"', '"kind":', '"name":')
 
 
-def arrays(path: Path) -> dict[str, np.ndarray]:
+def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
     """What the file holds, by name."""
-    return load_confined(__name__, path)
+    return load_confined(__name__, path, limits)
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
+def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """The signals of all data sets 58, their instants and their header; to be called in a process of its own."""
     if sum(line.rstrip() == MARK for line in path.read_bytes().splitlines()) % 2:
         raise RecordFileError(f"{path} is damaged: its last data set has no end")

@@ -8,6 +8,7 @@ import pyuff
 
 from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
+from workbench.records.limits import Limits
 
 NORMAL_MODE = 2  # analysis_type of both formats
 AT_NODES = 1  # dataset_location of 2414
@@ -19,7 +20,7 @@ def arrays(path: Path) -> dict[str, np.ndarray]:
     return load_confined(__name__, path)
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
+def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """Frequencies, damping, modal masses and shapes at nodes; to be called in a process of its own."""
     sets = pyuff.UFF(str(path)).read_sets()
     sets = sets if isinstance(sets, list) else [sets]

@@ -1,0 +1,139 @@
+"""Files as instruments write them: any layout of text, units, time stamps and uneven times, TDMS and WAV."""
+
+import numpy as np
+import pytest
+from nptdms import ChannelObject, TdmsWriter
+from scipy.io import wavfile
+
+from workbench.records.file_error import RecordFileError
+from workbench.records.files import read_record
+from workbench.records.limits import Limits
+from workbench.records.units import split_unit, unit_named
+
+G = 9.80665  # m/s^2, by definition
+
+
+def read(tmp_path, text, encoding="utf-8", ending=".csv", **options):
+    path = tmp_path / f"x{ending}"
+    path.write_bytes(text.encode(encoding))
+    return read_record(path, **options)
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding", "step", "channels", "values"),
+    [
+        pytest.param(
+            "LabVIEW Measurement\t\nWriter_Version\t2\n***End_of_Header***\t\nChannels\t2\n\n"
+            "X_Value\tAcc (g)\tHammer (kN)\n0,000\t1,5\t2\n0,001\t2,5\t3\n0,002\t1\t1\n",
+            "utf-8", 0.001, {"Acc": ("acceleration", "m/s^2"), "Hammer": ("force", "N")},
+            [[1.5 * G, 2.5 * G, G], [2e3, 3e3, 1e3]], id="header of several lines, tabs, decimal commas",
+        ),
+        pytest.param(
+            "Time (ms);Acc;Weg\nms;mm/s²;µm\n0;1000;1\n1;2000;2\n2;3;3\n", "utf-8", 0.001,
+            {"Acc": ("acceleration", "m/s^2"), "Weg": ("displacement", "m")}, [[1, 2, 0.003], [1e-6, 2e-6, 3e-6]],
+            id="a line of units",
+        ),
+        pytest.param(
+            "Zeit;Weg [µm]\n0,0;1,0\n0,5;2,0\n1,0;3,5\n", "latin-1", 0.5, {"Weg": ("displacement", "m")},
+            [[1e-6, 2e-6, 3.5e-6]], id="latin-1",
+        ),
+        pytest.param("time\ta [g]\n0\t1\n1\t2\n", "utf-16", 1.0, {"a": ("acceleration", "m/s^2")}, [[G, 2 * G]],
+                     id="utf-16"),
+        pytest.param("% by a program\n time   a  b\n  0.0  1 2\n  0.1  3 4\n", "utf-8", 0.1,
+                     {"a": ("", ""), "b": ("", "")}, [[1, 3], [2, 4]], id="spaces"),
+        pytest.param('"Time (s)","Acc, z (g)"\n"0","1"\n"1","2"\n', "utf-8", 1.0,
+                     {"Acc, z": ("acceleration", "m/s^2")}, [[G, 2 * G]], id="quotes"),
+        pytest.param("t;a;\n0;1;\n1;2;\n", "utf-8", 1.0, {"a": ("", "")}, [[1, 2]], id="a delimiter behind each row"),
+        pytest.param("Date;Time;a [mV]\n01.05.2024;23:59:59,5;1\n02.05.2024;00:00:00,0;2\n02.05.2024;00:00:00,5;4\n",
+                     "utf-8", 0.5, {"a": ("voltage", "V")}, [[0.001, 0.002, 0.004]], id="dates and times of day"),
+        pytest.param("timestamp,a\n2024-05-01T12:00:00.00,1\n2024-05-01T12:00:00.01,2\n", "utf-8", 0.01,
+                     {"a": ("", "")}, [[1, 2]], id="ISO 8601"),
+        pytest.param("time a\n23:59:59.50 1\n0:00:00.00 2\n00:00:00.50 3\n", "utf-8", 0.5, {"a": ("", "")},
+                     [[1, 2, 3]], id="past midnight"),
+    ],
+)  # fmt: skip
+def test_a_table_in_any_layout(tmp_path, text, encoding, step, channels, values):
+    record = read(tmp_path, text, encoding)
+    assert record.sample_time == pytest.approx(step, rel=1e-9)
+    assert {c.name: (c.quantity, c.unit) for c in record.output_channels} == channels
+    np.testing.assert_allclose(record.outputs, values, rtol=1e-12)
+
+
+def test_what_was_changed_is_remarked(tmp_path):
+    record = read(tmp_path, "t,a [g],b [m],c [counts],d (left)\n0,1,1,1,1\n1,2,2,2,2\n")
+    assert record.remarks[0] == "a: g taken as 9.80665 m/s^2"
+    assert record.remarks[1].startswith("c: in counts") and len(record.remarks) == 2
+    assert record.output_names == ("a", "b", "c", "d (left)")
+    assert record.only(["a"]).remarks == record.remarks
+
+
+def test_an_input_is_named_with_its_unit_or_without(tmp_path):
+    text = "t,F [kN],a\n0,1,1\n1,2,2\n"
+    for name in ("F", "F [kN]"):
+        record = read(tmp_path, text, inputs=(name,))
+        assert record.input_names == ("F",) and record.inputs.tolist() == [[1e3, 2e3]]
+
+
+def test_uneven_steps_are_resampled(tmp_path):
+    """Against the function itself at the new instants."""
+    steps = 0.01 * (1.0 + 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, 400))
+    times = np.cumsum(steps)
+    record = read(tmp_path, "t,a\n" + "".join(f"{t!r},{float(np.sin(3 * t))!r}\n" for t in map(float, times)))
+    np.testing.assert_allclose(record.outputs[0], np.sin(3 * record.time), atol=1e-7)
+    assert record.time[[0, -1]] == pytest.approx(times[[0, -1]]) and "resampled" in record.remarks[0]
+
+
+def test_rounded_times_are_no_uneven_ones(tmp_path):
+    """1,024 Hz, written in milliseconds: the signal stays as it is."""
+    record = read(tmp_path, "t,a\n" + "".join(f"{k / 1024:.3f},{k % 7}\n" for k in range(2000)))
+    assert record.sample_rate_hz == pytest.approx(1024.0, rel=1e-4)
+    np.testing.assert_array_equal(record.outputs[0], np.arange(2000) % 7)
+    assert "rounded" in record.remarks[0]
+
+
+@pytest.mark.parametrize("times", [[0, 1, 2, 4, 5, 6], [0, 1, 2, 3, 9, 10], [0, 1, 2, 2, 3, 4]])
+def test_a_missing_or_doubled_sample_is_not_filled(tmp_path, times):
+    with pytest.raises(RecordFileError, match="not uniformly sampled"):
+        read(tmp_path, "t,a\n" + "".join(f"{t},1\n" for t in [*times, *range(11, 40)]))
+
+
+@pytest.mark.parametrize(
+    ("written", "si"),
+    [("g", G), ("m/s²", 1), ("mm/s**2", 1e-3), ("µm", 1e-6), ("lbf", 4.4482216152605), ("in/s", 0.0254),
+     ("deg", np.pi / 180), ("N·m", 1), ("m s^-2", 1), ("kHz", 1e3)],
+)  # fmt: skip
+def test_units_by_their_definitions(written, si):
+    assert unit_named(written).factor == pytest.approx(si, rel=1e-15)
+
+
+def test_brackets_without_a_unit_belong_to_the_name():
+    assert split_unit("x (left)") == ("x (left)", "")
+    assert split_unit("Acc / g") == ("Acc", "g")
+
+
+def test_labview_channels(tmp_path):
+    properties = {"wf_increment": 0.01, "wf_start_offset": 0.5, "unit_string": "g"}
+    with TdmsWriter(tmp_path / "x.tdms") as file:
+        file.write_segment([ChannelObject("run", "acc", np.arange(5.0), properties=properties)])
+    record = read_record(tmp_path / "x.tdms")
+    assert (record.sample_time, record.start_time) == pytest.approx((0.01, 0.5))
+    assert record.output_channels[0].unit == "m/s^2"
+    np.testing.assert_allclose(record.outputs[0], G * np.arange(5.0))
+
+
+def test_sound_files(tmp_path):
+    wavfile.write(tmp_path / "x.wav", 8000, np.array([[0, 16384], [-32768, 8192]], np.int16))
+    record = read_record(tmp_path / "x.wav")
+    assert record.sample_rate_hz == 8000.0
+    np.testing.assert_array_equal(record.outputs, [[0.0, -1.0], [0.5, 0.25]])
+
+
+def test_limits_are_the_callers(tmp_path):
+    text = "t,a\n" + "".join(f"{k},1\n" for k in range(1000))
+    assert read(tmp_path, text, limits=Limits(memory=2000 * 32)).n_samples == 1000
+    with pytest.raises(RecordFileError, match="holds 2000 numbers; at most 1999"):
+        read(tmp_path, text, limits=Limits(memory=1999 * 32))
+    with pytest.raises(RecordFileError, match="more than 1e-06 s to read"):
+        read(tmp_path, text, limits=Limits(seconds=1e-6))
+    with pytest.raises(ValueError, match="memory must be positive"):
+        Limits(memory=0.0)

@@ -1,0 +1,41 @@
+"""TDMS, as LabVIEW writes it: one channel a signal, its unit and sample instants among its properties."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from workbench.records.confined import load_confined
+from workbench.records.file_error import RecordFileError
+from workbench.records.limits import DEFAULT, Limits, check_counts
+
+
+def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
+    """The channels of numbers, units in brackets behind their names, and `t` where the file has sample instants."""
+    return load_confined(__name__, path, limits)
+
+
+def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+    """The same, sizes known first; to be called in a process of its own."""
+    from nptdms import TdmsFile
+
+    with TdmsFile.open(path) as file:
+        channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
+        channels = [channel for channel in channels if channel.dtype.kind in "fiub"]
+        check_counts(path, len(channels), sum(map(len, channels)), limits)
+        twice = Counter(channel.name for channel in channels)
+        found: dict[str, np.ndarray] = {}
+        sampling: set[tuple[float, float]] = set()
+        for channel in channels:
+            name = channel.name if twice[channel.name] == 1 else f"{channel.group_name}/{channel.name}"
+            unit = str(channel.properties.get("unit_string", "")).strip()
+            found[f"{name} [{unit}]" if unit else name] = channel[:]
+            step = float(channel.properties.get("wf_increment", 0.0))
+            sampling |= {(float(channel.properties.get("wf_start_offset", 0.0)), step)} if step > 0 else set()
+    if len(sampling) > 1:
+        raise RecordFileError(f"{path}: its channels have {len(sampling)} different sample instants; export one rate")
+    lengths = {values.size for values in found.values()}
+    if sampling and len(lengths) == 1:
+        ((start, step),) = sampling
+        return {"t": start + step * np.arange(lengths.pop()), **found}
+    return found

@@ -1,0 +1,95 @@
+"""Units as instruments write them, and what they are in SI."""
+
+import re
+from dataclasses import dataclass
+from math import pi
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit of measurement.
+
+    Attributes:
+        factor: SI units in one of it.
+        si: the SI unit, as `Channel.unit` has it.
+        quantity: what it measures, one of `QUANTITIES` or a word beside them; empty where the unit leaves it open.
+    """
+
+    factor: float
+    si: str
+    quantity: str
+
+
+STANDARD_GRAVITY = 9.80665  # m/s^2
+INCH, POUND_FORCE = 0.0254, 4.4482216152605  # m, N
+DEGREE = pi / 180
+
+# By quantity: the SI unit, then names and factors of all its units. Small and capital letters differ: mN is not MN.
+BY_QUANTITY: dict[str, tuple[str, dict[str, float]]] = {
+    "time": ("s", {"s": 1, "sec": 1, "secs": 1, "second": 1, "seconds": 1, "ms": 1e-3, "msec": 1e-3, "us": 1e-6,
+                   "usec": 1e-6, "ns": 1e-9, "min": 60, "h": 3600}),
+    "frequency": ("Hz", {"Hz": 1, "hz": 1, "HZ": 1, "kHz": 1e3, "MHz": 1e6}),
+    "displacement": ("m", {"m": 1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "micron": 1e-6, "microns": 1e-6, "nm": 1e-9,
+                           "in": INCH, "inch": INCH, "mil": 1e-3 * INCH, "mils": 1e-3 * INCH, "ft": 12 * INCH}),
+    "velocity": ("m/s", {"m/s": 1, "cm/s": 1e-2, "mm/s": 1e-3, "um/s": 1e-6, "nm/s": 1e-9, "in/s": INCH, "ips": INCH}),
+    "acceleration": ("m/s^2", {"m/s^2": 1, "cm/s^2": 1e-2, "mm/s^2": 1e-3, "um/s^2": 1e-6, "in/s^2": INCH, "Gal": 1e-2,
+                               "g": STANDARD_GRAVITY, "G": STANDARD_GRAVITY, "gn": STANDARD_GRAVITY,
+                               "mg": 1e-3 * STANDARD_GRAVITY, "ug": 1e-6 * STANDARD_GRAVITY}),
+    "slope": ("rad", {"rad": 1, "mrad": 1e-3, "urad": 1e-6, "deg": DEGREE, "degree": DEGREE, "degrees": DEGREE,
+                      "°": DEGREE}),
+    "angular velocity": ("rad/s", {"rad/s": 1, "mrad/s": 1e-3, "deg/s": DEGREE, "°/s": DEGREE, "dps": DEGREE}),
+    "force": ("N", {"N": 1, "mN": 1e-3, "uN": 1e-6, "kN": 1e3, "MN": 1e6, "lbf": POUND_FORCE, "lb": POUND_FORCE,
+                    "kgf": STANDARD_GRAVITY}),
+    "moment": ("N m", {"N m": 1, "Nm": 1, "N mm": 1e-3, "Nmm": 1e-3, "mN m": 1e-3, "mNm": 1e-3, "kN m": 1e3,
+                       "kNm": 1e3}),
+    "voltage": ("V", {"V": 1, "v": 1, "Volt": 1, "Volts": 1, "volt": 1, "volts": 1, "mV": 1e-3, "uV": 1e-6, "kV": 1e3}),
+    "strain": ("1", {"strain": 1, "m/m": 1, "um/m": 1e-6, "ustrain": 1e-6, "ue": 1e-6, "uε": 1e-6}),
+    "pressure": ("Pa", {"Pa": 1, "kPa": 1e3, "MPa": 1e6, "bar": 1e5}),
+    "": ("counts", {"counts": 1, "count": 1, "Counts": 1, "cts": 1, "ADC": 1}),
+}  # fmt: skip
+UNITS = {
+    name: Unit(float(factor), si, quantity)
+    for quantity, (si, names) in BY_QUANTITY.items()
+    for name, factor in names.items()
+}
+
+# One spelling for each letter and exponent: the micro sign and the Greek mu, ² and **2 and s2, sec and s.
+SPELLINGS = (
+    ("µ", "u"), ("μ", "u"), ("²", "^2"), ("**", "^"), ("·", " "), ("*", " "), ("⋅", " "), ("º", "°"),
+    ("/sec", "/s"), ("/s/s", "/s^2"), ("/s2", "/s^2"), (" s^-2", "/s^2"), (" s^-1", "/s"), ("/(s^2)", "/s^2"),
+)  # fmt: skip
+BRACKETED = re.compile(r"(.*?)\s*(?:\[\s*([^\[\]]*)\]|\(\s*([^()]*(?:\(s\^2\))?[^()]*)\))")
+AFTER_SLASH = re.compile(r"(.*\S)\s+/\s+(\S.*)")  # as DIN and ISO label axes
+TIME = {"t", "time", "zeit", "temps", "tiempo", "x_value", "timestamp", "time stamp", "elapsed time", "relative time"}
+TIME_UNDERSCORE = re.compile(r"(t|time)_(s|sec|ms|us)", re.IGNORECASE)
+
+
+def unit_named(text: str) -> Unit | None:
+    """The unit that a text names, in any usual spelling; None where it names none."""
+    for spelling, ours in SPELLINGS:
+        text = text.replace(spelling, ours)
+    return UNITS.get(" ".join(text.split()))
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """A column's name without its unit, and the unit as written: `Acc [g]`, `Acc (g)` and `Acc / g` give (Acc, g).
+
+    What stands in brackets and is no unit belongs to the name.
+    """
+    for pattern in (BRACKETED, AFTER_SLASH):
+        found = pattern.fullmatch(name.strip())
+        if found and found[1]:
+            text = next(group for group in found.groups()[1:] if group is not None).strip()
+            if unit_named(text) is not None:
+                return found[1], text
+    return name, ""
+
+
+def time_factor(name: str) -> float | None:
+    """Seconds in one unit of a column of sample instants; None where the name is not that of one."""
+    underscore = TIME_UNDERSCORE.fullmatch(name)
+    base, text = (underscore[1], underscore[2].lower()) if underscore else split_unit(name)
+    if base.strip().lower() not in TIME:
+        return None
+    unit = unit_named(text) if text else UNITS["s"]
+    return unit.factor if unit is not None and unit.quantity == "time" else None

@@ -1,0 +1,31 @@
+"""WAV: one channel a signal, as a share of full scale where the samples are whole numbers."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.io import wavfile
+
+from workbench.records.confined import load_confined
+from workbench.records.file_error import RecordFileError
+from workbench.records.limits import DEFAULT, Limits, check_counts
+
+
+def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
+    """Sample instants `t` and the channels, by name."""
+    return load_confined(__name__, path, limits)
+
+
+def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
+    """The same; to be called in a process of its own."""
+    rate, samples = wavfile.read(path)
+    samples = samples.reshape(samples.shape[0], -1)
+    check_counts(path, samples.shape[1], samples.size + samples.shape[0], limits)
+    if not rate > 0:
+        raise RecordFileError(f"{path}: its sample rate is {rate} Hz; it must be positive")
+    if samples.dtype.kind == "u":
+        samples = samples.astype(float) - 128.0
+        full = 128.0
+    else:
+        full = -float(np.iinfo(samples.dtype).min) if samples.dtype.kind == "i" else 1.0
+    channels = {f"channel {i + 1}": column / full for i, column in enumerate(samples.T)}
+    return {"t": np.arange(samples.shape[0]) / rate, **channels}
