@@ -32,6 +32,7 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, Place
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
+from workbench.structure.plate import Plate
 
 MOST_SAMPLES = 5_000_000
 LEAST_SAMPLES = 16
@@ -42,6 +43,17 @@ TABLES = ("title", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "points")
+PLATE = (
+    "kind",
+    "length",
+    "mass_per_area",
+    "bending_stiffness",
+    "poisson_ratio",
+    "edges",
+    "damping_ratio",
+    "modes",
+)
+EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT, RECORD = ("name", "kind"), ("name", "quantity", "noise_std"), ("name", "file", "sample_time", "use")
 
@@ -112,6 +124,8 @@ def _rig(table: dict, path: Path) -> Rig:
     if not isinstance(structure, dict):
         raise CaseError(f"{path}: the table [structure] is missing")
     try:
+        if structure.get("kind") == "plate":
+            return _plate_rig(structure, inputs, outputs)
         if structure.get("kind") != "modal":
             return _member_rig(structure, inputs, outputs)
         if "points" in structure:
@@ -127,7 +141,7 @@ def _rig(table: dict, path: Path) -> Rig:
 def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in STRUCTURES:
-        raise CaseError(f"[structure]: kind is beam, rod or modal; got {shown(kind)}")
+        raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
     _check_ports(inputs, outputs, "at")
     common: dict[str, Any] = {
@@ -150,6 +164,33 @@ def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]")) for e in inputs)
     sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]")) for e in outputs)
     return Rig(modes, actuators, sensors, structure=structure)
+
+
+def _plate_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+    check_keys(table, PLATE, "[structure]")
+    _check_ports(inputs, outputs, "at")
+    edges = table.get("edges")
+    if not isinstance(edges, dict):
+        raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
+    check_keys(edges, EDGES, "[structure] edges")
+    a, b = numbers(table, "length", "[structure]", 2)
+    structure = Plate(
+        length=(float(a), float(b)),
+        mass_per_area=number(table, "mass_per_area", "[structure]", low=0.0),
+        bending_stiffness=number(table, "bending_stiffness", "[structure]", low=0.0),
+        poisson_ratio=number(table, "poisson_ratio", "[structure]"),
+        edges={side: text(edges, side, "[structure] edges") for side in EDGES},
+        damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
+    )
+    modes = structure.modes(count(table, "modes", MOST_MODES))
+
+    def pair(entry: dict, where: str) -> Place:
+        x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2)
+        modes.domain.locate((x, y))
+        return (float(x), float(y))
+
+    actuators = tuple(_actuator(e, pair(e, "[[input]]")) for e in inputs)
+    return Rig(modes, actuators, tuple(_sensor(e, pair(e, "[[output]]")) for e in outputs), structure=structure)
 
 
 def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:

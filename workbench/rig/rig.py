@@ -7,6 +7,7 @@ from workbench.rig.elements import Element
 from workbench.rig.sensors import Sensor
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
+from workbench.structure.plate import Membrane, Plate
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +20,7 @@ class Rig:
         sensors: one an output, in the order of the outputs.
         elements: forces at points or all along, linear or not.
         stiffness_rate: the stiffness is 1 + rate t times itself, 1/s; t from the start of a record.
-        structure: the member behind the modes, where it is known; changes of structure are solved anew on it.
+        structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved anew on it.
     """
 
     modes: Modes
@@ -27,7 +28,7 @@ class Rig:
     sensors: tuple[Sensor, ...]
     elements: tuple[Element, ...] = ()
     stiffness_rate: float = 0.0
-    structure: Structure | None = None
+    structure: Structure | Plate | Membrane | None = None
 
     def __post_init__(self) -> None:
         for name in ("actuators", "sensors", "elements"):

@@ -7,13 +7,26 @@ from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
+OWN = 4  # modes that move on their own, for each that is asked for
 
-def attach(modes: Modes, attachments: tuple[Attachment, ...]) -> Modes:
+
+def attach(modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | None = None) -> Modes:
     """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
 
     Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes (`truncation_error`).
     Damping ratios stay with the modes, in order. Where profiles or matrices are known, solve anew instead.
+
+    Args:
+        modes: as many as the changed shapes take.
+        attachments: what is attached.
+        kept: how many modes come out, and how many of those at hand move on their own, four times as many; the others
+            go with the force of each attachment as they do at rest: an error of the order of (ω / ω_kept)⁴. All of
+            them where not given.
+
+    MacNeal, Computers & Structures 1 (1971) 581, on residual flexibility.
     """
+    if kept is not None:
+        return _with_residual(modes, attachments, kept)
     n = modes.n_modes
     mass, stiffness, extra_damping = np.eye(n), np.diag(modes.omega**2), []
     for part in attachments:
@@ -65,6 +78,45 @@ def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.nd
         whole, part = attach(modes, attachments).omega[:half], attach(modes.select(slice(half)), attachments).omega
         error[:half] = np.abs(np.divide(part, whole, out=np.ones(half), where=whole > 0) - 1.0)
     return error
+
+
+def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int) -> Modes:
+    """The lowest modes, from the next few as they are and the rest by their static answer to each attachment."""
+    own = min(OWN * kept, modes.n_modes)
+    moving = [part for part in attachments if not isinstance(part, PointDamper)]
+    rows = np.vstack([np.zeros((0, modes.n_modes)), *(_moved(modes, part, 0) for part in moving)])
+    # each row of `rest` is the rest's static answer to one force, all of them of unit energy and apart from each other
+    _, sizes, answers = np.linalg.svd(rows[:, own:] / modes.omega[own:], full_matrices=False)
+    rest = answers[sizes > 1e-6 * sizes.max(initial=0.0)] / modes.omega[own:]
+    basis = np.zeros((modes.n_modes, own + len(rest)))
+    basis[:own, :own] = np.eye(own)
+    basis[own:, own:] = rest.T
+    full = modes.shapes
+    reduced = Modes(
+        omega=np.zeros(basis.shape[1]),
+        damping=np.zeros(basis.shape[1]),
+        shapes=lambda located, derivative: full(located, derivative) @ basis,
+        domain=modes.domain,
+        essential=modes.essential,
+    )
+    mass, stiffness = basis.T @ basis, basis.T @ (modes.omega[:, None] ** 2 * basis)
+    for part in moving:
+        shapes = _moved(reduced, part, 0)
+        value = part.mass if isinstance(part, PointMass) else part.stiffness
+        target = mass if isinstance(part, PointMass) else stiffness
+        target += value * shapes.T @ shapes
+    eigenvalues, vectors = eigh(stiffness, mass, subset_by_index=[0, kept - 1])
+    vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
+    omega = np.sqrt(np.maximum(eigenvalues, 0.0))
+    through = basis @ vectors
+    changed = Modes(
+        omega=omega,
+        damping=modes.zeta[:kept],
+        shapes=lambda located, derivative: full(located, derivative) @ through,
+        domain=modes.domain,
+        essential=modes.essential,
+    )
+    return attach(changed, tuple(part for part in attachments if isinstance(part, PointDamper)))
 
 
 def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:

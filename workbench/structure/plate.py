@@ -180,11 +180,15 @@ class Plate(_Surface):
         if n_modes < 1:
             raise ValueError(f"at least one mode must be asked for; got {n_modes}")
         heavy = any(isinstance(part, PointMass | PointSpring) for part in self.attachments)
-        simple = all(edge == Edge(HELD, 0.0) for edge in self.edges.values()) and not self.tension[2]
-        constant = self.mass_per_area.is_constant and self.bending_stiffness.is_constant
-        if simple and constant and not heavy and not isinstance(self.damping, ViscousDamping):
+        if self.is_navier and not heavy and not isinstance(self.damping, ViscousDamping):
             return self._with_dampers(self._closed_form(n_modes))
         return self._with_dampers(self._solved(solve(self.ritz_problem(), n_modes, tolerance=tolerance)))
+
+    @property
+    def is_navier(self) -> bool:
+        """Whether, without attachments, the modes are known in closed form: simply supported all round, and constant."""
+        simple = all(edge == Edge(HELD, 0.0) for edge in self.edges.values()) and not self.tension[2]
+        return simple and self.mass_per_area.is_constant and self.bending_stiffness.is_constant
 
     def ritz_problem(self) -> SurfaceProblem:
         """The eigenvalue problem that `surface_ritz` solves."""

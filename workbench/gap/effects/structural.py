@@ -1,7 +1,7 @@
 """Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -14,15 +14,43 @@ from workbench.structure.domain import Between
 from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
-from workbench.structure.supports import HELD, End, PointDamper, PointMass, PointSpring
+from workbench.structure.plate import Membrane, Plate
+from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring
 
-RESOLUTION = 1e-6
+RESOLUTION, ROUGHLY = 1e-6, 1e-4  # of a frequency; of the highest of many
+MANY, FEWER = 60, 6  # modes of a surface for each that is asked for: in closed form, or solved
 EDGE = 1e-9  # of the length
 
 
 def resolved(rig: Rig, structure) -> Rig:
     """The rig with a changed structure and the modes it then has."""
-    return replace(rig, structure=structure, modes=structure.modes(rig.modes.n_modes, tolerance=RESOLUTION))
+    return replace(rig, structure=structure, modes=modes_of(structure, rig.modes.n_modes))
+
+
+def modes_of(structure: Structure | Plate | Membrane, n_modes: int) -> Modes:
+    """The modes of a structure as exactly as a search needs them."""
+    if isinstance(structure, Plate | Membrane):
+        return _modes_of_surface(structure, n_modes)
+    return structure.modes(n_modes, tolerance=RESOLUTION)
+
+
+def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
+    """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many."""
+    facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
+    facts["edges"] = tuple(surface.edges.items())
+    return attach(_bare_modes(type(surface), tuple(facts.items()), n_modes), _attachments(surface), kept=n_modes)
+
+
+def _attachments(structure: object) -> tuple[Attachment, ...]:
+    return getattr(structure, "attachments", ())
+
+
+@lru_cache(maxsize=16)
+def _bare_modes(kind: type, facts: tuple, n_modes: int) -> Modes:
+    """Modes of a plate or membrane without attachments, as many as tell what one does to the lowest `n_modes`."""
+    surface = kind(**{**dict(facts), "edges": dict(dict(facts)["edges"])})
+    in_closed_form = getattr(surface, "is_navier", False)
+    return surface.modes((MANY if in_closed_form else FEWER) * n_modes, tolerance=ROUGHLY)
 
 
 def solved_once(change: Callable[[Rig, Any, dict[str, float]], Rig]) -> Callable[[Rig, Any, dict[str, float]], Rig]:
@@ -52,7 +80,8 @@ def _beam(rig: Rig) -> Beam:
 
 
 def _with_attachment(rig: Rig, part) -> Rig:
-    structure = rig.structure and replace(rig.structure, attachments=(*rig.structure.attachments, part))
+    bare = None if isinstance(rig.structure, Membrane) else rig.structure
+    structure = bare and replace(bare, attachments=(*bare.attachments, part))
     if structure is None or isinstance(part, PointDamper):  # which leaves the modes what they are
         return replace(rig, structure=structure, modes=attach(rig.modes, (part,)))
     return resolved(rig, structure)
@@ -70,6 +99,8 @@ def _modulus(rig: Rig, _, values) -> Rig:
     factor = values["factor"]
     if rig.structure is None:
         return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
+    if isinstance(rig.structure, Plate | Membrane):
+        return _stiffened(rig, rig.structure, factor)
     name = stiffness_name(rig.structure)
     structure = replace(rig.structure, **{name: getattr(rig.structure, name).scaled(factor)})
     if structure.attachments or (isinstance(structure, Beam) and structure.tension):
@@ -77,6 +108,13 @@ def _modulus(rig: Rig, _, values) -> Rig:
     if any(0 < s < HELD for end in (structure.left, structure.right) for s in (end.translation, end.rotation)):
         return resolved(rig, structure)
     return replace(rig, structure=structure, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
+
+
+def _stiffened(rig: Rig, surface: Plate | Membrane, factor: float) -> Rig:
+    """A plate of `factor` times the bending stiffness; a membrane's stiffness is its tension, which is no property."""
+    if isinstance(surface, Membrane):
+        return replace(rig, structure=None, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
+    return resolved(rig, replace(surface, bending_stiffness=surface.bending_stiffness.mapped(lambda d: factor * d)))
 
 
 def _scaled_modes(modes: Modes, factor: float) -> Modes:
@@ -331,7 +369,7 @@ def _damped(rig: Rig, _, values) -> Rig:
     if structure is None or not isinstance(structure.damping, ModalDamping):
         return replace(rig, modes=replace(rig.modes, damping=rig.modes.damping * factor))
     changed = replace(structure, damping=ModalDamping(np.asarray(structure.damping.zeta) * factor))
-    if any(isinstance(part, PointDamper) for part in structure.attachments):
+    if any(isinstance(part, PointDamper) for part in _attachments(structure)):
         return resolved(rig, changed)
     return replace(rig, structure=changed, modes=replace(rig.modes, damping=rig.modes.damping * factor))
 

@@ -8,7 +8,7 @@ import numpy as np
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
-from workbench.gap.effects.structural import RESOLUTION
+from workbench.gap.effects.structural import modes_of
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
@@ -150,7 +150,7 @@ def check_modes(rig: Rig) -> None:
     """
     if rig.structure is None:
         return
-    modes, own = rig.modes, rig.structure.modes(rig.modes.n_modes, tolerance=RESOLUTION)
+    modes, own = rig.modes, modes_of(rig.structure, rig.modes.n_modes)
     remedy = "; take the structure's own modes, or structure=None for modes of your own"
     off = np.abs(modes.omega - own.omega) > STRAY * np.maximum(own.omega, own.omega[-1] / own.n_modes**2)
     if off.any():
