@@ -20,7 +20,8 @@ class Rig:
         sensors: one an output, in the order of the outputs.
         elements: forces at points or all along, linear or not.
         stiffness_rate: the stiffness is 1 + rate t times itself, 1/s; t from the start of a record.
-        structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved anew on it.
+        structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved
+            anew on it.
     """
 
     modes: Modes

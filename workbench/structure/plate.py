@@ -186,7 +186,7 @@ class Plate(_Surface):
 
     @property
     def is_navier(self) -> bool:
-        """Whether, without attachments, the modes are known in closed form: simply supported all round, and constant."""
+        """Whether, but for attachments, the modes have a closed form: constant, simply supported all round."""
         simple = all(edge == Edge(HELD, 0.0) for edge in self.edges.values()) and not self.tension[2]
         return simple and self.mass_per_area.is_constant and self.bending_stiffness.is_constant
 

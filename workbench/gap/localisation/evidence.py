@@ -29,6 +29,7 @@ MOST_PEAKS = 3
 PLACES, FEWER_PLACES = 40, 20  # where a force is looked for: the first, and one beside what is given
 BESIDE, RESOLVED = 0.95, 2e-3  # of the spacing of places
 STILL = 1e-6  # of what moves most: a point, or what is between two, that no force moves
+BROAD, NARROW = 0.1, 0.03  # of a rectangle's diagonal: between tops of its profile, and once they are refined
 FINER = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
 POINTS_TRIED, PAIRS_TRIED = 4, 4  # named points, and pairs of them, whose motion is looked at
 CROWD = 12  # named points, of which all are looked at
@@ -182,7 +183,7 @@ class Evidence:
         order = np.argsort(-self.profile, kind="stable")
         ranked = [self.places[i] for i in order]
         if isinstance(self.domain, Rectangle):
-            return tuple(self._nearby(top) for top in _tops(ranked, self.domain, 1.5 * self._spacing))
+            return self._tops_over(self.domain, ranked)
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
         most = len(points) if len(points) <= CROWD else POINTS_TRIED
@@ -197,13 +198,25 @@ class Evidence:
         """Spacings along the longer side of a rectangle."""
         return max(self.n_places // 2, 16)
 
-    def _nearby(self, top: tuple[float, float]) -> tuple[float, float]:
-        """The likeliest place beside one of a rectangle's grid."""
-        a, b = self.domain.length  # type: ignore[union-attr, misc]
+    def _tops_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
+        """The tops of the profile over a rectangle, and their images: a symmetric plate all but repeats itself."""
+        (a, b), tops = rectangle.length, _apart(ranked, rectangle, BROAD, MOST_PEAKS)
+        mirrored = [image for x, y in tops for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
         offsets = self._spacing * np.arange(-FINER, FINER + 1) / FINER
-        xs, ys = np.clip(top[0] + offsets, 0.0, a), np.clip(top[1] + offsets, 0.0, b)
-        beside = [(float(x), float(y)) for x in xs for y in ys]
-        return beside[int(np.argmin(self._misfits(beside)))]
+        around = [
+            [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
+            for x, y in mirrored
+        ]
+        misfits = self._misfits([where for places in around for where in places]).reshape(len(around), -1)
+        refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
+        judged = self.workers.map(self._misfit, refined)
+        order = np.argsort(judged, kind="stable")
+        return tuple(_apart([refined[i] for i in order], rectangle, NARROW, MOST_PEAKS))
+
+    def _misfit(self, where: Where) -> float:
+        """What one force of any law there leaves, in units of the noise, the ends of records accounted for."""
+        shape = self.rig.modes.phi_at(where)
+        return sum(lines.misfit(shape) for lines in self._lines)
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
@@ -255,12 +268,14 @@ class Evidence:
         return Place(where, *(np.concatenate(series) for series in zip(*pieces, strict=True)))
 
 
-def _tops(ranked: Sequence[tuple[float, float]], rectangle: Rectangle, apart: float) -> list[tuple[float, float]]:
-    """The first few places, best first, that stand apart from those before them, m."""
+def _apart(
+    ranked: Sequence[tuple[float, float]], rectangle: Rectangle, share: float, most: int
+) -> list[tuple[float, float]]:
+    """The first few places, best first, that stand a share of the diagonal apart from those before them."""
     tops: list[tuple[float, float]] = []
     for where in ranked:
-        if all(rectangle.distance(where, other) > apart for other in tops):
+        if all(rectangle.separation(where, other) > share for other in tops):
             tops.append(where)
-        if len(tops) == MOST_PEAKS:
+        if len(tops) == most:
             break
     return tops

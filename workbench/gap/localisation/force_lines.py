@@ -26,6 +26,7 @@ MOST_LINES = 8192  # of a record: of a longer one every so many, which costs pre
 WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
 CHANCE = 2.0  # deviations by which noise may pass for a force in them
 COUNTING = 0.02  # weight below which a line tells nothing
+SCREENED = 300  # lines, the strongest, where many places are compared
 ROUNDS = 4  # of the spectrum of the force, each weighed by the one before
 
 
@@ -100,13 +101,18 @@ class Lines:
 
 
 def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
-    """About what a force leaves where the modes have each of many shapes (n_places, n_modes): the ends are left out."""
+    """About what a force leaves where the modes have each of many shapes (n_places, n_modes).
+
+    The ends of the record are left out, and lines where little is read.
+    """
+    strong = np.argsort(-lines.weights * np.sum(np.abs(lines.left) ** 2, axis=1))[:SCREENED]
+    power = lines.power
+    lines = Lines(lines.answers.on(strong), lines.left[strong], lines.weights[strong])
     to_force = np.moveaxis(np.array([lines.answers.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
-    left = np.full(len(shapes), lines.power)
+    left = np.full(len(shapes), power)
     for h, r, weight in zip(to_force, lines.left, lines.weights, strict=True):
         seen = h @ shapes.T
-        power = np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300)
-        left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2 / power
+        left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2 / np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300)
     return left
 
 
