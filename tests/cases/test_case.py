@@ -73,7 +73,7 @@ def test_what_the_format_cannot_say_is_refused(case, tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ('kind = "beam"', 'kind = "plate"', "beam, rod or modal; got 'plate'"),
+        ('kind = "beam"', 'kind = "shell"', "beam, rod, plate or modal; got 'shell'"),
         ("length = 2.0", "length = -2.0", "length"),
         ('left = "clamped"', 'left = "glued"', "glued"),
         ("modes = 5", "modes = 5.5", "whole number"),

@@ -152,7 +152,7 @@ def _position_starts(evidence, _):
     domain = evidence.rig.modes.domain
     if isinstance(domain, Interval):
         return [{"at": float(x)} for x in domain.length * np.linspace(0.015, 0.985, 41)]
-    return [place_values(where) for where in domain.grid(12)]
+    return [place_values(where) for where in domain.grid(9)]
 
 
 def _movable(targets: Callable[[Rig], tuple]) -> Callable[[Rig], tuple]:
