@@ -200,7 +200,7 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
     while fit.poles.size > 1:
         std = np.sqrt(np.diag(pole_covariance(fit))).reshape(2, -1)
         modes = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), fit.amplitudes, data.places)
-        good = credible(modes, *std, data.highest)
+        good = credible(modes, std[0], std[1], data.highest)
         if good.all() or not good.any():
             break
         out += list(modes.frequencies_hz[~good])

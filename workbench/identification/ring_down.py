@@ -25,7 +25,8 @@ from workbench.structure.modes import SampledModes
 from workbench.threads import one_blas_thread
 
 MOST_MODES = 20
-DRIFT_ROUNDS = 3
+# Rounds of modes and drift, and the degree of the drift before any mode is known.
+DRIFT_ROUNDS, PARABOLA = 3, 2
 # Energy of the second half over that of the first, either way; least correlation of such a record after a third of it.
 AS_STRONG, CORRELATED = 0.5, 0.5
 # Correlation of noise, times the root of its samples, is 1; more is an oscillation.
@@ -155,7 +156,11 @@ def _without_drift(
     records: list[Record], n_modes: int | None, budget: Budget
 ) -> tuple[Identified, list[Record], list[str]]:
     """Modes and drifts in turn, as each disturbs the other, until neither changes."""
-    cleared, size, poles = records, np.zeros((len(records), records[0].n_outputs)), np.zeros(0, complex)
+    poles = np.zeros(0, complex)
+    # A drift as large as the modes would be searched for modes first; a parabola is none.
+    drifts = [without_drift(record, poles, most=PARABOLA) for record in records]
+    size = np.array([drift.size for drift in drifts])
+    cleared = [drift.record for drift in drifts] if size.any() else records
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(DRIFT_ROUNDS):
         found = _identified(cleared, n_modes, budget)
@@ -163,7 +168,10 @@ def _without_drift(
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
         drifts = [without_drift(record, poles) for record in records]
         drifting = any(drift.size.any() for drift in drifts)
-        if not drifting or (poles.size == before.size and size.any()) or budget.spent("removal of drift"):
+        if not drifting and cleared is not records and not budget.unfinished:
+            cleared, size = records, np.zeros_like(size)
+            continue
+        if not drifting or (poles.size == before.size and size.any()) or budget.unfinished:
             break
         cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
     in_noise = size / found.refined.noise

@@ -136,7 +136,7 @@ def identify_transfer(
         inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
         selected = _selected(
-            budget.share(n_bands - k),
+            budget.share(1.0 / (n_bands - k)),
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),

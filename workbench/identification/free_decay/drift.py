@@ -6,7 +6,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.order import FALSE_ALARM
+from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 
@@ -26,7 +26,7 @@ class Drift:
     size: np.ndarray
 
 
-def without_drift(record: Record, poles: np.ndarray) -> Drift:
+def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGREE) -> Drift:
     """A record less a polynomial in time, fitted beside its modes: y_j = Re Σ a_jr e^{λ_r t} + Σ_k p_jk P_k(t).
 
     The degree is the least, of those that oscillate no faster than the slowest mode, by Schwarz's criterion; and
@@ -35,10 +35,11 @@ def without_drift(record: Record, poles: np.ndarray) -> Drift:
     Args:
         record: free decay.
         poles: (n_modes,) of its modes, rad/s; may be empty.
+        most: highest degree.
     """
     n, m = record.n_samples, record.n_outputs
     span = n * record.sample_time
-    highest = int(min(HIGHEST_DEGREE, np.abs(poles).min(initial=np.inf) * span / (2.0 * np.pi), (n - 4) // 4))
+    highest = int(min(most, np.abs(poles).min(initial=np.inf) * span / (2.0 * np.pi), (n - 4) // 4))
     nothing = Drift(record, frozen(np.zeros(m)))
     if highest < 1:
         return nothing

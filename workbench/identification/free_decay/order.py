@@ -21,7 +21,7 @@ from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refined import Identified, in_coloured_noise, unshaped
 from workbench.identification.free_decay.refinement import MOST_STEPS, refine, search
-from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.budget import SEARCH, SECONDS, Budget
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
 from workbench.identification.signal.noise import differ, variances, whitened
 from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, Stepwise, spurious_modes
@@ -93,12 +93,14 @@ def identify_within(
         found = identify_long(records, most_modes=most, false_alarm=false_alarm, budget=budget)
         return found if found is not None else _refuse(records)
     most = min(most_modes or MOST_MODES, fit_in)
-    problem, model = _selected(records, most, false_alarm, budget)
+    search_time = budget.share(SEARCH)
+    problem, model = _selected(records, most, false_alarm, search_time)
     for _ in range(WHITENED):
-        white = None if budget.spent("whitening of the noise") else whitened(records, problem.oscillating(model))
+        white = None if search_time.spent("whitening of the noise") else whitened(records, problem.oscillating(model))
         if white is None:
             break
-        problem, model = _selected(white, most, false_alarm, budget, records)
+        problem, model = _selected(white, most, false_alarm, search_time, records)
+    problem.budget = budget
     return problem.report(model, records) if model.poles.size else _refuse(records)
 
 

@@ -14,6 +14,7 @@ structure, drawn from that covariance.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from warnings import warn
 
 import numpy as np
 from scipy.special import ndtri
@@ -53,6 +54,12 @@ class Bands:
     interpolation_std: np.ndarray
     width: np.ndarray
     level: float
+
+    @property
+    def missed(self) -> np.ndarray:
+        """Former name of `interpolation_std`."""
+        warn("Bands.missed is now Bands.interpolation_std", DeprecationWarning, 2)
+        return self.interpolation_std
 
     @property
     def whole(self) -> tuple[np.ndarray, np.ndarray]:

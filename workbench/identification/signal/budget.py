@@ -3,6 +3,8 @@
 from time import monotonic
 
 SECONDS = 30.0
+# Share of the time in which modes are searched; the rest is for refinement, standard errors and remarks.
+SEARCH = 0.6
 
 
 class Budget:
@@ -28,9 +30,9 @@ class Budget:
             self.unfinished.append(search)
         return True
 
-    def share(self, of: int) -> "Budget":
-        """One part of so many equal ones of the time left; what it leaves unfinished counts here."""
-        part = Budget(None if self.seconds is None else max(self._end - monotonic(), 1e-3) / of)
+    def share(self, share: float) -> "Budget":
+        """A share of the time left, in (0, 1]; what it leaves unfinished counts here."""
+        part = Budget(None if self.seconds is None else share * max(self._end - monotonic(), 1e-3))
         part.unfinished = self.unfinished
         return part
 

@@ -8,6 +8,7 @@ sample rate, behind a low-pass filter that leaves free decay one, for what is to
 """
 
 import numpy as np
+from scipy.linalg.lapack import dgeqrf, dtrtrs
 from scipy.signal import oaconvolve
 from scipy.signal.windows import blackman
 
@@ -19,6 +20,7 @@ MOST_SIGNALS, MOST_SAMPLES = 8, 40_000
 # Fewer means are too few to learn the rule and to test it.
 SHORTEST = (4 + LEVEL_MEMORY) * ORDER
 COARSER = 4
+UPPER = np.triu(np.ones((ORDER + 1, ORDER + 1)))
 # Squared prediction error over its level: alone, where the energy of the motion also rises so many times, and within so
 # many samples of another break, for a force that dies away.
 BREAK, BREAK_RISING, RISE, BREAK_BESIDE, NEAR = 100.0, 25.0, 4.0, 16.0, 8
@@ -95,18 +97,25 @@ def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
         here = y[:, at].reshape(-1)
         if n - t >= 3 * ORDER:
             # Rounding enters as a ridge, and as the least level.
-            r = np.asarray(np.linalg.qr(np.vstack([factor, ridge]), mode="r"))
-            c = np.linalg.solve(r[:ORDER, :ORDER], r[:ORDER, ORDER])
+            r = _triangular(np.vstack([factor, ridge]))
+            c = dtrtrs(r[:ORDER, :ORDER], r[:ORDER, ORDER])[0]
             error = ((here - after @ c).reshape(m, BLOCK) ** 2).mean(axis=0)
             if n - t >= (3 + LEVEL_MEMORY) * ORDER:
                 ratio[at] = error / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
             level, weight = forget_level * level + error.mean(), forget_level * weight + 1.0
         rows = np.vstack([np.sqrt(forget) * factor, np.column_stack([after, here])])
-        factor = np.asarray(np.linalg.qr(rows, mode="r"))
+        factor = _triangular(rows)
     after = np.arange(1, n + 1)
     width = np.minimum(after, np.minimum(ORDER, n - after))
     rises = energy[after] - energy[after + width] > RISE * (energy[after - width] - energy[after])
     return ratio, (ratio > BREAK) | ((ratio > BREAK_RISING) & rises)
+
+
+def _triangular(rows: np.ndarray) -> np.ndarray:
+    """R of an orthogonal factorisation, (at most ORDER + 1, ORDER + 1); straight from LAPACK, for it is called so
+    often."""
+    factored = dgeqrf(rows)[0][: ORDER + 1]
+    return np.asarray(factored * UPPER[: len(factored)])
 
 
 def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:

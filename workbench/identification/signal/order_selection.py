@@ -115,7 +115,8 @@ class Stepwise(Generic[Model, Candidate]):
             self.problem.n_modes(model) < self.most_modes
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
-            and not self.budget.spent("search for further modes")
+            # The first mode is worth the wait.
+            and not (self.problem.n_modes(model) and self.budget.spent("search for further modes"))
         ):
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:

@@ -1,0 +1,73 @@
+"""Identification within a time limit, and what it does not report as modes."""
+
+from time import monotonic
+
+import numpy as np
+import pytest
+
+import workbench as wb
+from workbench.identification.free_decay.refined import Identified, Refined
+from workbench.identification.signal.modal_estimates import credible
+from workbench.identification.signal.synthesis import free_decay
+from workbench.records.record import Channel, Record
+from workbench.structure.modes import SampledModes
+
+MODES = SampledModes(
+    np.array([20.0, 50.0]), np.array([0.01, 0.01]), np.array([[1.0, 0.4], [0.6, -1.0]]), np.array([0.5, 1.5])
+)
+
+
+def hardening(n=40_000, dt=5e-4):
+    """A mode whose frequency falls as it decays, with a weak one beside it: linear models of it have no end."""
+    t = dt * np.arange(n)
+    envelope = np.exp(-1.5 * t)
+    phase = 2.0 * np.pi * 145.0 * t + 30.0 * np.cumsum(envelope) * dt
+    y = envelope * np.cos(phase) + 0.1 * np.exp(-4.0 * t) * np.cos(2.0 * np.pi * 400.0 * t)
+    return Record(dt, y[None] + 1e-3 * np.random.default_rng(0).standard_normal(n), (Channel("v", "velocity"),))
+
+
+def test_a_record_without_end_ends_and_says_so():
+    began = monotonic()
+    found = wb.identify(hardening(), seconds=0.5)
+    assert monotonic() - began < 20.0  # the step that is under way is finished
+    assert found.modes.n_modes >= 1 and "stopped after 0.5 s" in found.remarks[0]
+    assert found.remarks[0] in str(found)
+
+
+def test_time_that_suffices_changes_nothing():
+    record = free_decay(MODES, sample_time=0.01, n_samples=600, noise_std=0.01)
+    limited, unlimited = wb.identify(record), wb.identify(record, seconds=None)
+    assert np.array_equal(limited.modes.omega, unlimited.modes.omega) and not limited.remarks
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0])
+def test_no_time_at_all_is_refused(seconds):
+    with pytest.raises(ValueError, match="seconds must be positive"):
+        wb.identify(free_decay(MODES, sample_time=0.01, n_samples=600), seconds=seconds)
+
+
+def test_what_cannot_be_a_mode():
+    """Damping at and beyond three standard errors below zero; a frequency no better known than itself; beyond
+    Nyquist."""
+    omega = np.array([1.0, 1.0, 1.0, 1.0, 9.0, 11.0])
+    modes = SampledModes(omega, np.array([0.01, -0.02, -0.04, 0.01, 0.01, 0.01]), np.ones((1, 6)), np.array([0.0]))
+    good = credible(modes, np.array([0.1, 0.1, 0.1, 1.5, 0.1, 0.1]), np.full(6, 0.01), nyquist=10.0)
+    assert good.tolist() == [True, True, False, False, True, False]
+
+
+def test_artefacts_join_the_noise():
+    covariance = np.diag([1e-4, 900.0, 1e-6, 1e-6])
+    refined = Refined(MODES, covariance**2, (np.ones((2, 2)),), np.zeros((2, 2, 2)), np.ones((1, 2)), True, 3)
+    none = SampledModes(np.zeros(0), np.zeros(0), np.zeros((2, 0)), MODES.positions)
+    found = Identified(refined, np.array([90.0, 40.0]), 30.0, none, np.zeros(0)).without_artefacts(300.0)
+    assert found.modes.omega.tolist() == [20.0] and found.noise_modes.omega.tolist() == [50.0]
+    assert found.evidence.tolist() == [90.0] and found.noise_evidence.tolist() == [40.0]
+    assert found.covariance.shape == (2, 2) and found.refined.amplitudes[0].shape == (2, 1)
+
+
+def test_results_print_as_the_table_of_modes():
+    found = wb.identify(free_decay(MODES, sample_time=0.01, n_samples=600, noise_std=0.01))
+    head, *rows = str(found).splitlines()
+    assert head.split() == ["mode", "frequency", "[Hz]", "±", "damping", "[%]", "±", "phase", "collinearity"]
+    assert [float(row.split()[1]) for row in rows] == pytest.approx(found.modes.frequencies_hz, rel=1e-3)
+    assert repr(found) == "Identified(2 modes: 3.183, 7.958 Hz)" and found._repr_html_().count("<tr>") == 3
