@@ -31,6 +31,7 @@ from .gap.report.verdict import Verdict as Verdict
 from .identification.ambient import identify_ambient as identify_ambient
 from .identification.driven import identify_driven as identify_driven
 from .identification.free_decay.order import identify as identify
+from .identification.rig_from import rig_from as rig_from
 from .identification.ring_down import ring_down as ring_down
 from .identification.shapes.eigenfunctions import eigenfunctions as eigenfunctions
 from .identification.signal.aliases import aliases as aliases

@@ -1,0 +1,106 @@
+"""From a bench to a rig in one line: what was identified simulates, and answers to an added mass, as the structure."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from workbench.identification.ambient import AmbientModes
+from workbench.identification.driven import identify_driven
+from workbench.identification.rig_from import rig_from
+from workbench.records.record import Channel
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.modes import SampledModes
+from workbench.structure.modification import attach
+from workbench.structure.supports import PointMass
+
+DT, NOISE = 0.02, 1e-4
+PLACES = (0.9, 1.7, 2.6, 3.4)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    """A hinged beam that shows three modes, driven at 0.9 m, where a sensor stands too."""
+    beam = Beam(
+        length=4.0,
+        mass_per_length=1.5,
+        bending_stiffness=20.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping((0.02, 0.015, 0.01)),
+    )
+    sensors = tuple(Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate(PLACES))
+    return Rig(beam.modes(3), (Actuator("F", 0.9),), sensors)
+
+
+@pytest.fixture(scope="module")
+def found(bench):
+    rng = np.random.default_rng(8)
+    record = simulate(bench, rng.normal(size=(1, 3000)), sample_time=DT)
+    noisy = type(record)(
+        sample_time=DT,
+        outputs=record.outputs + NOISE * rng.normal(size=record.outputs.shape),
+        output_channels=record.output_channels,
+        inputs=record.inputs,
+        input_channels=record.input_channels,
+    )
+    return identify_driven(noisy, at_rest=True, feedthrough=False)
+
+
+def test_the_rig_of_identified_modes_simulates_what_the_structure_does(bench, found):
+    rig = rig_from(found)
+    inputs = np.random.default_rng(9).normal(size=(1, 1500))
+    exact = simulate(bench, inputs, sample_time=DT).outputs
+    ours = simulate(rig, inputs, sample_time=DT).outputs
+    assert np.abs(ours - exact).max() < 0.01 * np.abs(exact).max()
+    assert rig.modes.covariance.shape == (6, 6)
+    assert [s.noise_std for s in rig.sensors] == pytest.approx([NOISE] * 4, rel=0.1)
+
+
+def test_a_driving_point_scales_the_shapes_so_that_a_mass_changes_the_modes_as_it_should(bench, found):
+    rig = rig_from(found)
+    changed = attach(rig.modes, (PointMass("d3", 0.8),))
+    expected = attach(bench.modes, (PointMass(2.6, 0.8),))
+    assert abs(expected.omega / bench.modes.omega - 1).max() > 0.05
+    np.testing.assert_allclose(changed.omega, expected.omega, rtol=2e-3)
+
+
+def test_modes_that_nothing_scales_are_said_so(found):
+    elsewhere = [Channel(c.name, c.quantity) for c in found.output_channels]
+    with pytest.warns(UserWarning, match="the shapes have no scale"):
+        rig_from(found, outputs=elsewhere)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scaled = rig_from(found)
+        largest = np.abs(scaled.modes.phi(["d1", "d2", "d3", "d4"])).max(axis=0)
+        by_mass = rig_from(found, outputs=elsewhere, modal_masses=1.0 / largest**2)
+    np.testing.assert_allclose(
+        np.abs(by_mass.modes.phi(["d1", "d2", "d3", "d4"])),
+        np.abs(scaled.modes.phi(["d1", "d2", "d3", "d4"])),
+        rtol=1e-6,
+    )
+
+
+def test_output_only_modes_need_modal_masses(found):
+    modes = SampledModes([2.0, 5.0], [0.01, 0.02], [[0.5, 1.0], [1.0, -0.25]], [np.nan, np.nan])
+    ambient = AmbientModes(modes, np.eye(4), np.ones(2), 0.0, ())
+    channels = (Channel("a", "displacement"), Channel("b", "displacement"))
+    with pytest.raises(ValueError, match="no scale; give modal_masses"):
+        rig_from(ambient, outputs=channels)
+    rig = rig_from(ambient, outputs=channels, modal_masses=[4.0, 0.25], inputs=["b"])
+    np.testing.assert_allclose(rig.modes.phi(["a", "b"]), [[0.25, 2.0], [0.5, -0.5]])
+    assert rig.actuators[0].at == "b"
+
+
+def test_what_does_not_fit_is_refused(found):
+    with pytest.raises(ValueError, match=r"driving_point is \(input, output\), of F and d1, d2, d3, d4"):
+        rig_from(found, driving_point=("F", "d9"))
+    with pytest.raises(ValueError, match="negative mass at the driving point"):
+        rig_from(found, driving_point=("F", "d4"))
+    with pytest.raises(ValueError, match="must name the 4 outputs"):
+        rig_from(found, outputs=[Channel("only", "displacement")])

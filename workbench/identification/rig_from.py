@@ -1,0 +1,194 @@
+"""A rig from the modes that were identified on a bench: known at its inputs and outputs, and nowhere else."""
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from workbench.identification.driven import Driven
+from workbench.identification.transfer import TransferModes
+from workbench.records.record import Channel
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes, SampledModes
+
+COMPLEX = 0.1  # share of a mode's residues that the nearest real mode may leave without a warning
+
+
+def rig_from(
+    identified: Any,
+    *,
+    inputs: Sequence[Channel | str] | None = None,
+    outputs: Sequence[Channel] | None = None,
+    driving_point: tuple[str, str] | None = None,
+    modal_masses: ArrayLike | None = None,
+) -> Rig:
+    """The rig of identified modes, each the nearest real one, mass-normalised where the scale is known.
+
+    The residue of output j and input i at the pole λ is A_ji / (2 i ω_d), and A_ji = φ_j φ_i for a real mode: its
+    nearest one is the largest singular value of Re A. The product is what a simulation needs. Its parts, to which
+    masses and springs answer, follow from a driving point, where φ_i = φ_j, or from modal masses.
+
+    Args:
+        identified: of `identify_driven` or `identify_transfer`, or of `identify_ambient`, `ring_down` or `identify`,
+            which tell no input.
+        inputs: channels of the inputs: not needed from `identify_driven`; where no input was measured, the names of
+            outputs where forces are to act.
+        outputs: channels of the outputs, not needed from `identify_driven`.
+        driving_point: an input and the output at its place; those of one name or place unless given.
+        modal_masses: (n_modes,) kg, for shapes whose largest entry is 1; where there is no driving point.
+
+    Returns:
+        A rig at named points: each input and output is one, by its name.
+
+    Raises:
+        ValueError: channels that are missing, shapes that nothing scales, a driving point where a mode would have a
+            negative mass.
+
+    Warns:
+        UserWarning: modes far from real; modes that nothing scales, so that only responses to these inputs are right.
+
+    Source: Ewins, Modal Testing, 2nd ed., sections 2.4 and 4.4.
+    """
+    modes = identified.modes
+    out = _channels(identified, "output_channels", outputs, modes.shapes.shape[0])
+    measured = [channel.quantity for channel in out]
+    for channel in out:
+        if channel.quantity not in MEASURED:
+            raise ValueError(
+                f"output {channel.name!r} measures {channel.quantity or 'an unnamed quantity'}; give outputs= with one"
+                f" of {', '.join(MEASURED)}"
+            )
+    if isinstance(identified, Driven | TransferModes):
+        into = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
+        shapes, points = _of_residues(identified, modes, out, into, driving_point, modal_masses)
+        actuators = tuple(Actuator(c.name, c.name, kind="moment" if c.quantity == "moment" else "force") for c in into)
+    else:
+        shapes, points = _of_shapes(modes, out, modal_masses)
+        names = [channel if isinstance(channel, str) else channel.name for channel in inputs or ()]
+        points.locate(names)
+        actuators = tuple(Actuator(f"force at {name}", name) for name in names)
+    noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out])
+    sensors = tuple(
+        Sensor(c.name, c.name, quantity, noise_std=float(std))
+        for c, quantity, std in zip(out, measured, np.atleast_1d(noise), strict=True)
+    )
+    order = np.argsort(modes.omega, kind="stable")
+    both = np.r_[order, order + order.size]
+    found = Modes(
+        omega=modes.omega[order],
+        damping=modes.zeta[order],
+        shapes=PointShapes(shapes[:, order]),
+        domain=points,
+        covariance=np.asarray(identified.covariance)[np.ix_(both, both)],
+    )
+    return Rig(found, actuators, sensors)
+
+
+def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None, count: int) -> tuple[Channel, ...]:
+    records = getattr(identified, "records", ()) or getattr(identified, "decays", ())
+    found = given if given is not None else getattr(identified, name, getattr(next(iter(records), None), name, None))
+    side = name.split("_")[0] + "s"
+    if found is None:
+        raise ValueError(f"{type(identified).__name__} does not keep its {side}; give {side}= with {count} channels")
+    channels = tuple(Channel(c) if isinstance(c, str) else c for c in found)
+    if len(channels) != count:
+        raise ValueError(f"{side}= must name the {count} {side} of the identified modes; got {len(channels)}")
+    return channels
+
+
+def _of_residues(
+    identified: Any,
+    modes: SampledModes,
+    out: tuple[Channel, ...],
+    into: tuple[Channel, ...],
+    driving_point: tuple[str, str] | None,
+    modal_masses: ArrayLike | None,
+) -> tuple[np.ndarray, NamedPoints]:
+    """Shapes (n_points, n_modes) at inputs and outputs, and these as named points."""
+    turned = 2j * modes.poles.imag
+    # of displacement, whatever the outputs measure
+    residues = np.einsum("jr,ri,r->rji", modes.shapes, identified.participation, turned)
+    left, sizes, right = np.linalg.svd(residues.real)
+    cost = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
+    for r in np.flatnonzero(cost > COMPLEX):
+        warnings.warn(
+            f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
+            f" {100 * cost[r]:.0f} % of its residues",
+            stacklevel=3,
+        )
+    root = np.sqrt(sizes[:, 0])
+    at_out, at_in = left[:, :, 0].T * root, right[:, 0].T * root
+    pair = _pair(out, into, driving_point)
+    if pair is not None:
+        j, i = pair
+        ratio = at_in[i] / np.where(at_out[j] == 0, np.nan, at_out[j])
+        if not (ratio > 0).all():
+            r = int(np.argmin(np.where(np.isnan(ratio), -np.inf, ratio)))
+            raise ValueError(
+                f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz has a negative mass at the driving point"
+                f" ({into[i].name}, {out[j].name}): is a sensor turned round, or is the mode noise?"
+            )
+    elif modal_masses is not None:
+        largest = np.abs(at_out).max(axis=0)
+        ratio = (1.0 / np.sqrt(_masses(modal_masses, modes.n_modes)) / largest) ** 2
+    else:
+        ratio = np.ones(modes.n_modes)
+        warnings.warn(
+            "no output stands where an input acts, so the shapes have no scale: responses to these inputs are right,"
+            " those to masses, springs or forces elsewhere are not; give driving_point= or modal_masses=",
+            stacklevel=3,
+        )
+    at_out, at_in = at_out * np.sqrt(ratio), at_in / np.sqrt(ratio)
+    names = {channel.name: (channel, row) for channel, row in zip(into, at_in, strict=True)}
+    names |= {channel.name: (channel, row) for channel, row in zip(out, at_out, strict=True)}
+    return np.array([row for _, row in names.values()]), _points([channel for channel, _ in names.values()])
+
+
+def _of_shapes(
+    modes: SampledModes, out: tuple[Channel, ...], modal_masses: ArrayLike | None
+) -> tuple[np.ndarray, NamedPoints]:
+    if modal_masses is None:
+        raise ValueError(
+            "no input was measured, so the shapes have no scale; give modal_masses= for shapes whose largest entry is 1"
+        )
+    largest = modes.shapes[np.argmax(np.abs(modes.shapes), axis=0), np.arange(modes.n_modes)]
+    shapes = (modes.shapes / largest).real / np.sqrt(_masses(modal_masses, modes.n_modes))
+    return shapes, _points(out)
+
+
+def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
+    masses = np.broadcast_to(np.asarray(modal_masses, float), (n_modes,))
+    if not (np.isfinite(masses).all() and (masses > 0).all()):
+        raise ValueError(f"modal_masses must be positive, kg, one a mode; got {modal_masses}")
+    return masses
+
+
+def _pair(
+    out: tuple[Channel, ...], into: tuple[Channel, ...], driving_point: tuple[str, str] | None
+) -> tuple[int, int] | None:
+    """Indices of an output and the input at its place."""
+    if driving_point is not None:
+        i = [channel.name for channel in into]
+        j = [channel.name for channel in out]
+        if driving_point[0] not in i or driving_point[1] not in j:
+            raise ValueError(f"driving_point is (input, output), of {', '.join(i)} and {', '.join(j)}")
+        return j.index(driving_point[1]), i.index(driving_point[0])
+    for j, measured in enumerate(out):
+        for i, acting in enumerate(into):
+            same_place = measured.at is not None and measured.at == acting.at
+            if measured.name == acting.name or same_place:
+                return j, i
+    return None
+
+
+def _points(channels: Sequence[Channel]) -> NamedPoints:
+    """The channels as named points, with positions where all stand along an interval."""
+    along = [channel.at for channel in channels]
+    known = all(isinstance(x, int | float) for x in along)
+    positions = np.array([(x, 0.0, 0.0) for x in along]) if known else None
+    return NamedPoints(tuple(channel.name for channel in channels), positions)
