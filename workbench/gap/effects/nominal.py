@@ -10,6 +10,7 @@ from workbench.gap.effects.effect import Effect, Kind, Parameter
 from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Structure
 from workbench.structure.modes import Shapes
 from workbench.structure.profile import Profile
 
@@ -61,8 +62,9 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
         reach = min(WIDEST * max(std, unit), most)
         return Parameter(name, "", -reach, reach, scale=unit, prior_std=max(std / unit, 1e-6))
 
-    waves = WAVES if rig.structure is not None else 1
-    if prior.stiffness and rig.structure is not None:
+    along = isinstance(rig.structure, Structure)
+    waves = WAVES if along else 1
+    if prior.stiffness and along:
         yield from (believed(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
     if prior.mass:
         yield from (believed(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
@@ -93,7 +95,7 @@ def _off_profiles(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Ri
     """The rig with the errors of its profiles, or of its modal mass."""
     stiffness, mass = _numbered(values, "stiffness"), _numbered(values, "mass")
     structure, modes = rig.structure, rig.modes
-    if structure is None:
+    if not isinstance(structure, Structure):
         factor = float(np.exp(-0.5 * mass[0])) if mass.any() else 1.0
         return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, factor))) if mass.any() else rig
     profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
@@ -114,6 +116,8 @@ _with_profiles = solved_once(_off_profiles)
 def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     """The rig with the errors in its structure and modes; only those of the profiles ask for new modes."""
     along = {name: value for name, value in values.items() if group_of(name) in ("stiffness", "mass")}
+    if not isinstance(rig.structure, Structure):
+        rig = replace(rig, structure=None)  # what follows must change these modes, not solve others anew
     rig = _with_profiles(rig, prior, along)
     frequency, damping = _numbered(values, "frequency"), _numbered(values, "damping")
     if not (frequency.any() or damping.any()):

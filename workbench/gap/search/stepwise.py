@@ -16,6 +16,7 @@ from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pursuit import FINE, one_more
 from workbench.gap.search.search import Search, spread_over_kinds
 from workbench.rig.simulate import is_stepped
+from workbench.structure.member import Structure
 
 
 @dataclass(frozen=True)
@@ -168,7 +169,7 @@ def _resized(errors: Effect) -> Effect:
 
 def prior_of(search: Search) -> NominalPrior:
     """What a nominal model may be off by before any record is seen."""
-    structured = search.rig.structure is not None
+    structured = isinstance(search.rig.structure, Structure)
     return NominalPrior(
         stiffness=0.02 if structured else 0.0,
         mass=0.02,
