@@ -1,7 +1,8 @@
-"""Can the modes, the mass and the stiffness of a tapered bar be read off its ring-down, as section 4.4 says?
+"""Can the modes, the mass and the stiffness of a tapered bar be identified from its ring-down, as section 4.4 says?
 
-A bar with m(x) = EA(x) = 2 (1 - x), fixed at x = 0, is struck at x = 0.63; twenty modes answer. Tables 4.1 to 4.3 and
-Figs. 4.1 to 4.3 of the dissertation are made again in its own setting, beside what this project does by default.
+A bar with m(x) = EA(x) = 2 (1 - x), fixed at x = 0, is excited by an impulse at x = 0.63; twenty modes respond.
+Tables 4.1 to 4.3 and Figs. 4.1 to 4.3 of the dissertation are made again in its own setting, beside what this project
+does by default.
 """
 
 from pathlib import Path
@@ -74,7 +75,7 @@ def study(outcome, data: Path | None = None) -> None:
 
 
 def ring_down(exact, m: int):
-    """Accelerations at i/m (4.31) after a unit blow at 0.63."""
+    """Accelerations at i/m (4.31) after a unit impulse at 0.63."""
     decay = impulse_response_modes(exact, at=0.63, positions=np.arange(1, m + 1) / m)
     return free_decay(decay, sample_time=0.01, n_samples=1500, quantity="acceleration")
 

@@ -1,7 +1,8 @@
-"""From a measured ring-down to a controlled beam: what is found, what is designed, and which mode does it feed?
+"""From a measured ring-down to a controlled beam: what is identified and designed, and which mode does it excite?
 
-A hinged beam is struck; eleven noisy sensors listen. Everything after the first function knows the record, the length,
-the ends and the mass of the beam, never its modes. The law designed on what was found then drives the true beam.
+An impulse excites a hinged beam; eleven noisy sensors record it. Everything after the first function knows the
+record, the length, the ends and the mass of the beam, never its modes. The law designed on the identified modes then
+drives the true beam.
 """
 
 import numpy as np
@@ -91,7 +92,7 @@ def study(outcome, data=None) -> None:
     outcome.figure(
         "ring_down",
         plot_ring_down(record, stretch=120.0),
-        "What was measured: velocity at eleven places after a blow at x = 7.3. Noise is 1 % of the signal.",
+        "What was measured: velocity at eleven places after an impulse at x = 7.3. Noise is 1 % of the signal.",
     )
     outcome.figure(
         "modes",
@@ -209,5 +210,5 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
     sensors = [Sensor(f"y{i + 1}", at, "displacement") for i, at in enumerate(SENSORS)]
     outcome.motion(
         response_motion(shown, actuators=laws["IMSC"].actuators, sensors=sensors),
-        "The same motion: struck at x = 6.3, with nobody at the controls and with four actuators (triangles).",
+        "The same motion after an impulse at x = 6.3, uncontrolled and with four actuators (triangles).",
     )

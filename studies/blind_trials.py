@@ -1,4 +1,4 @@
-"""Which effect hides in each case of a folder whose labels are withheld?"""
+"""Which effect is hidden in each case of a folder whose labels are withheld?"""
 
 from collections.abc import Iterator
 from pathlib import Path

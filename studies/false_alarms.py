@@ -1,4 +1,4 @@
-"""How often does the diagnosis see an effect where none hides? A hundred cases with nothing but sensor noise."""
+"""How often does the diagnosis name an effect where none is hidden? A hundred cases with nothing but sensor noise."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from workbench.trials.make import make_trial
 CASES, SEED = 100, 40000
 
 
-def told(seed: int) -> list[str]:
+def diagnosed(seed: int) -> list[str]:
     """Kinds of the effects that the diagnosis names on a case that hides none."""
     case, _ = make_trial(seed)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1).to_json()
@@ -19,7 +19,7 @@ def told(seed: int) -> list[str]:
 
 def study(outcome, data: Path | None = None) -> None:
     seeds = range(SEED, SEED + CASES)
-    results = Parallel(n_jobs=2, return_as="generator")(delayed(told)(seed) for seed in seeds)
+    results = Parallel(n_jobs=2, return_as="generator")(delayed(diagnosed)(seed) for seed in seeds)
     alarms = {seed: kinds for seed, kinds in zip(outcome.track(seeds, "cases"), results, strict=True) if kinds}
     outcome.table("cases", CASES)
     outcome.table("alarms", alarms)

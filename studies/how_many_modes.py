@@ -1,4 +1,4 @@
-"""How many modes are in need of control, and when does one more spill more than it takes?"""
+"""How many modes need control, and when does one more cause more spillover than it removes?"""
 
 import numpy as np
 

@@ -17,7 +17,7 @@ from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.modes import SampledModes
 
-# The method was worked out on seeds below 1000.
+# The method was developed on seeds below 1000.
 STRUCTURES, FIRST_SEED = 100, 5000
 COUNTS_BELOW, WITHIN = 0.01, 5.0
 
@@ -45,7 +45,7 @@ def random_structure(seed: int):
     return truth, record, noise, level
 
 
-def told(seed: int) -> dict:
+def compared(seed: int) -> dict:
     """How many modes count, are found, are reported, and are reported without being there."""
     truth, record, noise, level = random_structure(seed)
     std = cramer_rao_bound(truth, record, noise_std=noise).omega_std
@@ -69,7 +69,7 @@ def told(seed: int) -> dict:
 
 
 def study(outcome, data: Path | None = None) -> None:
-    rows = [told(seed) for seed in outcome.track(range(FIRST_SEED, FIRST_SEED + STRUCTURES), "structures")]
+    rows = [compared(seed) for seed in outcome.track(range(FIRST_SEED, FIRST_SEED + STRUCTURES), "structures")]
     total = {name: sum(row[name] for row in rows) for name in ("count", "found", "reported", "false")}
     recall, precision = total["found"] / total["count"], 1.0 - total["false"] / total["reported"]
     outcome.table("total", total)

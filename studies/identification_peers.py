@@ -107,7 +107,7 @@ PACKAGES = {SSI: "pyoma2", "LSCF, sdypy-EMA": "sdypy"}
 
 
 def _ringing(poles: np.ndarray):
-    """Frequencies and damping ratios of the poles that swing and decay."""
+    """Frequencies and damping ratios of the underdamped poles."""
     poles = poles[(poles.imag > 0) & (poles.real < 0)]
     omega, zeta = np.abs(poles), -poles.real / np.abs(poles)
     return omega[zeta < MOST_DAMPED], zeta[zeta < MOST_DAMPED]

@@ -1,6 +1,6 @@
 """How near the bound are the modes, whatever the record: several together, one sensor, driven, unknown forces?
 
-Random cantilevers are measured in every way there is, each record 40 dB above its noise. Errors are told in standard
+Random cantilevers are measured in every way there is, each record 40 dB above its noise. Errors are given in standard
 errors of the Cramér-Rao bound, taken from finite differences of the true response; below it no method can be. With
 --data, a folder of ring-downs of a measured arm (arm-ringdown) is read as it came.
 """
@@ -37,7 +37,7 @@ SEEN_ON_THE_ARM = (2.5, 18.0, 53.0, 107.0, 178.5)
 
 
 class Structure:
-    """A cantilever of random damping, measured at random places, struck where each mode answers."""
+    """A cantilever of random damping, measured at random places, excited where each mode responds."""
 
     def __init__(self, seed: int) -> None:
         self.rng = rng = np.random.default_rng(seed)
@@ -47,12 +47,12 @@ class Structure:
         self.poles = self.omega * (-self.zeta + 1j * np.sqrt(1.0 - self.zeta**2))
         self.seen = beam.phi(np.sort(rng.uniform(0.3, 1.0, SENSORS)))
         places = beam.phi(np.linspace(0.3, 1.0, 71))
-        self.struck = rng.choice(places[np.abs(places).min(axis=1) > LEAST_ANSWER * np.abs(places).max()])
+        self.excited = rng.choice(places[np.abs(places).min(axis=1) > LEAST_ANSWER * np.abs(places).max()])
 
     def amplitudes(self, quantities) -> np.ndarray:
         """Of y = Re Σ a z, z' = λ z + u, for each sensor's quantity, (n_outputs, n_modes)."""
         order = np.array([DERIVATIVE[quantity] for quantity in quantities])[:, None]
-        return -1j * self.seen[: len(order)] * self.struck / self.poles.imag * self.poles**order
+        return -1j * self.seen[: len(order)] * self.excited / self.poles.imag * self.poles**order
 
     def figures(self) -> np.ndarray:
         return np.r_[self.omega, self.zeta]
@@ -119,36 +119,36 @@ def one(structure: Structure, *options, **more):
 
 
 def together(structure: Structure):
-    """Three blows: what each tells adds up."""
+    """Three impulses, identified together."""
     every = [free_decay(structure) for _ in range(3)]
     least = np.linalg.inv(sum(np.linalg.inv(least) for _, least in every))
     return identify([record for record, _ in every]).refined, least
 
 
 def held_before(structure: Structure):
-    """A hand sways the beam, and lets go at a time that is not told."""
+    """A hand sways the beam, and lets go at an unknown time."""
     force = np.zeros(HELD + 1)
     force[:HELD] = lfilter([0.15], [1.0, -0.85], structure.rng.standard_normal(HELD))
-    z = swings(structure.poles, force)
+    z = modal_response(structure.poles, force)
     record, least = free_decay(structure, start=z[:, -1])
-    swayed = (structure.amplitudes(ACCELERATIONS) @ z).real + np.outer(structure.seen @ structure.struck, force)
+    swayed = (structure.amplitudes(ACCELERATIONS) @ z).real + np.outer(structure.seen @ structure.excited, force)
     swayed = swayed[:, :HELD]
     quiet = LEVEL * record.outputs.std(axis=1, keepdims=True) * structure.rng.standard_normal(swayed.shape)
-    told = ring_down(replace(record, outputs=np.hstack([swayed + quiet, record.outputs])))
-    late = (told.records[0].start_time - HELD * DT) * structure.omega[-1] / (2.0 * np.pi)
-    return told.refined, least, late
+    decay = ring_down(replace(record, outputs=np.hstack([swayed + quiet, record.outputs])))
+    late = (decay.records[0].start_time - HELD * DT) * structure.omega[-1] / (2.0 * np.pi)
+    return decay.refined, least, late
 
 
 def known_force(structure: Structure):
     """A force that is noise, held over each sample; the state at the first sample is unknown."""
     a = structure.amplitudes(ACCELERATIONS)
-    direct, u = structure.seen @ structure.struck, structure.rng.standard_normal(N)
+    direct, u = structure.seen @ structure.excited, structure.rng.standard_normal(N)
     time = DT * np.arange(N)
 
     def answer(parameters):
         poles, a, rest = parts(parameters, SENSORS)
         direct, offset, start = rest[:SENSORS], rest[SENSORS : 2 * SENSORS], rest[2 * SENSORS :]
-        z = swings(poles, u) + (start[:MODES] + 1j * start[MODES:])[:, None] * np.exp(np.outer(poles, time))
+        z = modal_response(poles, u) + (start[:MODES] + 1j * start[MODES:])[:, None] * np.exp(np.outer(poles, time))
         return (a @ z).real + direct[:, None] * u + offset[:, None]
 
     truth = packed(structure, a, direct, np.zeros(SENSORS + 2 * MODES))
@@ -159,7 +159,7 @@ def known_force(structure: Structure):
     return identify_driven(record), bound(answer, truth, std)
 
 
-def swings(poles: np.ndarray, u: np.ndarray) -> np.ndarray:
+def modal_response(poles: np.ndarray, u: np.ndarray) -> np.ndarray:
     """z' = λ z + u from rest, u held over each sample, (n_modes, n_samples)."""
     steps = np.exp(poles * DT)
     return np.array([lfilter([0.0, (m - 1.0) / p], [1.0, -m], u.astype(complex)) for p, m in zip(poles, steps)])
@@ -176,7 +176,7 @@ def transfer_functions(structure: Structure):
         h = h + above * s**2 / np.abs(s[-1]) ** 2 + below
         return np.hstack([h.real, h.imag])
 
-    truth = packed(structure, a, np.zeros(SENSORS), structure.seen @ structure.struck)
+    truth = packed(structure, a, np.zeros(SENSORS), structure.seen @ structure.excited)
     clean = answer(truth)
     std = LEVEL * np.sqrt((clean**2).mean(axis=1, keepdims=True))
     real, imaginary = np.split(clean + std * structure.rng.standard_normal(clean.shape), 2, axis=1)
@@ -191,8 +191,8 @@ def unknown_forces(structure: Structure):
     outputs = np.zeros((SENSORS, n))
     for _ in range(3):
         push, force = structure.rng.standard_normal(MODES), structure.rng.standard_normal(n)
-        a, direct = structure.amplitudes(ACCELERATIONS) * push, structure.seen @ (structure.struck * push)
-        outputs += (a @ swings(structure.poles, force)).real + direct[:, None] * force
+        a, direct = structure.amplitudes(ACCELERATIONS) * push, structure.seen @ (structure.excited * push)
+        outputs += (a @ modal_response(structure.poles, force)).real + direct[:, None] * force
     outputs += LEVEL * outputs.std() * structure.rng.standard_normal(outputs.shape)
     found = identify_ambient(Record(DT, outputs, channels(ACCELERATIONS)))
     return found, None
@@ -220,8 +220,8 @@ def scored(structure: Structure, way: str) -> dict:
     own = np.concatenate([found.omega_std[r], found.zeta_std[r]])
     errors = np.concatenate([(found.modes.omega[r] - structure.omega[s]), (found.modes.zeta[r] - structure.zeta[s])])
     bound = own if least is None else np.sqrt(np.diag(least))[np.r_[s, s + MODES]]
-    told = {"right": r.size, "told": found.modes.n_modes, "late": late[0] if late else 0.0}
-    return {**told, "own": errors / own, "bound": errors / bound}
+    counts = {"right": r.size, "identified": found.modes.n_modes, "late": late[0] if late else 0.0}
+    return {**counts, "own": errors / own, "bound": errors / bound}
 
 
 def study(outcome, data: Path | None = None) -> None:
@@ -232,13 +232,13 @@ def study(outcome, data: Path | None = None) -> None:
     errors = {way: np.concatenate([row["bound"] for row in each]) for way, each in rows.items()}
     summary = {way: summed(way, rows[way]) for way in WAYS}
     outcome.table("records", summary)
-    for way, told in summary.items():
-        outcome.check(f"{way}: share of the modes told that are there", told["precision"], 0.98, at_least=True)
-        outcome.check(f"{way}: share of the modes there that are told", told["recall"], 0.98, at_least=True)
+    for way, totals in summary.items():
+        outcome.check(f"{way}: share of the modes told that are there", totals["precision"], 0.98, at_least=True)
+        outcome.check(f"{way}: share of the modes there that are told", totals["recall"], 0.98, at_least=True)
         if way == "unknown forces":
             continue
-        outcome.check(f"{way}: rms error over the least possible", told["over_bound"], 1.1)
-        outcome.check(f"{way}: share of 95 % intervals that hold the truth", told["inside"], 0.92, at_least=True)
+        outcome.check(f"{way}: rms error over the least possible", totals["over_bound"], 1.1)
+        outcome.check(f"{way}: share of 95 % intervals that hold the truth", totals["inside"], 0.92, at_least=True)
     unknown = summary["unknown forces"]
     outcome.say(
         f"under unknown forces {100 * unknown['recall']:.0f} % of the modes are found, and 95 % intervals hold the"
@@ -264,10 +264,10 @@ def study(outcome, data: Path | None = None) -> None:
 
 def summed(way: str, rows: list[dict]) -> dict:
     apart, own = (np.concatenate([row[name] for row in rows]) for name in ("bound", "own"))
-    right, told = (sum(row[name] for row in rows) for name in ("right", "told"))
+    right, identified = (sum(row[name] for row in rows) for name in ("right", "identified"))
     return {
         "records": len(rows),
-        "precision": right / told,
+        "precision": right / identified,
         "recall": right / (MODES * len(rows)),
         "bound": "none known: its own errors" if way == "unknown forces" else "Cramér-Rao",
         "over_bound": float(np.sqrt((apart**2).mean())),
@@ -276,18 +276,18 @@ def summed(way: str, rows: list[dict]) -> dict:
 
 
 def by_amplitude(outcome) -> None:
-    """A swing on a hardening spring beside linear ones: x'' + 2ζω x' + ω² x + κ x³ = 0, ω(A) = ω + 3κA²/8ω."""
+    """A mass on a hardening spring beside linear ones: x'' + 2ζω x' + ω² x + κ x³ = 0, ω(A) = ω + 3κA²/8ω."""
     omega, zeta, kappa, time = 10.0, 0.004, 6.0, 0.02 * np.arange(3000)
     swing = solve_ivp(
         lambda t, y: [y[1], -2.0 * zeta * omega * y[1] - omega**2 * y[0] - kappa * y[0] ** 3],
         (0.0, time[-1]), [1.0, 0.0], t_eval=time, method="DOP853", rtol=1e-8, atol=1e-10,
     ).y[0]  # fmt: skip
     noise = 1e-3 * np.random.default_rng(FIRST_SEED).standard_normal(time.size)
-    told = ring_down(Record(0.02, (swing + noise)[None], (Channel("x", "displacement"),)), n_modes=1).by_amplitude
-    backbone = omega + 3.0 * kappa * told.amplitude[:, 0] ** 2 / (8.0 * omega)
-    apart = np.nanmax(np.abs(told.omega[:, 0] - backbone)) / np.nanmax(backbone - omega)
-    outcome.table("backbone", {"amplitude": told.amplitude[:, 0], "omega": told.omega[:, 0], "exact": backbone})
-    outcome.check("hardening spring: dependence on amplitude not seen", 0 if told.depends.all() else 1, 0)
+    decay = ring_down(Record(0.02, (swing + noise)[None], (Channel("x", "displacement"),)), n_modes=1).by_amplitude
+    backbone = omega + 3.0 * kappa * decay.amplitude[:, 0] ** 2 / (8.0 * omega)
+    apart = np.nanmax(np.abs(decay.omega[:, 0] - backbone)) / np.nanmax(backbone - omega)
+    outcome.table("backbone", {"amplitude": decay.amplitude[:, 0], "omega": decay.omega[:, 0], "exact": backbone})
+    outcome.check("hardening spring: dependence on amplitude not seen", 0 if decay.depends.all() else 1, 0)
     outcome.check("hardening spring: error of the backbone over its rise", apart, 0.1)
     alarms = 0
     for k in range(DRAWS):
@@ -302,10 +302,10 @@ def by_amplitude(outcome) -> None:
 def arm(outcome, data: Path) -> None:
     """Modes of the measured arm that stand in its spectra."""
     table = np.loadtxt(data / "hold_and_release_1.txt")
-    told = ring_down(Record(0.002, table[:, -1][None], (Channel("a", "acceleration"),)))
-    found = told.modes.frequencies_hz
+    decay = ring_down(Record(0.002, table[:, -1][None], (Channel("a", "acceleration"),)))
+    found = decay.modes.frequencies_hz
     apart = [float(np.abs(found / seen - 1.0).min()) for seen in SEEN_ON_THE_ARM]
-    outcome.table("arm", {"start": told.records[0].start_time, "frequencies_hz": found, "zeta": told.modes.zeta})
+    outcome.table("arm", {"start": decay.records[0].start_time, "frequencies_hz": found, "zeta": decay.modes.zeta})
     outcome.check("arm: frequencies seen by eye and the nearest found, relative", max(apart), 0.02)
-    outcome.say(f"the hand leaves the arm at {told.records[0].start_time:.3f} s; modes at "
+    outcome.say(f"the hand leaves the arm at {decay.records[0].start_time:.3f} s; modes at "
                 + ", ".join(f"{f:.4g}" for f in found) + " Hz")  # fmt: skip

@@ -51,7 +51,7 @@ def noisy(truth: SampledModes, n_samples: int, level_db: float, seed: int) -> tu
     return free_decay(truth, sample_time=1.0, n_samples=n_samples, noise_std=noise, seed=seed), noise
 
 
-def told(truth: SampledModes, record: Record, noise: float) -> tuple[dict, np.ndarray]:
+def compared(truth: SampledModes, record: Record, noise: float) -> tuple[dict, np.ndarray]:
     """Modes that count, found, not there, what it cost; errors (2, n_found) of ω and ζ over the bound."""
     start, own = perf_counter(), process_time()
     found = identify(record)
@@ -94,7 +94,7 @@ def many_structures(outcome) -> None:
     for level, seed in outcome.track(cases, "structures"):
         sensors = int(np.random.default_rng(seed).integers(8, 61))
         truth = random_structure(seed, MODES, sensors, SAMPLES)
-        row, error = told(truth, *noisy(truth, SAMPLES, level, seed))
+        row, error = compared(truth, *noisy(truth, SAMPLES, level, seed))
         rows.append({"level_db": level, "seed": seed, **row})
         errors.append(error)
     total = {name: sum(row[name] for row in rows) for name in ("count", "found", "reported", "false")}
@@ -118,7 +118,7 @@ def study(outcome, data: Path | None = None) -> None:
     rows = []
     for part in outcome.track(PARTS, "lengths"):
         record, noise = noisy(truth, FULL_SAMPLES // part, FULL_DB, FIRST_SEED)
-        row, errors = told(truth, record, noise)
+        row, errors = compared(truth, record, noise)
         row["processor_seconds_over_transforms"] = row["processor_seconds"] / transforms(record)
         rows.append(row)
         outcome.say(

@@ -1,4 +1,4 @@
-"""Is a local loss of stiffness found and placed from noisy sensors, when neither mass nor stiffness is known?
+"""Is a local loss of stiffness detected and located from noisy sensors, when neither mass nor stiffness is known?
 
 Bars and beams of random smooth mass and stiffness, solved by scikit-fem, lose a fifth of their stiffness over a tenth
 of their length at a random place, or nothing. Twelve accelerometers record the ring-down after a random blow: six
@@ -19,7 +19,7 @@ from workbench.identification.updating.local_loss import LocatedDamage, locate_d
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes
 
-# The method was worked out on seeds below 1000.
+# The method was developed on seeds below 1000.
 FIRST_SEED, CASES, FEWER = 5000, 25, 5
 SHARE, WIDTH, LEVEL_DB, MODES = 0.2, 0.1, 40.0, 6
 LOWER_LEVELS = (20.0, 0.0)

@@ -1,4 +1,4 @@
-"""How often does the diagnosis name what hides, on cases made by finite elements with sealed labels?"""
+"""How often does the diagnosis name the hidden effect, in blind trials simulated by finite elements?"""
 
 from pathlib import Path
 from time import process_time
@@ -14,7 +14,7 @@ CASES, SEED = 200, 845211
 
 
 def trial(kinds, seed):
-    """One blind trial: the score of the diagnosis, what it told, and the processor time of it all, s."""
+    """One blind trial: the score of the diagnosis, its verdict, and the processor time of it all, s."""
     begun = process_time()
     held = hold_trials(1, seed, kinds=[kinds])
     (score,), (verdict,) = held.scores.values(), held.verdicts.values()
@@ -52,4 +52,4 @@ def study(outcome, data: Path | None = None) -> None:
         if one["kinds"] and one["family"] in ("single", "pair") and one["shrinkage"].get("validate") is not None
     )
     outcome.check("median share of the closable gap closed", closed[len(closed) // 2], 0.95, at_least=True)
-    outcome.figure("confusion", plot_confusion(held), "What hid against what was told, in blind cases.")
+    outcome.figure("confusion", plot_confusion(held), "Hidden against named effects, in blind trials.")

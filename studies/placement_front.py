@@ -1,4 +1,4 @@
-"""What does less spillover cost, is an optimum the best there is, and what does the rule of the nodes give away?"""
+"""What does less spillover cost, is an optimum global, and how far from it are the nodes of mode n+1?"""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Does a design live on every structure that the measurement leaves possible, and does it follow one that drifts?"""
+"""Does a design stay stable on every structure within the identification uncertainty, and when the structure drifts?"""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""It works on the reduced model and fails on the full one: which mode did it, by which path, and what settles it?"""
+"""A design stable on the reduced model fails on the full one: which mode, by which path, and what restores it?"""
 
 import numpy as np
 

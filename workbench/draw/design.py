@@ -319,7 +319,5 @@ def plot_switching(law: OnOffLaw, switched: Switched, which: int = 0) -> Figure:
         inside = (tau >= 0) & (response.time <= s.end)
         pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])
     axes[1].plot(response.time, pushes, color=COLOURS[0])
-    axes[1].set(
-        xlabel="time [s]", ylabel="modal force", title="modal force; its mean where the mode slides"
-    )
+    axes[1].set(xlabel="time [s]", ylabel="modal force", title="modal force; its mean where the mode slides")
     return figure

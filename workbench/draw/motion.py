@@ -21,7 +21,7 @@ def response_motion(
 
     Args:
         responses: by the name under which each is shown; all over the same times and of the same modes' number.
-        actuators, sensors: marked where they stand.
+        actuators, sensors: marked at their places.
 
     Raises:
         ValueError: responses over different times.
@@ -55,7 +55,7 @@ def mode_motion(
     actuators: Sequence[Actuator] = (),
     sensors: Sequence[Sensor] = (),
 ) -> dict:
-    """Mode shapes swinging, one mode at a time; several sets of modes over each other, each scaled to one.
+    """Mode shapes in motion, one mode at a time; several sets of modes over each other, each scaled to one.
 
     Sampled modes are shown at their sensors, with the phase that each sensor has.
     """
@@ -70,7 +70,7 @@ def mode_motion(
             shapes = found.phi(x).astype(complex)
         order = np.argsort(x)
         shapes = shapes[order] / np.maximum(np.abs(shapes).max(axis=0), 1e-300)
-        # two sets of modes swing together, whatever the sign of each
+        # two sets of modes move together, whatever the sign of each
         if tracks and isinstance(found, Modes) and tracks[0]["x"] == _numbers(x):
             n = min(shapes.shape[1], len(tracks[0]["real"][0]))
             aligned = np.sign(np.sum(shapes[:, :n].real * np.array(tracks[0]["real"])[:, :n], axis=0))

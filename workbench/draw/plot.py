@@ -112,7 +112,7 @@ def _(result: Placement) -> Figure:
     numbers = result.positions.size + 1 + np.arange(result.by_mode.size)
     ax.bar(numbers, result.by_mode)
     where = ", ".join(f"{x:.3g}" for x in result.positions)
-    ax.set(xlabel="residual mode", ylabel="work spilled, W_r", xticks=numbers)
+    ax.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers)
     ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
     return figure
 

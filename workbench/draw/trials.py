@@ -18,19 +18,19 @@ BOTH, OTHER = "both of the two", "another two"
 
 
 def plot_confusion(tally: Tally) -> Figure:
-    """What hid against what was told, one square a case or more; on the diagonal, the right answers."""
+    """Hidden against named effects, one square a case or more; on the diagonal, the right answers."""
     counts = _gathered(tally)
     rows = sorted({hidden for hidden, _ in counts}, key=_order)
-    columns = rows + sorted({told for _, told in counts} - set(rows), key=_order)
+    columns = rows + sorted({named for _, named in counts} - set(rows), key=_order)
     figure, ax = new_figure(width=3.6 + 0.27 * len(columns), height=2.6 + 0.24 * len(rows))
-    for (hidden, told), count in counts.items():
-        x, y, right = columns.index(told), rows.index(hidden), hidden == told
+    for (hidden, named), count in counts.items():
+        x, y, right = columns.index(named), rows.index(hidden), hidden == named
         ax.add_patch(_square(x, y, COLOURS[0] if right else COLOURS[1]))
         ax.text(x, y, str(count), ha="center", va="center", color="white", fontsize=8)
     ax.plot([-0.5, len(rows) - 0.5], [-0.5, len(rows) - 0.5], color=GREY, linewidth=0.6, zorder=0)
     ax.set_xticks(range(len(columns)), [_plain(c) for c in columns], rotation=90, fontsize=8)
     ax.set_yticks(range(len(rows)), ["two effects" if r == BOTH else _plain(r) for r in rows], fontsize=8)
-    ax.set(xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6), xlabel="told", ylabel="hidden")
+    ax.set(xlim=(-0.6, len(columns) - 0.4), ylim=(len(rows) - 0.4, -0.6), xlabel="named", ylabel="hidden")
     total = sum(of for _, of in tally.shares.values())
     words = "; ".join(f"{_FAMILY[family]} {right} of {of}" for family, (right, of) in tally.shares.items())
     ax.set_title(f"{total} blind cases, numbers of cases, blue right and orange wrong.\n{words}")
@@ -53,11 +53,11 @@ def plot_times(seconds: Mapping[str, Sequence[float]], limits: Mapping[str, floa
 def _gathered(tally: Tally) -> dict[tuple[str, str], int]:
     """Counts with all pairs in one row and two columns."""
     gathered: dict[tuple[str, str], int] = {}
-    for (hidden, told), count in tally.counts.items():
+    for (hidden, named), count in tally.counts.items():
         if " + " in hidden:
-            key = (BOTH, BOTH if told == hidden else OTHER if " + " in told else told)
+            key = (BOTH, BOTH if named == hidden else OTHER if " + " in named else named)
         else:
-            key = (hidden, OTHER if " + " in told else told)
+            key = (hidden, OTHER if " + " in named else named)
         gathered[key] = gathered.get(key, 0) + count
     return gathered
 

@@ -132,7 +132,7 @@ def run_study(study: StudyFile, data: Path | None, outcome: Outcome, root: Path)
 
 
 def _inputs(study: StudyFile, data: Path | None) -> dict[str, str]:
-    """The script, and what tells the data from others."""
+    """The script, and a checksum of the data."""
     found = {f"studies/{study.path.name}": study.path.read_text(encoding="utf-8")}
     if data is not None and data.is_file():
         found["data (SHA-256)"] = f"{hashlib.sha256(data.read_bytes()).hexdigest()}  {data.name}"

@@ -1,4 +1,4 @@
-"""Where cases are worked: in this process, in processes of this machine, or on a Dask cluster."""
+"""Where cases are computed: in this process, in processes of this machine, or on a Dask cluster."""
 
 import functools
 import sys
@@ -25,7 +25,7 @@ MOST_BARREN = 2
 
 @dataclass(frozen=True)
 class Job:
-    """One case to be worked.
+    """One case to be computed.
 
     Attributes:
         key: of its result.
@@ -109,7 +109,7 @@ def here(function: Callable, jobs: list[Job]) -> Iterator[tuple[str, dict]]:
 def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tuple[str, dict]]:
     """In processes of this machine, in the order in which they end.
 
-    A case whose process dies takes the others' processes with it. Those that were running then are worked again, each
+    A case whose process dies takes the others' processes with it. Those that were running then are computed again, each
     on its own; what dies alone has only itself to blame.
 
     Raises:

@@ -174,7 +174,7 @@ class _Walk:
             parts = value.__reduce_ex__(4)
         except Exception as error:
             raise StudyError(
-                f"{where} is a {type(value).__name__}, of which nothing tells whether it is the same next time:"
+                f"{where} is a {type(value).__name__}, which cannot be compared from run to run:"
                 " build it inside the function, or run with cache=None"
             ) from error
         self.add(type(value).__module__, type(value).__qualname__)

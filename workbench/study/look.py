@@ -66,9 +66,9 @@ def _record(record: Record, path: Path) -> Look:
     faults = data_faults(record)
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
     remarks = [fault.message for fault in faults]
-    untold = [channel.name for channel in channels if not channel.quantity]
-    if untold:
-        remarks.append(f"the file states no quantity for {', '.join(untold)}: their units are as recorded")
+    unstated = [channel.name for channel in channels if not channel.quantity]
+    if unstated:
+        remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
     forces = [] if inputs else [n for n in record.output_names if n not in faulty and FORCES.search(n)]
     options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
     if forces:

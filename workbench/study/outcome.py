@@ -24,7 +24,8 @@ class Outcome:
         name: of the study.
         title: the question it answers.
         figures_folder: where figures are saved.
-        on_say, on_track, on_report: told each line, each iterable to show progress for, and how far a run is.
+        on_say, on_track, on_report: called with each line, each iterable to show progress for, and the
+            progress of a run.
         cache: folder where results of cases are kept.
         scheduler: address of a Dask scheduler that takes the cases of every run; None for processes here.
     """

@@ -47,7 +47,7 @@ class Story:
     versions: Mapping[str, str] = field(default_factory=versions)
 
     def to_json(self) -> dict:
-        """Plain JSON, told from others by its "format"."""
+        """Plain JSON, marked by its "format"."""
         return {"format": FORMAT, **asdict(self)}
 
 

@@ -46,7 +46,7 @@ def case_story(folder: Path) -> Story:
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
     beside = plot_responses({"nominal": rig}, records)
-    told = "Measured beside the nominal model, at the sensor and in the stretch where they differ most."
+    caption = "Measured beside the nominal model, at the sensor and in the stretch where they differ most."
     rows = [
         (r.name, "fit" if r in case.fit else "validate", r.n_samples, r.sample_rate_hz, float(r.inputs.std()))
         for r in records
@@ -55,7 +55,7 @@ def case_story(folder: Path) -> Story:
     return Story(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
-        blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, told)],
+        blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, caption)],
         tables=[
             ("Records", ("record", "use", "samples", "sample rate [Hz]", "input rms"), rows),
             ("Nominal modes", ("mode", "frequency [Hz]", "damping ratio"), modes),
@@ -66,7 +66,7 @@ def case_story(folder: Path) -> Story:
 
 
 def story_in(path: Path) -> Story:
-    """The story that a JSON file holds or tells.
+    """The story that a JSON file holds, or that is made of it.
 
     Raises:
         StudyError: no such file, no JSON, or JSON of something else.
@@ -87,13 +87,13 @@ def story_in(path: Path) -> Story:
         if content["format"] != FORMAT:
             raise StudyError(f"{path} has the format {content['format']!r:.60}; this workbench reads {FORMAT!r}")
         return story_of(content)
-    tell = next((tell for key, tell in KINDS.items() if key in content), _anything)
+    write = next((write for key, write in KINDS.items() if key in content), _anything)
     try:
-        told = tell(content)
+        parts = write(content)
     except (KeyError, TypeError, AttributeError, ValueError, IndexError, ArithmeticError) as error:
-        looks = (tell.__doc__ or "").rstrip(".")
+        looks = (write.__doc__ or "").rstrip(".")
         raise StudyError(f"{path} looks like {looks[:1].lower()}{looks[1:]}, but is damaged: {error!r:.120}") from error
-    story = {"title": path.stem.replace("_", " "), "tables": _tables(content), **told}
+    story = {"title": path.stem.replace("_", " "), "tables": _tables(content), **parts}
     return Story(made_by=f"workbench report {path.name}", **story)
 
 
@@ -204,7 +204,7 @@ def _designed(content: dict) -> dict:
         "lead": "" if not sensed else _stability(loops, unstable),
         "standing": "" if not sensed else "bad" if len(unstable) == len(loops) else "part" if unstable else "good",
         "blocks": [
-            block(plot_two_works(works, first=len(controlled)), "Work that each law puts into each residual mode."),
+            block(plot_two_works(works, first=len(controlled)), "Spillover work of each law in each residual mode."),
             block(plot_poles(poles), "Closed-loop poles."),
         ],
         "tables": [
@@ -249,14 +249,14 @@ def _placed(content: dict) -> dict:
     n = len(content.get("controlled", ()))
     return {
         "title": "Actuator placement",
-        "lead": f"Actuators at {_between(places[0])} m spill W_R = {float(first):.4g}.{proof}",
+        "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g}.{proof}",
         "standing": "good" if bound is not None else "",
         "lines": [f"The search ended with: {placements[0]['status']}."],
         "blocks": [
             block(
                 plot_places(dict(zip(names, places, strict=True)), content.get("length")), "Where the actuators stand."
             ),
-            block(plot_two_works(works, first=n), "Work that each placement spills into each residual mode."),
+            block(plot_two_works(works, first=n), "Spillover work of each placement in each residual mode."),
         ],
         "tables": [("Placements", ("placement", "W_R", "effort", "peak force", "condition of B", "places [m]"), rows)],
     }

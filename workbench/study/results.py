@@ -22,7 +22,7 @@ class Result:
 
     Attributes:
         parameters: of the case.
-        seed: it was worked with; None where the function takes none.
+        seed: it was computed with; None where the function takes none.
         values: by name; empty where the case failed.
         error: what it raised, in a line; None where it did not.
         trace: of the error, for the developer.
@@ -98,7 +98,7 @@ class Results(Sequence):
         return rows
 
     def write(self, path: str | Path) -> Path:
-        """Write the table: .csv, .parquet (with pyarrow) or .json, told by the ending.
+        """Write the table: .csv, .parquet (with pyarrow) or .json, by its ending.
 
         In CSV, lists and arrays are written as JSON, and numbers so that they read back bit for bit.
 

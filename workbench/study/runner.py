@@ -1,4 +1,4 @@
-"""Many cases of a study: each worked once, kept as soon as it is done, and taken up again after any interruption."""
+"""Many cases of a study: each computed once, kept as soon as it is done, and resumed after any interruption."""
 
 import inspect
 import warnings
@@ -30,7 +30,7 @@ def run(
 
     A result is kept under a name made of the function (its code and all that reaches), the versions of what computes,
     the case and its seed, so that a second run works only what is new, changed, failed, or was not finished. What a
-    case raises is kept beside the results of the others. Cases that are equal are worked once. A file counts with what
+    case raises is kept beside the results of the others. Equal cases are computed once. A file counts with what
     it holds only where a case names it as a `Path`.
 
     Args:
@@ -38,38 +38,38 @@ def run(
         function: of a case's parameters by name; returns a dict of numbers, texts, lists and arrays, or one of these.
             Where it has a parameter `seed` that the case does not give, it gets a seed of the case's own.
         cache: folder where results are kept; None keeps none.
-        workers: processes; one for each core unless given. With one, cases are worked in this process.
+        workers: processes; one for each core unless given. With one, cases are computed in this process.
         scheduler: address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers take the cases instead.
         seed: root of the seeds.
-        report: told what is done, and the share of it, after each case.
+        report: called with what is done, and the share of it, after each case.
 
     Raises:
-        StudyError: no cases; a case or function whose result could not be told from another's; a cluster that does
-            not answer.
+        StudyError: no cases; a case or function whose result could not be distinguished from another's; a cluster
+            that does not answer.
     """
-    told = [checked(case, number) for number, case in enumerate(cases, 1)]
-    if not told:
+    checked_cases = [checked(case, number) for number, case in enumerate(cases, 1)]
+    if not checked_cases:
         raise StudyError("there are no cases to run")
     if workers is not None and workers < 1:
         raise StudyError(f"workers must be at least 1; got {workers}")
-    seeds = _seeds(told, function, seed)
+    seeds = _seeds(checked_cases, function, seed)
     print_ = fingerprint(function) if cache is not None else ""
-    keys = [key_of(case, print_, s) for case, s in zip(told, seeds)]
+    keys = [key_of(case, print_, s) for case, s in zip(checked_cases, seeds)]
     folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{print_[:12]}"
     records = {} if folder is None else _kept(folder, keys)
     jobs = {
         key: Job(key, _arguments(case, s), None if folder is None or scheduler else _file(folder, key))
-        for key, case, s in zip(keys, told, seeds)
+        for key, case, s in zip(keys, checked_cases, seeds)
         if key not in records
     }
-    _tell(report, len(records), len(set(keys)))
+    _report(report, len(records), len(set(keys)))
     unkept = []
-    for key, record in _worked(function, list(jobs.values()), workers, scheduler):
+    for key, record in _computed(function, list(jobs.values()), workers, scheduler):
         records[key] = record
         if folder is not None and scheduler:
             record["unkept"] = keep(_file(folder, key), record)
         unkept += filter(None, [record.get("unkept")])
-        _tell(report, len(records), len(set(keys)))
+        _report(report, len(records), len(set(keys)))
     if unkept:
         warnings.warn(
             f"{len(unkept)} of {len(set(keys))} results could not be kept in {folder} and would be computed again:"
@@ -79,12 +79,12 @@ def run(
     return Results(
         tuple(
             Result(case, _seed_shown(case, s), _values(records[key]), *_ending(records[key]))
-            for case, s, key in zip(told, seeds, keys)
+            for case, s, key in zip(checked_cases, seeds, keys)
         )
     )
 
 
-def _worked(function, jobs, workers, scheduler):
+def _computed(function, jobs, workers, scheduler):
     if not jobs:
         return iter(())
     if scheduler:
@@ -131,6 +131,6 @@ def _name(function) -> str:
     return "".join(c if c.isalnum() or c == "_" else "-" for c in name)
 
 
-def _tell(report, done: int, of: int) -> None:
+def _report(report, done: int, of: int) -> None:
     if report is not None:
         report(f"{done} of {of} cases", done / of)

@@ -37,8 +37,8 @@ def study(outcome, data=None):
     outcome.say(f"The closed loop is {{'stable' if tried.loop.stable else 'unstable'}}.")
     outcome.say("W_R = {{W_R:.3e}} for an effort of {{effort:.3e}}.".format(**found))
     motion = response_motion({{"controlled": tried.response}}, actuators=tried.law.actuators)
-    outcome.motion(motion, "The structure after the blow, controlled; triangles are actuators.")
-    outcome.figure("work", plot_work({{"this design": tried.work}}), "Work that control spills, by residual mode.")
+    outcome.motion(motion, "The structure after the impulse, controlled; triangles are actuators.")
+    outcome.figure("work", plot_work({{"this design": tried.work}}), "Spillover work by residual mode.")
     x = np.linspace(0.0, rig.modes.length, 201)
     outcome.figure("motion", plot_motion({{"controlled": tried.response}}, x), "Displacement over place and time.")
 '''

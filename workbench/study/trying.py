@@ -1,4 +1,4 @@
-"""A design tried out: what actuators, sensors and gains at these places do to a structure after a blow."""
+"""A design tried out: what actuators, sensors and gains at these places do to a structure after an impulse."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
@@ -38,7 +38,7 @@ class Design:
         controlled: how many of the lowest modes.
         weight: R of force against motion, one for each controlled mode; coupled LQR takes the first.
         law: one of LAWS.
-        struck_at: place of a unit blow, m.
+        struck_at: place of a unit impulse, m.
         final_time: until which the work is counted, s.
     """
 
@@ -58,7 +58,7 @@ class Tried:
     Attributes:
         law: in force.
         loop: closed.
-        response: to the blow, at N_TIMES instants.
+        response: to the impulse, at N_TIMES instants.
         work: in every mode, residual modes at rest at first.
         effort: ∫ FᵀF dt up to the final time.
     """
@@ -109,12 +109,12 @@ def start(rig: Rig) -> Design:
     """The design that a rig begins with: its actuators, as many modes as these, its hammer, exact modal coordinates.
 
     Raises:
-        StudyError: plain modal data, which know no places, or no mode that swings.
+        StudyError: plain modal data, which know no places, or no elastic mode.
     """
     _check_along(rig)
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size == 0:
-        raise StudyError("the structure has no mode that swings; ask for more modes")
+        raise StudyError("the structure has no elastic mode; ask for more modes")
     places = sorted({a.at for a in rig.actuators if not a.direct}) or [0.37 * rig.modes.length]
     struck = next((a.at for a in rig.actuators if a.direct), 0.63 * rig.modes.length)
     count = min(len(places), rig.modes.n_modes)

@@ -15,7 +15,9 @@ from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes
 from workbench.study.page import Story, block, to_its_error, write_page
 
-MOVING = "How the nominal model swings, and the corrected one where it differs; circles are sensors, triangles inputs."
+MOVING = (
+    "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
+)
 
 STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
@@ -110,7 +112,7 @@ def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict]:
 
 
 def case_inputs(folder: Path) -> dict[str, str]:
-    """What a case was read from: its description, and what tells its records from others."""
+    """What a case was read from: its description, and checksums of its records."""
     files = sorted(file for file in folder.rglob("*") if file.is_file() and file.name != "case.toml")
     digests = [f"{hashlib.sha256(file.read_bytes()).hexdigest()}  {file.relative_to(folder)}" for file in files]
     text = (folder / "case.toml").read_text(encoding="utf-8")
@@ -118,15 +120,13 @@ def case_inputs(folder: Path) -> dict[str, str]:
 
 
 def _could_show(verdict: Verdict) -> str:
-    """What the records could and could not tell, in a line."""
+    """What the records can and cannot show, in a line."""
     hidden, alike = verdict.readiness.invisible, verdict.readiness.alike
-    text = (
-        f"Before any fit: these records could show all but {len(hidden)} of {len(verdict.readiness.strengths)} effects"
-    )
+    text = f"Before any fit: these records can show all but {len(hidden)} of {len(verdict.readiness.strengths)} effects"
     if hidden:
         named = ", ".join(label.replace("_", " ") for label in hidden[:6])
         text += f" (not {named}{', …' if len(hidden) > 6 else ''})"
     if alike:
-        text += f"; at small strength they could not tell {alike[0][0]} from {alike[0][1]}".replace("_", " ")
+        text += f"; at small strength they cannot distinguish {alike[0][0]} from {alike[0][1]}".replace("_", " ")
         text += f", nor {len(alike) - 1} pairs more" if len(alike) > 1 else ""
     return text + "."

@@ -1,4 +1,4 @@
-// Motion: a structure that swings in one of its modes, or moves as it did over time, without and with control.
+// Motion: a structure that vibrates in one of its modes, or moves as it did over time, without and with control.
 "use strict";
 workbench.COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
 workbench.move = function (root, spec) {
