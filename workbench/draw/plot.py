@@ -19,6 +19,7 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.free_decay.refined import Refined
 from workbench.identification.shapes.bands import Bands
+from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
 from workbench.structure.modes import Modes, SampledModes
 
@@ -27,8 +28,8 @@ MOST_PANELS = 12
 
 @singledispatch
 def plot(result) -> Figure:
-    """A figure of a result: `Record`, `Modes`, `SampledModes`, `Refined`, `Bands`, `Response`, `Spillover`,
-    `Explanation`, `HowMany`, `Placement`, `ModalFilter` or `Verdict`.
+    """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
+    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter` or `Verdict`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -77,6 +78,11 @@ def _(result: SampledModes) -> Figure:
         ax.set_xlabel("x" if placed else "sensor")
     axes[0].legend(fontsize=8)
     return figure
+
+
+@plot.register
+def _(result: ModalEstimates) -> Figure:
+    return plot(result.modes)
 
 
 @plot.register
