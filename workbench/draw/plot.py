@@ -16,11 +16,13 @@ from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.surface import plot_point_modes, plot_surface_modes
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.free_decay.refined import Refined
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
+from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.modes import Modes, SampledModes
 
 MOST_PANELS = 12
@@ -53,6 +55,10 @@ def _(result: Record) -> Figure:
 
 @plot.register
 def _(result: Modes) -> Figure:
+    if isinstance(result.domain, Rectangle):
+        return plot_surface_modes(result, count=MOST_PANELS)
+    if isinstance(result.domain, NamedPoints):
+        return plot_point_modes(result, count=MOST_PANELS)
     x = np.linspace(0.0, result.length, 401)
     shapes = result.phi(x)[:, :MOST_PANELS]
     figure, axes = _panels(shapes.shape[1])

@@ -27,11 +27,38 @@ class ModePairing:
     others: np.ndarray
 
 
+def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, repeated: float = 1e-3) -> np.ndarray:
+    """Modal assurance criterion in which repeated modes of the second set count as the subspace that they span.
+
+    MAC_rs = |P_s φ_r|² / |φ_r|², P_s the projection on the span of all ψ_t with |ω_t / ω_s - 1| chained below
+    `repeated`: any basis of repeated modes agrees alike. Where ω_s stands alone it is the plain criterion.
+
+    Args:
+        first: (n_points, n_first) shapes, real or complex.
+        second: (n_points, n_second).
+        omega: (n_second,) frequencies of the second set, not decreasing.
+        repeated: largest relative step of frequency from one mode to the next of a cluster.
+
+    Returns:
+        (n_first, n_second), between 0 and 1.
+    """
+    cluster = np.cumsum(np.r_[False, np.diff(omega) > repeated * np.maximum(omega[1:], 1e-300)])
+    agreement = mac(first, second)
+    for each in np.unique(cluster):
+        members = np.flatnonzero(cluster == each)
+        if members.size > 1:
+            basis = np.linalg.qr(second[:, members])[0]
+            share = (np.abs(basis.conj().T @ first) ** 2).sum(axis=0) / (np.abs(first) ** 2).sum(axis=0)
+            agreement[:, members] = share[:, None]
+    return agreement
+
+
 def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, frequency: float = 0.1) -> ModePairing:
     """Match measured modes with a model of unknown scale of frequency, each at most once, by shape, then frequency.
 
     A measured mode is the model's if its shape agrees with that of a mode that no other measured mode agrees with
-    better, and if the frequencies keep the model's ratios.
+    better, and if the frequencies keep the model's ratios. Repeated modes of the model are matched as the subspace
+    that they span.
 
     Args:
         measured: shapes at placed sensors.
@@ -39,7 +66,7 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
         shape: least MAC of a match.
         frequency: largest relative difference from the median ratio.
     """
-    agreement = mac(measured.shapes, model.phi(measured.positions))
+    agreement = subspace_mac(measured.shapes, model.phi(measured.positions), model.omega)
     rows, columns = linear_sum_assignment(-np.where(agreement >= shape, agreement, 0.0))
     good = agreement[rows, columns] >= shape
     rows, columns = rows[good], columns[good]

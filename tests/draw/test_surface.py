@@ -1,0 +1,69 @@
+"""What figures of plates and frames show, read back from the figures themselves."""
+
+import numpy as np
+import pytest
+
+from workbench.design.loop.closed_loop import Response
+from workbench.draw.plot import plot
+from workbench.draw.surface import plot_point_modes, plot_surface_modes, plot_surface_motion
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes
+from workbench.structure.plate import Plate
+
+A, B = 1.2, 0.8
+
+
+def panel():
+    plate = Plate(length=(A, B), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="simply supported")
+    return plate.modes(4)
+
+
+def points():
+    """Two masses on one vertical line, moving along x together and apart."""
+    shapes = np.array([[1.0, 1.0], [1.0, -1.0]])
+    domain = NamedPoints(("1x", "2x"), np.array([[0, 1, 0], [0, 2, 0]]), ("x", "x"), ("1", "2"))
+    return Modes([1.0, 3.0], np.zeros(2), lambda index, _: shapes[index], domain)
+
+
+def test_the_nodal_line_stands_where_the_plate_does_not_move():
+    axes = plot_surface_modes(panel()).axes[1]  # mode 2 is sin(2 π x / a) sin(π y / b)
+    lines = np.vstack([path.vertices for path in axes.collections[-1].get_paths()])
+    inside = lines[(np.abs(lines[:, 1] - B / 2) < 0.45 * B) & (np.abs(lines[:, 0] - A / 2) < 0.45 * A)]
+    assert inside.shape[0] > 5
+    np.testing.assert_allclose(inside[:, 0], A / 2, atol=1e-3 * A)
+
+
+def test_sensors_are_drawn_where_they_stand_and_coloured_as_they_read():
+    modes, places = panel(), np.array([(0.3, 0.2), (0.9, 0.2)])
+    dots = plot_surface_modes(modes, places=places, values=modes.phi(places)).axes[1].collections[-1]
+    np.testing.assert_allclose(dots.get_offsets(), places)
+    np.testing.assert_allclose(dots.get_array(), modes.phi(places)[:, 1])
+
+
+def test_motion_has_a_row_a_response_and_a_panel_an_instant():
+    modes, time = panel(), np.linspace(0.0, 1.0, 11)
+    response = Response(time, np.ones((8, 11)), np.zeros((1, 11)), modes)
+    figure = plot_surface_motion({"one": response, "two": response}, [0.0, 0.52, 1.0], struck=(0.2, 0.2))
+    titles = [ax.get_title("left") for ax in figure.axes]
+    assert titles[:6] == ["0 s", "0.5 s", "1 s"] * 2 and figure.axes[3].get_ylabel() == "two"
+
+
+def test_named_points_are_drawn_moved_along_their_directions():
+    axes = plot_point_modes(points(), [("1", "2")]).axes[1]
+    moved = axes.lines[-1].get_xydata()
+    np.testing.assert_allclose(moved[:, 1], [1.0, 2.0])
+    np.testing.assert_allclose(moved[0, 0], -moved[1, 0])
+    assert abs(moved[0, 0]) > 0.1
+
+
+def test_plot_draws_modes_of_any_domain():
+    assert len(plot(panel()).axes) == 4 and len(plot(points()).axes) == 2
+
+
+def test_what_cannot_be_drawn_is_refused():
+    modes = points()
+    with pytest.raises(ValueError, match="rectangle"):
+        plot_surface_modes(modes)
+    bare = Modes([1.0], [0.0], lambda index, _: np.ones((len(index), 1)), NamedPoints(("a", "b")))
+    with pytest.raises(ValueError, match="give positions"):
+        plot_point_modes(bare)

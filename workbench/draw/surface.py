@@ -1,0 +1,172 @@
+"""Figures of plates, membranes and frames: shapes with their nodal lines, and motion at some instants."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from workbench.design.loop.closed_loop import Response
+from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.structure.domain import TRANSLATIONS, NamedPoints, Rectangle
+from workbench.structure.modes import Modes
+
+PER_SIDE = 61  # of the longer one: points where a shape is drawn
+LEVELS = 12  # of colour on each side of zero
+COLUMNS = 4
+SWAY = 0.15  # of the structure's size: the largest motion as drawn
+
+
+def plot_surface_modes(
+    modes: Modes, *, count: int | None = None, places: np.ndarray | None = None, values: np.ndarray | None = None
+) -> Figure:
+    """Shapes over a rectangle, a panel a mode: red up, blue down, the nodal line black.
+
+    Args:
+        count: of the lowest modes; all where not given.
+        places: (n_places, 2) of sensors, m, drawn as circles.
+        values: (n_places, n_modes) found at the sensors, whose colour fills their circles.
+    """
+    count = min(count or modes.n_modes, modes.n_modes)
+    x, y, fields = _over(modes, np.eye(modes.n_modes)[:, :count])
+    columns = min(COLUMNS, count)
+    figure, axes = _panels(modes, count, columns)
+    for r, ax in enumerate(axes):
+        limit = np.abs(fields[r]).max()
+        _coloured(ax, x, y, fields[r], limit)
+        ax.contour(x, y, fields[r].T, levels=[0.0], colors="black", linewidths=1.2)
+        if places is not None and values is not None:
+            dots: Any = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "edgecolors": "black"}
+            ax.scatter(places[:, 0], places[:, 1], s=46, c=values[:, r], linewidths=0.9, **dots)
+        elif places is not None:
+            ax.plot(*places.T, "o", color="black", markerfacecolor="none", markersize=7)
+        ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
+    return figure
+
+
+def plot_surface_motion(
+    responses: Mapping[str, Response],
+    times: Sequence[float],
+    *,
+    actuators: np.ndarray | None = None,
+    struck: tuple[float, float] | None = None,
+) -> Figure:
+    """Displacement of a plate at some instants, a row a response, all in one scale of colour.
+
+    Args:
+        times: s; the nearest instants of each response are drawn.
+        actuators: (n_actuators, 2) places, m, marked by crosses.
+        struck: where the plate was hit, marked by a star.
+    """
+    first = next(iter(responses.values()))
+    figure, grid = new_figure(
+        len(responses), len(times), width=2.6 * len(times), height=2.1 * len(responses), squeeze=False
+    )
+    drawn, instants = {}, {}
+    for name, response in responses.items():
+        nearest = [int(np.argmin(np.abs(response.time - t))) for t in times]
+        instants[name] = response.time[nearest]
+        drawn[name] = _over(response.modes, response.modal[: response.modes.n_modes, nearest])
+    limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values())
+    for row, (name, (x, y, fields)) in zip(grid, drawn.items()):
+        for ax, time, field in zip(row, instants[name], fields):
+            image = _coloured(ax, x, y, field, limit)
+            if actuators is not None:
+                ax.plot(*actuators.T, "x", color="black", markersize=6)
+            if struck is not None:
+                ax.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=11)
+            ax.set_title(f"{time:.3g} s", fontsize=10)
+        row[0].set_ylabel(name, fontsize=11)
+    for ax in grid.flat:
+        _bare(ax, first.modes)
+    figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8)
+    return figure
+
+
+def plot_point_modes(
+    modes: Modes, lines: Sequence[tuple[str, str]] = (), *, count: int | None = None, axes: tuple[int, int] = (0, 1)
+) -> Figure:
+    """Shapes at named points, a panel a mode: the structure at rest grey, moved blue, its nodes joined by lines.
+
+    Args:
+        lines: pairs of nodes to join; without them the points are drawn alone.
+        count: of the lowest modes; all where not given.
+        axes: of the three coordinates, those that the picture shows.
+
+    Raises:
+        ValueError: modes of another domain, or points without positions.
+    """
+    domain = modes.domain
+    if not isinstance(domain, NamedPoints) or domain.positions is None:
+        raise ValueError("shapes at named points are drawn where their positions are known; give positions")
+    count = min(count or modes.n_modes, modes.n_modes)
+    rest, moves = _nodes(domain, modes)
+    size = np.ptp(np.array(list(rest.values())), axis=0).max()
+    columns = min(COLUMNS, count)
+    figure, grid = new_figure(-(-count // columns), columns, width=2.8 * columns, height=3.2, squeeze=False)
+    for r, ax in enumerate(grid.flat[:count]):
+        largest = max(float(np.abs(move[:, r]).max()) for move in moves.values())
+        moved = {node: rest[node] + SWAY * size / largest * moves[node][:, r] for node in rest}
+        for places, colour in ((rest, GREY), (moved, COLOURS[0])):
+            for first, second in lines:
+                ax.plot(*np.array([places[first], places[second]])[:, axes].T, color=colour, linewidth=1.6)
+            ax.plot(*np.array(list(places.values()))[:, axes].T, "o", color=colour, markersize=3)
+        ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
+    for ax in grid.flat:
+        ax.set_aspect("equal")
+        ax.axis("off")
+    return figure
+
+
+def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coordinates x, y and fields (n_columns, n_x, n_y) of modal coordinates (n_modes, n_columns)."""
+    if not isinstance(modes.domain, Rectangle):
+        raise ValueError("a surface is drawn over a rectangle; these modes have another domain")
+    sides = modes.domain.length
+    x, y = (np.linspace(0.0, side, max(round(PER_SIDE * side / max(sides)), 16)) for side in sides)
+    places = np.column_stack([np.repeat(x, y.size), np.tile(y, x.size)])
+    fields = (modes.phi(places) @ columns).T.reshape(-1, x.size, y.size)
+    return x, y, fields
+
+
+def _coloured(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, limit: float):  # type: ignore[no-untyped-def]
+    levels = limit * np.linspace(-1.0, 1.0, 2 * LEVELS + 1)
+    return ax.contourf(x, y, field.T, levels=levels, cmap="RdBu_r", extend="both")
+
+
+def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]:
+    assert isinstance(modes.domain, Rectangle)
+    rows, (a, b) = -(-count // columns), modes.domain.length
+    figure, grid = new_figure(
+        rows, columns, width=2.7 * columns, height=rows * (2.7 * min(b / a, 1.6) + 0.4), squeeze=False
+    )
+    for ax in grid.flat:
+        _bare(ax, modes)
+    for ax in grid.flat[count:]:
+        ax.set_visible(False)
+    return figure, list(grid.flat[:count])
+
+
+def _bare(ax: Axes, modes: Modes) -> None:
+    """Equal axes with the rim as the only frame."""
+    assert isinstance(modes.domain, Rectangle)
+    a, b = modes.domain.length
+    ax.set(aspect="equal", xlim=(0.0, a), ylim=(0.0, b), xticks=[], yticks=[])
+    ax.grid(False)
+    for spine in ax.spines.values():
+        spine.set_visible(True)
+
+
+def _nodes(domain: NamedPoints, modes: Modes) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Of each node its position (3,) and its displacements (3, n_modes)."""
+    shapes = modes.phi(list(domain.names))
+    rest: dict[str, np.ndarray] = {}
+    moves: dict[str, np.ndarray] = {}
+    assert domain.positions is not None
+    for i, (node, direction) in enumerate(zip(domain.nodes, domain.directions)):
+        rest.setdefault(node, domain.positions[i])
+        move = moves.setdefault(node, np.zeros((3, modes.n_modes)))
+        if direction in TRANSLATIONS:
+            move[TRANSLATIONS.index(direction)] = shapes[i]
+    return rest, moves
