@@ -3,8 +3,11 @@
 import sys
 from pathlib import Path
 
+import numpy.typing
+
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
+numpy.typing.ArrayLike = type("ArrayLike", (), {"__module__": "numpy.typing"})  # shown by its name, not as its union
 
 project = "modal-workbench"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "public_names", "command_options"]
@@ -19,7 +22,7 @@ html_show_copyright = False
 
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
-smartquotes = False  # q' is a rate, not a quotation
+smartquotes_action = "D"  # dashes only: q' is a rate, not a quotation
 
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented_params"
