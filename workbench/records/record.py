@@ -8,6 +8,7 @@ import numpy as np
 
 from workbench.structure.domain import Place
 from workbench.structure.modes import frozen
+from workbench.structure.printed import Printed, counted, place_text
 
 if TYPE_CHECKING:
     import control  # takes seconds to import: most who read a record never need it
@@ -51,8 +52,8 @@ class Channel:
         object.__setattr__(self, "unit", self.unit or QUANTITIES.get(self.quantity, ""))
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
+@dataclass(frozen=True, eq=False, repr=False)
+class Record(Printed):
     """Sampled signals with time last, as in python-control.
 
     Attributes:
@@ -114,6 +115,21 @@ class Record:
                         f"record {self.name!r}, channel {channel.name!r}: sample {int(np.argmax(bad))} is"
                         f" {row[bad][0]}; repair or cut it out before use"
                     )
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        rows = [
+            (c.name, kind, c.quantity, c.unit, place_text(c.at), f"{row.std():.3g}", f"{np.abs(row).max():.3g}")
+            for kind, values, channels in (
+                ("input", self.inputs, self.input_channels),
+                ("output", self.outputs, self.output_channels),
+            )
+            for c, row in zip(channels, values, strict=True)
+        ]
+        line = (
+            f"record {self.name!r}, {counted(self.n_inputs, 'input')} and {counted(self.n_outputs, 'output')},"
+            f" {self.n_samples} samples at {self.sample_rate_hz:.6g} Hz, {self.n_samples * self.sample_time:.4g} s"
+        )
+        return line, ("channel", "", "quantity", "unit", "at", "std", "peak"), rows, self.remarks
 
     @property
     def n_samples(self) -> int:

@@ -1,15 +1,17 @@
 """Transfer functions: named, placed spectra of outputs per unit input."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from workbench.records.record import Channel
 from workbench.structure.modes import frozen
+from workbench.structure.printed import Printed, counted, place_text
 
 
-@dataclass(frozen=True, eq=False)
-class TransferFunctions:
+@dataclass(frozen=True, eq=False, repr=False)
+class TransferFunctions(Printed):
     """Measured transfer functions, frequency last.
 
     Attributes:
@@ -43,6 +45,17 @@ class TransferFunctions:
         for kind, names in (("output", self.output_names), ("reference", self.references)):
             if len(set(names)) < len(names):
                 raise ValueError(f"{self.name}: {kind} names must differ; got {names}")
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        rows = [
+            (c.name, c.quantity, c.unit, place_text(c.at), f"{np.abs(values).max():.3g}")
+            for c, values in zip(self.output_channels, self.values, strict=True)
+        ]
+        f = self.frequencies_hz
+        pairs = f"{counted(len(self.output_channels), 'output')} by {counted(len(self.references), 'reference')}"
+        span = f"{f.min(initial=np.inf):.4g} to {f.max(initial=0.0):.4g} Hz"
+        line = f"{self.name}: {pairs}, {f.size} lines, {span}"
+        return line, ("output", "quantity", "unit", "at", "peak"), rows, ()
 
     @property
     def output_names(self) -> tuple[str, ...]:

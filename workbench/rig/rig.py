@@ -1,5 +1,6 @@
 """A rig: what stands in the laboratory."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from workbench.rig.actuators import Actuator
@@ -8,10 +9,11 @@ from workbench.rig.sensors import Sensor
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
+from workbench.structure.printed import Printed, counted, place_text
 
 
-@dataclass(frozen=True, eq=False)
-class Rig:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rig(Printed):
     """Modes, what drives them, what measures them, and what touches them.
 
     Attributes:
@@ -38,3 +40,11 @@ class Rig:
             names = [part.name for part in parts]
             if len(set(names)) != len(names):
                 raise ValueError(f"the {name} of a rig must have different names; got {names}")
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        rows = [(a.name, "actuator", a.kind, place_text(a.at)) for a in self.actuators]
+        rows += [(s.name, "sensor", s.quantity, place_text(s.at)) for s in self.sensors]
+        rows += [("", "element", type(e).__name__, place_text(getattr(e, "at", None))) for e in self.elements]
+        parts = ((self.actuators, "actuator"), (self.sensors, "sensor"), (self.elements, "element"))
+        line = ", ".join([counted(self.modes.n_modes, "mode"), *(counted(len(each), word) for each, word in parts)])
+        return line, ("name", "", "quantity", "at"), rows, ()

@@ -47,6 +47,9 @@ class Interval:
         if not (np.isfinite(self.length) and self.length > 0):
             raise ValueError(f"the length of a structure must be positive; got {self.length}")
 
+    def __str__(self) -> str:
+        return f"0 to {self.length:g} m"
+
     @property
     def size(self) -> float:
         """The length, m."""
@@ -118,6 +121,9 @@ class Rectangle:
         object.__setattr__(self, "length", (float(a), float(b)))
         if not (np.isfinite(self.length).all() and min(self.length) > 0):
             raise ValueError(f"the lengths of a rectangle must be positive; got {self.length}")
+
+    def __str__(self) -> str:
+        return f"{self.length[0]:g} m by {self.length[1]:g} m"
 
     @property
     def size(self) -> float:
@@ -194,7 +200,7 @@ class Rectangle:
 TRANSLATIONS, ROTATIONS = ("x", "y", "z"), ("rx", "ry", "rz")
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class NamedPoints:
     """Places with a name each, a degree of freedom of a node: those of a finite-element model, or of a bench's sensors.
 
@@ -249,6 +255,13 @@ class NamedPoints:
             PlaceError: positions are not known.
         """
         return float(np.linalg.norm(np.ptp(self._positions, axis=0)))
+
+    def __str__(self) -> str:
+        return f"{len(self.names)} named points"
+
+    def __repr__(self) -> str:
+        first = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
+        return f"<NamedPoints: {len(self.names)} points, {first}>"
 
     @property
     def _positions(self) -> np.ndarray:

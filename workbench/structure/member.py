@@ -13,8 +13,9 @@ from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes
 from workbench.structure.polynomials import Segments
+from workbench.structure.printed import Printed
 from workbench.structure.profile import Profile, ProfileLike, as_profile
-from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring, as_end
+from workbench.structure.supports import HELD, NAMED_ENDS, Attachment, End, PointDamper, PointMass, PointSpring, as_end
 from workbench.threads import one_blas_thread
 
 HIGHEST_DEGREE = 60
@@ -29,14 +30,22 @@ INSIDE = (np.arange(8) + 0.5) / 8  # where along a segment the length of waves i
 RIGID = 1e-13  # of the eigenvalue of a half wave: below it a mode moves as a rigid body
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Member:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class _Member(Printed):
     length: float
     mass_per_length: Profile
     left: End
     right: End
     attachments: tuple[Attachment, ...] = ()
     damping: Damping = field(default_factory=ModalDamping)
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        at = self.length * np.array([0.0, 0.5, 1.0])
+        profiles = {name: value for name, value in vars(self).items() if isinstance(value, Profile)}
+        rows = [(name, *(f"{v:.4g}" for v in profile(at))) for name, profile in profiles.items()]
+        ends = f"left {_end_text(self.left)}, right {_end_text(self.right)}"
+        line = f"{type(self).__name__.lower()}, {self.length:g} m, {ends}"
+        return line, ("", *(f"x = {x:.4g} m" for x in at)), rows, tuple(map(str, self.attachments))
 
     def _prepare(self, allowed_ends: tuple[str, ...], stiffness: str) -> None:
         if not (np.isfinite(self.length) and self.length > 0):
@@ -247,6 +256,12 @@ class _Member:
         return matrix
 
 
+def _end_text(end: End) -> str:
+    """The name of an end, as far as stiffnesses of 0 and infinity have one."""
+    names = {(known.translation, known.rotation): name for name, known in NAMED_ENDS.items() if name != "fixed"}
+    return names.get((end.translation, end.rotation), f"on springs of {end.translation:g} N/m and {end.rotation:g} N m")
+
+
 def _carrying(half_waves: float) -> int:
     """The degree of a polynomial that carries so many half waves to ten digits: Bessel's J_k(z) < 1e-10 beyond it."""
     degree = int(np.ceil(0.5 * np.pi * half_waves + 10.0 * half_waves ** (1.0 / 3.0))) + 3
@@ -259,7 +274,7 @@ def _unstable(tension: float) -> str:
     return "the structure is unstable: an eigenvalue ω² is negative; check springs and profiles"
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Bar(_Member):
     """A bar in axial vibration: -(EA u')' = ω² m u (4.26).
 
@@ -308,7 +323,7 @@ class Bar(_Member):
         return self._solve(n_modes, self.axial_stiffness, 0, 0.0, tolerance)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Beam(_Member):
     """An Euler-Bernoulli beam in bending: (EI w'')'' - T w'' = ω² m w.
 

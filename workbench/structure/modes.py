@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, wraps
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.structure.domain import Between, Derivative, Domain, Interval, Where, as_domain
+from workbench.structure.printed import Printed, counted
 
 Shapes = Callable[[np.ndarray, Any], np.ndarray]
 HELD = 1e-9  # of the largest motion anywhere: what moves less is held by a support
@@ -35,8 +36,8 @@ def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
     return np.block([[np.zeros(s.shape), np.eye(len(s))], [-s, -c]])
 
 
-@dataclass(frozen=True, eq=False)
-class Modes:
+@dataclass(frozen=True, eq=False, repr=False)
+class Modes(Printed):
     """Mass-normalised modes, known all over their domain: ∫ m φ_r φ_s dx = δ_rs (2.5).
 
     Each modal coordinate obeys q_r'' + Σ_s c_rs q_s' + ω_r² q_r = f_r (2.10).
@@ -58,10 +59,10 @@ class Modes:
 
     omega: np.ndarray
     damping: np.ndarray
-    shapes: Shapes = field(repr=False)
+    shapes: Shapes
     domain: Domain
     essential: tuple[tuple[float, int], ...] = ()
-    covariance: np.ndarray | None = field(default=None, repr=False)
+    covariance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "domain", as_domain(self.domain))
@@ -82,6 +83,14 @@ class Modes:
         object.__setattr__(self, "damping", frozen(damping))
         if self.covariance is not None:
             object.__setattr__(self, "covariance", frozen(self.covariance))
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        rows = [
+            (str(r + 1), f"{f:.6g}", f"{100 * z:.4g}") for r, (f, z) in enumerate(zip(self.frequencies_hz, self.zeta))
+        ]
+        coupled = () if self.proportional else ("damping couples the modes; the ratios are those of its diagonal",)
+        line = f"{counted(self.n_modes, 'mode')}, {_range_hz(self.frequencies_hz)}, on {self.domain}"
+        return line, ("mode", "frequency [Hz]", "damping [%]"), rows, coupled
 
     @property
     def n_modes(self) -> int:
@@ -208,8 +217,8 @@ class PointShapes:
         return self.values[index]
 
 
-@dataclass(frozen=True, eq=False)
-class SampledModes:
+@dataclass(frozen=True, eq=False, repr=False)
+class SampledModes(Printed):
     """Modes as a measurement gives them: complex, unscaled, known at the sensors only.
 
     Attributes:
@@ -233,6 +242,13 @@ class SampledModes:
                 f"SampledModes with {n} frequencies and {self.positions.size} positions needs zeta ({n},) and shapes"
                 f" ({self.positions.size}, {n}); got {self.zeta.shape} and {self.shapes.shape}"
             )
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        each = enumerate(zip(self.frequencies_hz, self.zeta, self.phase_collinearity))
+        rows = [(str(r + 1), f"{f:.6g}", f"{100 * z:.4g}", f"{mpc:.4f}") for r, (f, z, mpc) in each]
+        sensors = counted(self.positions.size, "sensor")
+        line = f"{counted(self.n_modes, 'mode')} at {sensors}, {_range_hz(self.frequencies_hz)}"
+        return line, ("mode", "frequency [Hz]", "damping [%]", "phase collinearity"), rows, ()
 
     @property
     def n_modes(self) -> int:
@@ -283,3 +299,8 @@ def mac(first: ArrayLike, second: ArrayLike) -> np.ndarray:
         raise ValueError(f"MAC compares shapes at the same places; got {a.shape[0]} and {b.shape[0]} of them")
     norms = np.outer((np.abs(a) ** 2).sum(0), (np.abs(b) ** 2).sum(0))
     return np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300)
+
+
+def _range_hz(frequencies: np.ndarray) -> str:
+    ends = [f"{f:.4g}" for f in (frequencies.min(initial=np.inf), frequencies.max(initial=0.0))]
+    return f"{' to '.join(dict.fromkeys(ends))} Hz" if frequencies.size else "no frequency"

@@ -1,0 +1,42 @@
+"""How a result is printed: a line that sums it up and a short table, as text and in a notebook."""
+
+from collections.abc import Sequence
+from html import escape
+
+
+class Printed:
+    """A result with a line, headings, rows and remarks of its own."""
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        """The line that sums it up, headings, rows, and remarks below the table."""
+        raise NotImplementedError
+
+    def __str__(self) -> str:
+        line, headings, rows, remarks = self._printed()
+        table = [headings, *rows] if rows else []
+        widths = [max(len(row[k]) for row in table) for k in range(len(headings))] if table else []
+        lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths)).rstrip() for row in table]
+        return "\n".join([line, *lines, *remarks])
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self._printed()[0]}>"
+
+    def _repr_html_(self) -> str:
+        line, headings, rows, remarks = self._printed()
+        head = "".join(f"<th>{escape(cell)}</th>" for cell in headings)
+        body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+        below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
+        table = f"<table><tr>{head}</tr>{body}</table>" if rows else ""
+        return f"<p>{escape(line)}</p>{table}{below}"
+
+
+def counted(number: int, word: str) -> str:
+    """A number of things: 1 mode, 2 modes."""
+    return f"{number} {word}{'s' * (number != 1)}"
+
+
+def place_text(place: object) -> str:
+    """A place: x in m, (x, y), a name, or two of these; empty where unknown."""
+    if isinstance(place, tuple):
+        return ", ".join(place_text(part) for part in place)
+    return "" if place is None else f"{place:.4g}" if isinstance(place, int | float) else str(place)
