@@ -29,13 +29,16 @@ QUICK = (
     ("stiffness_drift", "sensor_gain"),
     (),
 )
+CHANNELS = ("kind", "input", "output", "with", "from")
 BY_NAME = {kind.name: kind for kind in CATALOGUE}
 
 
 def _effect(told: dict) -> Effect:
     """The catalogue's own effect with the numbers of a label."""
-    values = {name: value for name, value in told.items() if name not in ("kind", "input", "output")}
+    values = {name: value for name, value in told.items() if name not in CHANNELS}
     target = told.get("input", told.get("output"))
+    if "with" in told or "from" in told:
+        target = (target, told.get("with", told.get("from")))
     if told["kind"] == "support_rotation":
         target = "left" if values.pop("at") == 0 else "right"
     if told["kind"] == "truncated_modes":
@@ -138,9 +141,9 @@ def test_a_bench_that_cannot_show_a_kind_says_so():
 
 
 def test_of_sixty_forty_hide_one_ten_a_pair_five_none_five_something_else():
-    drawn = draw_kinds(60, 1)
+    drawn = draw_kinds(120, 1)
     sizes = Counter("outside" if set(k) & set(OUTSIDE_KINDS) else len(k) for k in drawn)
-    assert sizes == {1: 40, 2: 10, 0: 5, "outside": 5}
+    assert sizes == {1: 80, 2: 20, 0: 10, "outside": 10}
     assert {k for kinds in drawn if len(kinds) == 1 for k in kinds} >= set(KINDS), "every kind stands alone once"
 
 

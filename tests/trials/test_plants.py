@@ -124,6 +124,8 @@ LAWS = {
     "one_sided_stop": lambda w, v, z: -60.0 * max(w - 0.04, 0.0),
     "coulomb_friction": lambda w, v, z: -0.3 * np.tanh(v / 0.02),
     "bouc_wen": lambda w, v, z: -10.0 * z,
+    "two_way_friction": lambda w, v, z: -0.2 * np.tanh(v / 0.02) - 0.1,
+    "quadratic_damper": lambda w, v, z: -3.0 * v * abs(v),
     "point_damper": lambda w, v, z: -0.8 * v,
 }
 EFFECTS = {
@@ -132,6 +134,8 @@ EFFECTS = {
     "one_sided_stop": {"stiffness": 60.0, "gap": 0.04},
     "coulomb_friction": {"force": 0.3, "smoothing_speed": 0.02},
     "bouc_wen": {"stiffness": 10.0, "yield_displacement": 0.03},
+    "two_way_friction": {"force_forward": 0.3, "force_backward": 0.1, "smoothing_speed": 0.02},
+    "quadratic_damper": {"coefficient": 3.0},
     "point_damper": {"coefficient": 0.8},
 }
 

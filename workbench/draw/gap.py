@@ -167,27 +167,9 @@ def _law(chosen, series: np.ndarray, name: str):
     """The fitted law as a line over one variable, where it depends on that variable alone."""
     if not chosen:
         return None
-    effect, v = chosen[0], chosen[0].values
+    law = chosen[0].kind.force_laws.get(name.split()[0])
     grid = np.linspace(series.min(), series.max(), 400)
-
-    def power(w: np.ndarray) -> np.ndarray:
-        return -v["force_at_rms"] * np.abs(w / v["rms"]) ** v["exponent"]
-
-    of_displacement = {
-        "ground_spring": lambda w: -v["stiffness"] * w,
-        "cubic_spring": lambda w: -v["stiffness"] * w**3,
-        "clearance": lambda w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0),
-        "one_sided_stop": lambda w: -v["stiffness"] * np.maximum(w - v["gap"], 0.0),
-        "power_spring": lambda w: np.sign(w) * power(w),
-        "even_spring": power,
-    }
-    of_velocity = {
-        "point_damper": lambda u: -v["coefficient"] * u,
-        "coulomb_friction": lambda u: -v["force"] * np.tanh(u / v["smoothing_speed"]),
-        "power_damper": lambda u: np.sign(u) * power(u),
-    }
-    laws = of_velocity if name.startswith("velocity") else of_displacement
-    return (grid, laws[effect.kind.name](grid)) if effect.kind.name in laws else None
+    return None if law is None else (grid, law(chosen[0].values, grid))
 
 
 def plot_rivals(verdict: Verdict) -> Figure:

@@ -112,7 +112,8 @@ def diagnose(
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:
     """Sensors at fault, which one force at a point would have to explain too."""
-    return {str(effect.target) for effect in effects if effect.kind.path == "sensor"}
+    targets = [effect.target for effect in effects if effect.kind.path == "sensor"]
+    return {name for target in targets for name in (target if isinstance(target, tuple) else (target,))}
 
 
 def _outcome(found: Attribution, shrinkage: Shrinkage | None) -> str:
@@ -124,15 +125,16 @@ def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None) -> bool:
 
     Enough effects of the wrong kind bend to the records that they are fitted to, not to others.
     """
-    if shrinkage is None or _unpredictable(found):
+    if shrinkage is None or _remainders(found):
         return False
     noise_power = max(found.noise_ratio, 1.0) ** 2
     left = any(shrinkage.after[n] ** 2 > (1.0 + LEFT) * noise_power * shrinkage.floor[n] ** 2 for n in shrinkage.after)
     return left and shrinkage.overall < HELD_OUT
 
 
-def _unpredictable(found: Attribution) -> set[str]:
-    return {effect.kind.name for effect in found.best.effects} & {"random_disturbance", "sensor_quantisation"}
+def _remainders(found: Attribution) -> list[str]:
+    """What the effects leave that no model can predict."""
+    return list(dict.fromkeys(effect.kind.remainder for effect in found.best.effects if effect.kind.remainder))
 
 
 def _check(rig: Rig, record: Record) -> None:
@@ -158,15 +160,6 @@ def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
 
 
 def _notes(found: Attribution, outcome: str, budget: Budget) -> tuple[str, ...]:
-    names = _unpredictable(found)
-    notes = []
-    if outcome != found.outcome:
-        notes.append("The nearest set explains the records it was fitted to, but not those it has not seen.")
-    remark = budget.noise_remark
-    if remark:
-        notes.append(remark)
-    if "random_disturbance" in names:
-        notes.append("A random disturbance leaves a remainder that no model can predict; its statistics were fitted.")
-    if "sensor_quantisation" in names:
-        notes.append("Rounding leaves a remainder of a step over the root of twelve that no model can predict.")
-    return tuple(notes)
+    seen = "The nearest set explains the records it was fitted to, but not those it has not seen."
+    notes = (*([seen] if outcome != found.outcome else []), budget.noise_remark, *_remainders(found))
+    return tuple(note for note in notes if note)

@@ -18,7 +18,7 @@ MEASURED = {
 
 @dataclass(frozen=True)
 class Sensor:
-    """A sensor at a point: delay, lag, gain, bias and drift, noise, clipping, rounding, in that order.
+    """A sensor at a point: cross-talk, delay, lag, gain, bias and drift, noise, clipping, rounding, in that order.
 
     Attributes:
         name: of the output.
@@ -28,6 +28,7 @@ class Sensor:
         gain: reading per truth.
         bias: constant offset.
         drift: offset gained over a record, from 0 at its first sample.
+        crosstalk: (name, share) of other sensors whose truth it reads too, delay and lag of its own.
         delay: s; negative, by less than a sample, where its clock is ahead of that of the inputs.
         time_constant: of a first-order lag, s.
         limit: readings stop at ± this.
@@ -46,6 +47,7 @@ class Sensor:
     limit: float = np.inf
     step: float = 0.0
     delay: float = 0.0
+    crosstalk: tuple[tuple[str, float], ...] = ()
     direction: str | None = None
 
     def __post_init__(self) -> None:
@@ -63,4 +65,4 @@ class Sensor:
     @property
     def linear(self) -> bool:
         """Whether a reading is a linear function of the truth (a time constant adds a state)."""
-        return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay))
+        return bool(np.isinf(self.limit) and not (self.bias or self.drift or self.step or self.delay or self.crosstalk))

@@ -164,9 +164,23 @@ def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
         for j, shape in zip(here, shapes, strict=True):
             if late is not None and rig.sensors[j].delay:
                 outputs[j] = late.earlier(order, shape, rig.sensors[j].delay)
+    for row, leak in _leaks(rig, outputs):
+        outputs[row] += leak
     for j, sensor in enumerate(rig.sensors):
         outputs[j] = sensor_reading(sensor, outputs[j], sample_time)
     return outputs
+
+
+def _leaks(rig: Rig, truths: np.ndarray) -> list[tuple[int, np.ndarray]]:
+    """What each sensor reads of others' truths (n_sensors, n_samples): its row, and that series."""
+    rows = {sensor.name: j for j, sensor in enumerate(rig.sensors)}
+    leaks = []
+    for sensor in rig.sensors:
+        for name, share in sensor.crosstalk:
+            if name not in rows:
+                raise ValueError(f"sensor {sensor.name} reads a share of {name!r}, which is no sensor of the rig")
+            leaks.append((rows[sensor.name], share * truths[rows[name]]))
+    return leaks
 
 
 def sensor_reading(sensor: Sensor, truth: np.ndarray, sample_time: float) -> np.ndarray:

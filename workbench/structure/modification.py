@@ -8,6 +8,7 @@ from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
 OWN = 4  # modes that move on their own, for each that is asked for
+ROUNDING = 1e-9  # of the largest eigenvalue: what a rigid-body mode may be off by
 
 
 def attach(modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | None = None) -> Modes:
@@ -45,6 +46,7 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | Non
                 target += value * shapes.T @ shapes
     if any(isinstance(part, PointMass | PointSpring) for part in attachments):
         eigenvalues, vectors = eigh(stiffness, mass)
+        _check_stable(eigenvalues)
         vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
         omega = np.sqrt(np.maximum(eigenvalues, 0.0))
         damping = np.diag(2.0 * modes.zeta * omega)
@@ -106,6 +108,7 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int)
         target = mass if isinstance(part, PointMass) else stiffness
         target += value * shapes.T @ shapes
     eigenvalues, vectors = eigh(stiffness, mass, subset_by_index=[0, kept - 1])
+    _check_stable(eigenvalues)
     vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
     omega = np.sqrt(np.maximum(eigenvalues, 0.0))
     through = basis @ vectors
@@ -124,3 +127,8 @@ def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
     if isinstance(part, PointMass) and isinstance(modes.domain, NamedPoints) and derivative == 0:
         return modes.phi(modes.domain.translations(str(part.at)))
     return modes.phi_at(part.at, derivative)[None, :]
+
+
+def _check_stable(eigenvalues: np.ndarray) -> None:
+    if eigenvalues[0] < -ROUNDING * eigenvalues[-1]:
+        raise ValueError("the structure is unstable with these springs: one of negative stiffness is too strong")

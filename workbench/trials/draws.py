@@ -1,12 +1,14 @@
 """Draws of hidden effects, one a kind: the numbers of an effect, or a function of a strength near 1 that gives them."""
 
 from collections.abc import Callable
+from itertools import combinations
 
 import numpy as np
 
 from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Beam
 from workbench.structure.supports import HELD
+from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
 from workbench.trials.scene import Scene, Unsuitable
 
 Draw = Callable[[Scene, np.random.Generator], dict | Callable[[float], dict]]
@@ -34,36 +36,16 @@ def _stiff(scene: Scene) -> float:
     return float(modes.omega[first] ** 2 / np.max(shape**2))
 
 
-def _at_point(make: Callable[[Scene, float, float, float, np.random.Generator], Callable[[float], dict]]) -> Draw:
-    """Draws of an effect at a point, from its place and the rms of the displacement and velocity there."""
+def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> Draw:
+    """Draws of an effect at a point, from what is typical there."""
 
     def draw(scene, rng):
         at = scene.place(rng)
-        w, v = scene.motion_at(at)
-        law = make(scene, float(np.sqrt(np.mean(w**2))), float(np.sqrt(np.mean(v**2))), float(np.abs(w).max()), rng)
+        w, v = (float(np.sqrt(np.mean(motion**2))) for motion in scene.motion_at(at))
+        law = make(PointSizes(_stiff(scene), w, v, scene.bench.level), rng)
         return lambda s: {"at": at, **law(s)}
 
     return draw
-
-
-def _clearance(scene, w, v, peak, rng):
-    gap = float(rng.uniform(0.3, 0.8)) * 1.5 * w
-    return lambda s: {"stiffness": s * _stiff(scene), "gap": gap}
-
-
-def _friction(scene, w, v, peak, rng):
-    speed = float(rng.uniform(0.01, 0.05)) * v
-    return lambda s: {"force": 0.02 * s * scene.bench.level, "smoothing_speed": speed}
-
-
-def _bouc_wen(scene, w, v, peak, rng):
-    limit = float(rng.uniform(0.2, 0.8)) * w
-    return lambda s: {"stiffness": 0.1 * s * _stiff(scene), "yield_displacement": limit}
-
-
-def _magnet(scene, w, v, peak, rng):
-    reach = float(rng.uniform(0.5, 1.0)) * w
-    return lambda s: {"stiffness": 0.1 * s * _stiff(scene), "reach": reach}
 
 
 def _member_only(draw: Draw) -> Draw:
@@ -173,6 +155,43 @@ def _limit(scene, rng):
 
 def _dead(scene, rng):
     return lambda s: 0.1 * s * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
+
+
+def _hysteresis(scene, rng):
+    which = "all" if rng.random() < 0.6 else str(rng.choice(scene.acting))
+    width = float(rng.uniform(0.3, 1.0)) * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
+    return lambda s: {"input": which, "share": float(-np.expm1(-0.3 * s)), "width": width}
+
+
+def _push(scene, rng):
+    sign = _sign(rng)
+    return lambda s: sign * 0.1 * s * scene.bench.level
+
+
+def _rate(scene, rng):
+    steps = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
+    return lambda s: float(np.quantile(steps, 0.9)) / s
+
+
+def _swapped_inputs(scene, rng):
+    pair = sorted(str(name) for name in rng.choice(scene.acting, 2, replace=False))
+    return {"input": pair[0], "with": pair[1]}
+
+
+def _swapped_outputs(scene, rng):
+    sensors = scene.bench.rig.sensors
+    alike = [(a.name, b.name) for a, b in combinations(sensors, 2) if a.quantity == b.quantity]
+    if not alike:
+        raise Unsuitable("no two sensors measure the same quantity")
+    pair = alike[rng.integers(len(alike))]
+    return {"output": pair[0], "with": pair[1]}
+
+
+def _crosstalk(scene, rng):
+    row, source = rng.choice(len(scene.bench.rig.sensors), 2, replace=False)
+    names, sign = [s.name for s in scene.bench.rig.sensors], _sign(rng)
+    ratio = float(scene.outputs[row].std() / scene.outputs[source].std())
+    return lambda s: {"output": names[row], "from": names[source], "share": sign * 0.2 * s * ratio}
 
 
 def _time(scene, rng):
@@ -292,38 +311,36 @@ DRAWS: dict[str, Draw] = {
     "local_stiffness_loss": _member_only(_loss),
     "support_rotation": _support,
     "axial_load": _axial,
-    "ground_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.05 * s * _stiff(c)}),
+    "ground_spring": _at_point(lambda p, rng: lambda s: {"stiffness": 0.05 * s * p.stiffness}),
+    **{name: _at_point(law.draw) for name, law in POINT_LAWS.items() if law.draw is not None},
     "truncated_modes": _truncation,
     "modal_damping": _factor("factor", 0.3),
     "point_damper": _damper,
     "air_drag": _member_only(_drag),
-    "cubic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.1 * s * _stiff(c) / w**2}),
     "midplane_stretching": _beam_only(_stretching),
-    "clearance": _at_point(_clearance),
-    "one_sided_stop": _at_point(_clearance),
-    "coulomb_friction": _at_point(_friction),
-    "bouc_wen": _at_point(_bouc_wen),
     "actuator_gain": _drive("gain", _gain, every=0.0),
     "actuator_lag": _drive("time_constant", _time),
     "actuator_delay": _drive("delay", _time),
     "actuator_saturation": _drive("limit", _limit),
     "actuator_dead_zone": _drive("width", _dead),
     "actuator_misplacement": _moved_actuator,
+    "actuator_hysteresis": _hysteresis,
+    "actuator_bias": _drive("force", _push, every=0.0),
+    "actuator_rate_limit": _drive("rate", _rate),
+    "swapped_inputs": _swapped_inputs,
     "sensor_gain": _reading("gain", lambda c, row, r: (lambda sign: lambda s: float(np.exp(sign * 0.3 * s)))(_sign(r))),
     "sensor_bias": _reading("bias", _in_rms(0.3)),
     "sensor_drift": _reading("drift_over_record", _in_rms(0.5)),
     "sensor_lag": _sensor_lag,
     "sensor_misplacement": _moved_sensor,
+    "sensor_delay": _reading("delay", lambda c, row, r: lambda s: 0.5 * s * c.bench.sample_time),
+    "sensor_crosstalk": _crosstalk,
+    "swapped_outputs": _swapped_outputs,
     "sensor_clipping": _reading("limit", _clip),
     "sensor_quantisation": _step,
     "periodic_disturbance": _tone,
     "random_disturbance": _noise,
     "stiffness_drift": _drift,
-    "quadratic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.1 * s * _stiff(c) / w}),
-    "quintic_spring": _at_point(lambda c, w, v, p, r: lambda s: {"stiffness": 0.05 * s * _stiff(c) / w**4}),
-    "cubic_damper": _at_point(lambda c, w, v, p, r: lambda s: {"coefficient": 0.05 * s * _stiff(c) * w / v**3}),
-    "squeeze_film": _at_point(lambda c, w, v, p, r: lambda s: {"coefficient": 0.1 * s * _stiff(c) / (w * v)}),
-    "magnet": _at_point(_magnet),
     "cross_talk": _cross_talk,
     "bent_command": _bent_command,
     "bent_reading": _reading("curvature", _bent_reading),

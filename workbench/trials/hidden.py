@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from workbench.trials import motion
+from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant, with_ports
 
 Hide = Callable[[Plant, dict], Plant]
@@ -15,9 +16,9 @@ def _altered(plant: Plant, **changes) -> Plant:
     return replace(plant, altered=replace(plant.altered, **changes))
 
 
-def _law(code: int, *names: str) -> Hide:
+def _law(law: PointLaw) -> Hide:
     def hide(plant: Plant, e: dict) -> Plant:
-        return replace(plant, laws=(*plant.laws, (code, e["at"], tuple(e[name] for name in names))))
+        return replace(plant, laws=(*plant.laws, (law.code, e["at"], tuple(e[name] for name in law.parameters))))
 
     return hide
 
@@ -34,6 +35,34 @@ def _support(plant: Plant, e: dict) -> Plant:
     left, right = plant.altered.rotational_stiffness
     ends = (e["rotational_stiffness"], right) if e["at"] == 0 else (left, e["rotational_stiffness"])
     return _altered(plant, rotational_stiffness=ends)
+
+
+def _swapped(side: str, key: str) -> Hide:
+    """Two actuators or two sensors on each other's wires; a channel keeps its name and its noise."""
+
+    def hide(plant: Plant, e: dict) -> Plant:
+        by_name = {port.name: port for port in getattr(plant, side)}
+        pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
+        kept = ("name", "noise_std") if side == "sensors" else ("name",)
+        ports: Any = tuple(
+            replace(pair[name], **{field: getattr(port, field) for field in kept}) if name in pair else port
+            for name, port in by_name.items()
+        )
+        return replace(plant, **{side: ports})
+
+    return hide
+
+
+def _crosstalk(plant: Plant, e: dict) -> Plant:
+    names = [sensor.name for sensor in plant.sensors]
+    row, source = names.index(e["output"]), names.index(e["from"])
+
+    def read(y: np.ndarray, sample_time: float) -> np.ndarray:
+        y = y.copy()
+        y[row] += e["share"] * y[source]
+        return y
+
+    return replace(plant, reading_laws=(*plant.reading_laws, read))
 
 
 def _cross_talk(plant: Plant, e: dict) -> Plant:
@@ -83,25 +112,27 @@ HIDE: dict[str, Hide] = {
     "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (e["at"], e["stiffness"]))),
     "truncated_modes": lambda p, e: replace(p, n_modes=e["needed"]),
     "modal_damping": lambda p, e: replace(p, damping_factor=p.damping_factor * e["factor"]),
-    "point_damper": _law(motion.DAMPER, "coefficient"),
+    **{name: _law(law) for name, law in POINT_LAWS.items() if not law.outside},
     "air_drag": lambda p, e: replace(p, drag=e["coefficient"]),
-    "cubic_spring": _law(motion.CUBIC, "stiffness"),
     "midplane_stretching": lambda p, e: replace(p, stretching=e["coefficient"]),
-    "clearance": _law(motion.CLEARANCE, "stiffness", "gap"),
-    "one_sided_stop": _law(motion.STOP, "stiffness", "gap"),
-    "coulomb_friction": _law(motion.FRICTION, "force", "smoothing_speed"),
-    "bouc_wen": _law(motion.BOUC_WEN, "stiffness", "yield_displacement"),
     "actuator_gain": _actuator(gain="gain"),
     "actuator_lag": _actuator(time_constant="time_constant"),
     "actuator_delay": _actuator(delay="delay"),
     "actuator_saturation": _actuator(limit="limit"),
     "actuator_dead_zone": _actuator(dead_zone="width"),
     "actuator_misplacement": _actuator(at="at"),
+    "actuator_hysteresis": _actuator(hysteresis_share="share", hysteresis_width="width"),
+    "actuator_bias": _actuator(bias="force"),
+    "actuator_rate_limit": _actuator(rate_limit="rate"),
+    "swapped_inputs": _swapped("actuators", "input"),
     "sensor_gain": _sensor(gain="gain"),
     "sensor_bias": _sensor(bias="bias"),
     "sensor_drift": _sensor(drift="drift_over_record"),
     "sensor_lag": _sensor(time_constant="time_constant"),
     "sensor_misplacement": _sensor(at="at"),
+    "sensor_delay": _sensor(delay="delay"),
+    "sensor_crosstalk": _crosstalk,
+    "swapped_outputs": _swapped("sensors", "output"),
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),
     "periodic_disturbance": lambda p, e: replace(
@@ -113,11 +144,7 @@ HIDE: dict[str, Hide] = {
 
 # Kinds that no catalogue of the diagnosis holds: an honest verdict on them is "unknown".
 OUTSIDE: dict[str, Hide] = {
-    "quadratic_spring": _law(motion.QUADRATIC, "stiffness"),
-    "quintic_spring": _law(motion.QUINTIC, "stiffness"),
-    "cubic_damper": _law(motion.CUBIC_DAMPER, "coefficient"),
-    "squeeze_film": _law(motion.SQUEEZE, "coefficient"),
-    "magnet": _law(motion.MAGNET, "stiffness", "reach"),
+    **{name: _law(law) for name, law in POINT_LAWS.items() if law.outside},
     "cross_talk": _cross_talk,
     "bent_command": _bent_command,
     "bent_reading": _reading(_bent_reading),

@@ -33,6 +33,9 @@ TWINS = (
     {"sensor_lag", "actuator_lag"},
     {"sensor_lag", "actuator_delay"},
     {"modulus_error", "stiffness_drift"},
+    {"sensor_lag", "sensor_delay"},
+    {"sensor_delay", "actuator_lag"},
+    {"sensor_delay", "actuator_delay"},
 )
 
 

@@ -7,34 +7,9 @@ coordinates and rates, the lags of actuators, the hysteretic variables of laws a
 import numpy as np
 from numba import njit
 
+from workbench.trials.laws import BOUC_WEN, law_force
+
 HYSTERESIS_STEPS = 200  # of a command's change over one sample
-DAMPER, CUBIC, CLEARANCE, STOP, FRICTION, BOUC_WEN, QUADRATIC, QUINTIC, CUBIC_DAMPER, SQUEEZE, MAGNET = range(11)
-
-
-@njit(cache=True)
-def law_force(code, p, w, v, z):
-    """Force of a law at a point, from displacement, velocity and hysteretic variable there."""
-    if code == DAMPER:
-        return -p[0] * v
-    if code == CUBIC:
-        return -p[0] * w**3
-    if code == CLEARANCE:
-        return -p[0] * (max(w - p[1], 0.0) + min(w + p[1], 0.0))
-    if code == STOP:
-        return -p[0] * max(w - p[1], 0.0)
-    if code == FRICTION:
-        return -p[0] * np.tanh(v / p[1])
-    if code == BOUC_WEN:
-        return -p[0] * z
-    if code == QUADRATIC:
-        return -p[0] * w * abs(w)
-    if code == QUINTIC:
-        return -p[0] * w**5
-    if code == CUBIC_DAMPER:
-        return -p[0] * v**3
-    if code == SQUEEZE:
-        return -p[0] * w * w * v
-    return p[0] * w / (1.0 + (w / p[1]) ** 2) ** 2
 
 
 @njit(cache=True)

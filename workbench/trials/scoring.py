@@ -209,5 +209,7 @@ def _same_channel(hidden: dict, told: dict, inputs: Sequence[str], outputs: Sequ
     for side, names in (("input", inputs), ("output", outputs)):
         if side in hidden:
             name = hidden[side]
-            return (names[name] if isinstance(name, int) else name) == told.get(side)
+            channels = {names[name] if isinstance(name, int) else name, hidden.get("with")}
+            source = hidden.get("from") == told.get("from")
+            return source and channels == {told.get(side), told.get("with")}
     return True

@@ -98,6 +98,8 @@ def test_what_a_set_comes_to_at_bounds_is_told_to_the_last(rig):
     assert contained((near_the_end, gain), rig) == {
         ("ground_spring", "sensor_gain[d1]"),
         ("sensor_gain[d1]", "support_rotation[left]"),
+        ("coulomb_friction", "sensor_gain[d1]"),  # of one that always slides
+        ("point_damper", "sensor_gain[d1]"),
     }
 
 

@@ -1,6 +1,7 @@
 """Laws at a point that the catalogue does not hold: springs and dampers of any power."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -9,6 +10,11 @@ from workbench.gap.effects.nonlinear import strength_along, with_element
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
 EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # to start from
+
+
+def _of_power(v: Mapping[str, Any], motion: np.ndarray) -> np.ndarray:
+    """-F |w / w_r|^p."""
+    return -v["force_at_rms"] * np.abs(motion / v["rms"]) ** v["exponent"]
 
 
 def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
@@ -33,6 +39,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
         starts=starts,
         nonlinear=True,
         phrase=words,
+        force_laws={motion: lambda v, u: (1.0 if even else np.sign(u)) * _of_power(v, u)},
     )
 
 

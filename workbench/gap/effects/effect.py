@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -22,8 +22,10 @@ class Parameter:
         name: as in the verdict.
         unit: as written beside it.
         low, high: bounds, in the unit.
-        logarithmic: fitted as its logarithm; for what is positive by nature.
+        logarithmic: fitted as its logarithm; with a negative lower bound as asinh(value / scale), which is the
+            logarithm of its size on either side of zero.
         scale: a typical size, which makes the steps of a fit comparable.
+        neutral: the value at which the effect changes nothing; None where no single one does.
         prior_std: standard deviation of a normal prior on the free coordinate, centred at 0; None for none.
     """
 
@@ -34,19 +36,29 @@ class Parameter:
     logarithmic: bool = False
     scale: float = 1.0
     prior_std: float | None = None
+    neutral: float | None = None
 
     def to_free(self, value: float) -> float:
         """From the unit to the coordinate of the fit."""
-        return float(np.log(value)) if self.logarithmic else value / self.scale
+        if self.logarithmic:
+            return float(np.arcsinh(value / self.scale)) if self.low < 0 else float(np.log(value))
+        return value / self.scale
 
     def from_free(self, free: float) -> float:
         """From the coordinate of the fit to the unit, inside the bounds."""
-        value = float(np.exp(min(free, 700.0))) if self.logarithmic else free * self.scale
+        if not self.logarithmic:
+            value = free * self.scale
+        elif self.low < 0:
+            value = self.scale * float(np.sinh(np.clip(free, -700.0, 700.0)))
+        else:
+            value = float(np.exp(min(free, 700.0)))
         return min(max(value, self.low), self.high)
 
     def slope(self, value: float) -> float:
         """d value / d free."""
-        return value if self.logarithmic else self.scale
+        if not self.logarithmic:
+            return self.scale
+        return float(np.hypot(value, self.scale)) if self.low < 0 else value
 
 
 def place_parameters(rig: Rig) -> tuple[Parameter, ...]:
@@ -74,7 +86,7 @@ def place_values(where: Where) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """A kind of effect in the catalogue.
+    """A kind of effect in the catalogue: all that a diagnosis knows of it, from where to start a fit to how to draw it.
 
     Attributes:
         name: as in the vocabulary.
@@ -85,6 +97,19 @@ class Kind:
         targets: rig -> what it can act on: input or output names, "all", an end; (None,) where there is no choice.
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
+        simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
+        signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
+        found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",
+            where only its statistics can be found.
+        alone: whether one rules out another of the kind, whatever its target.
+        remainder: what it leaves that no model can predict, in a sentence; empty where it leaves nothing.
+        force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), where it is a law of that
+            alone.
+        numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
+        second_channel, joined: of a kind that acts on two inputs or two outputs: what the verdict calls the other one,
+            and the word between the two in its sentence.
+        remark: effect, rig -> what the sentence says in brackets; None for its numbers.
+        stands: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
         first: whether it changes the nominal model itself, before any other effect acts on it.
     """
 
@@ -96,6 +121,17 @@ class Kind:
     targets: Callable[[Rig], tuple] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
+    simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
+    signed: bool = False
+    found_in: Literal["search", "readings", "residual"] = "search"
+    alone: bool = False
+    remainder: str = ""
+    force_laws: Mapping[str, Callable[[Mapping[str, Any], np.ndarray], np.ndarray]] = field(default_factory=dict)
+    numbers: Callable[["Effect", Rig], dict[str, float]] | None = None
+    remark: Callable[["Effect", Rig], str] | None = None
+    stands: Callable[["Effect", Rig], tuple[float, str]] | None = None
+    second_channel: str = "with"
+    joined: str = " and "
     first: bool = False
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
@@ -113,13 +149,13 @@ class Effect:
 
     Attributes:
         kind: of the catalogue.
-        target: input, output, "all", an end, or None.
+        target: input, output, two of them, "all", an end, or None.
         values: by parameter name; at named points also "at", the name of the point or the two it acts between.
         deviations: standard deviations by parameter name, where it was fitted.
     """
 
     kind: Kind
-    target: str | int | None
+    target: Any
     values: dict[str, Any]
     deviations: dict[str, float] = field(default_factory=dict)
 
@@ -129,6 +165,23 @@ class Effect:
 
     def parameters(self, rig: Rig) -> tuple[Parameter, ...]:
         return self.kind.parameters(rig, self.target)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Its values, the place left out."""
+        return {name: value for name, value in self.values.items() if name not in COORDINATES}
+
+    def significant(self, rig: Rig) -> bool:
+        """Whether every number is farther from where it changes nothing than its standard deviation."""
+        return all(
+            abs(self.values[p.name] - p.neutral) > self.deviations.get(p.name, 0.0)
+            for p in self.parameters(rig)
+            if p.neutral is not None
+        )
+
+    def stated(self, rig: Rig) -> dict[str, Any]:
+        """The numbers that a verdict states, by name."""
+        return self.numbers if self.kind.numbers is None else self.kind.numbers(self, rig)
 
     @property
     def at(self) -> Any:
@@ -141,7 +194,8 @@ class Effect:
 
     @property
     def label(self) -> str:
-        return f"{self.kind.name}[{self.target}]" if isinstance(self.target, str | int) else self.kind.name
+        names = ", ".join(self.target) if type(self.target) is tuple else self.target
+        return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:

@@ -44,6 +44,7 @@ PERIODIC_DISTURBANCE = Kind(
     ),
     apply=lambda rig, _, v: with_element(rig, PeriodicForce(place_of(v), v["frequency"], v["amplitude"], v["phase"])),
     starts=_periodic_starts,
+    numbers=lambda tone, _: {**tone.numbers, "phase": (tone.values["phase"] + np.pi) % (2.0 * np.pi) - np.pi},
     phrase="a periodic disturbance",
 )
 
@@ -62,6 +63,8 @@ RANDOM_DISTURBANCE = Kind(
     ),
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=_random_starts,
+    found_in="residual",
+    remainder="A random disturbance leaves a remainder that no model can predict; its statistics were fitted.",
     phrase="a random disturbance",
 )
 

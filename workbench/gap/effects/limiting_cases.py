@@ -1,53 +1,16 @@
-"""Which effects contain another as a limit: the simpler one is meant where the records cannot tell them apart."""
+"""Limiting cases: the simpler effect is meant where the records cannot tell it from one that contains it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 
-from workbench.gap.effects.effect import COORDINATES, Effect, key_of, place_values
-from workbench.gap.effects.nonlinear import BOUC_WEN, CLEARANCE, COULOMB_FRICTION
-from workbench.gap.effects.structural import (
-    GROUND_SPRING,
-    POINT_DAMPER,
-    SUPPORT_ROTATION,
-    TRUNCATED_MODES,
-)
+from workbench.gap.effects.effect import COORDINATES, Effect, key_of
 from workbench.rig.rig import Rig
-from workbench.structure.member import Structure
-
-BESIDE = 0.1  # of the length: farther out a spring does not turn the hinge, it holds the beam
 
 
 def simpler_forms(effect: Effect, rig: Rig) -> tuple[Effect, ...]:
-    """Effects that this one turns into at a bound of its parameters, with values to start a fit from.
-
-    A clearance of no gap and a hysteretic spring that never yields are springs; friction far below its smoothing
-    speed is a viscous damper; a hysteretic spring that always slides is friction; a spring beside a hinge is a hinge
-    that resists turning, by k a²; one mode fewer is fewer.
-    """
-    v = effect.values
-    if effect.kind is COULOMB_FRICTION:
-        coefficient = v["force"] / v["smoothing_speed"]
-        return (Effect(POINT_DAMPER, None, {**place_values(effect.at), "coefficient": coefficient}),)
-    if effect.kind is CLEARANCE:
-        return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": v["stiffness"]}),)
-    if effect.kind is BOUC_WEN:
-        return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": v["stiffness"]}),)
-    if effect.kind is GROUND_SPRING:
-        return _turned_by(effect, rig)
-    if effect.kind is TRUNCATED_MODES and isinstance(effect.target, int) and effect.target - 1 > rig.modes.n_modes:
-        return (Effect(TRUNCATED_MODES, effect.target - 1, {}),)
-    return ()
-
-
-def _turned_by(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
-    if not isinstance(rig.structure, Structure):
-        return ()
-    length, v = rig.structure.length, spring.values
-    end, arm = ("left", v["at"]) if v["at"] < 0.5 * length else ("right", length - v["at"])
-    if arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
-        return ()
-    return (Effect(SUPPORT_ROTATION, end, {"rotational_stiffness": v["stiffness"] * arm**2}),)
+    """Effects that this one turns into at a bound of its parameters, with values to start a fit from."""
+    return tuple(effect.kind.simpler(effect, rig))
 
 
 def fewer(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:

@@ -1,11 +1,14 @@
 """Effects of the structure that depend on level: contacts, friction, hysteresis, large motion, air."""
 
+from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numba import njit
 
-from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.scales import Scales
+from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import (
     AirDrag,
     BoucWen,
@@ -14,10 +17,13 @@ from workbench.rig.elements import (
     CubicSpring,
     MidplaneStretching,
     OneSidedStop,
+    PowerDamper,
 )
 from workbench.rig.rig import Rig
-from workbench.rig.stepping import yield_update
+from workbench.rig.stepping import hysteresis
 from workbench.structure.member import Structure
+
+LEAST, MOST = 1e-12, 1e12  # bounds of a strength, in units of the rig's own
 
 
 def with_element(rig: Rig, element) -> Rig:
@@ -30,8 +36,24 @@ def strength_along(force: np.ndarray, basis: np.ndarray) -> float:
     return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
 
 
-def _stiffness(name: str, typical: float = 1.0) -> Parameter:
-    return Parameter(name, "N/m", 1e-9 * typical, 1e12 * typical, logarithmic=True)
+def _stiffness(name: str, rig: Rig) -> Parameter:
+    unit = Scales.of(rig).stiffness
+    return Parameter(name, "N/m", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0)
+
+
+def _force(name: str, rig: Rig) -> Parameter:
+    unit = Scales.of(rig).force
+    return Parameter(name, "N", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0)
+
+
+def _speed(name: str, rig: Rig) -> Parameter:
+    unit = Scales.of(rig).speed
+    return Parameter(name, "m/s", LEAST * unit, MOST * unit, logarithmic=True)
+
+
+def _distance(name: str, rig: Rig) -> Parameter:
+    unit = Scales.of(rig).length
+    return Parameter(name, "m", LEAST * unit, MOST * unit, logarithmic=True)
 
 
 # --- cubic_spring
@@ -47,7 +69,8 @@ def _cubic_starts(evidence, _):
 
 
 def _cubic_parameters(rig: Rig, _):
-    return (*place_parameters(rig), Parameter("stiffness", "N/m^3", -1e15, 1e15, scale=1.0))
+    unit = Scales.of(rig).stiffness / Scales.of(rig).length ** 2
+    return (*place_parameters(rig), Parameter("stiffness", "N/m^3", -1e15 * unit, 1e15 * unit, scale=unit, neutral=0.0))
 
 
 CUBIC_SPRING = Kind(
@@ -57,6 +80,7 @@ CUBIC_SPRING = Kind(
     apply=lambda rig, _, v: with_element(rig, CubicSpring(place_of(v), v["stiffness"])),
     starts=_cubic_starts,
     nonlinear=True,
+    force_laws={"displacement": lambda v, w: -v["stiffness"] * w**3},
     phrase="a cubic spring",
 )
 
@@ -76,10 +100,15 @@ def _stretching_starts(evidence, _):
     return [{"coefficient": s * tension / max(stretch, 1e-300)} for s in np.geomspace(1e-3, 30.0, 14)]
 
 
+def _stretching_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+    unit = Scales.of(rig).stiffness  # tension over a squared slope times length
+    return (Parameter("coefficient", "N/m", LEAST * unit, 1e15 * unit, logarithmic=True, neutral=0.0),)
+
+
 MIDPLANE_STRETCHING = Kind(
     name="midplane_stretching",
     path="structure",
-    parameters=lambda rig, _: (Parameter("coefficient", "N/m", 1e-12, 1e15, logarithmic=True),),
+    parameters=_stretching_parameters,
     apply=lambda rig, _, v: with_element(rig, MidplaneStretching(v["coefficient"])),
     starts=_stretching_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
@@ -101,10 +130,16 @@ def _drag_starts(evidence, _):
     return [{"coefficient": s * viscous / max(max(speeds), 1e-300)} for s in np.geomspace(0.02, 50.0, 12)]
 
 
+def _drag_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+    scales = Scales.of(rig)
+    unit = scales.damping / scales.speed / scales.length
+    return (Parameter("coefficient", "N s^2/m^3", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0),)
+
+
 AIR_DRAG = Kind(
     name="air_drag",
     path="structure",
-    parameters=lambda rig, _: (Parameter("coefficient", "N s^2/m^3", 1e-12, 1e12, logarithmic=True),),
+    parameters=_drag_parameters,
     apply=lambda rig, _, v: with_element(rig, AirDrag(v["coefficient"])),
     starts=_drag_starts,
     targets=lambda rig: (None,) if isinstance(rig.structure, Structure) else (),
@@ -119,8 +154,8 @@ AIR_DRAG = Kind(
 def _contact_parameters(rig: Rig, _):
     return (
         *place_parameters(rig),
-        _stiffness("stiffness"),
-        Parameter("gap", "m", 1e-12, 1e6, logarithmic=True),
+        _stiffness("stiffness", rig),
+        _distance("gap", rig),
     )
 
 
@@ -139,6 +174,10 @@ def _contact_starts(two_sided: bool):
     return starts
 
 
+def _spring_alone(effect: Effect, _: Rig) -> tuple[Effect, ...]:
+    return (Effect(GROUND_SPRING, None, {**place_values(effect.at), "stiffness": effect.values["stiffness"]}),)
+
+
 CLEARANCE = Kind(
     name="clearance",
     path="structure",
@@ -146,6 +185,8 @@ CLEARANCE = Kind(
     apply=lambda rig, _, v: with_element(rig, Clearance(place_of(v), v["stiffness"], v["gap"])),
     starts=_contact_starts(True),
     nonlinear=True,
+    simpler=_spring_alone,  # of no gap
+    force_laws={"displacement": lambda v, w: -v["stiffness"] * np.sign(w) * np.maximum(np.abs(w) - v["gap"], 0.0)},
     phrase="a clearance closed on both sides by springs",
 )
 
@@ -156,6 +197,7 @@ ONE_SIDED_STOP = Kind(
     apply=lambda rig, _, v: with_element(rig, OneSidedStop(place_of(v), v["stiffness"], v["gap"])),
     starts=_contact_starts(False),
     nonlinear=True,
+    force_laws={"displacement": lambda v, w: -v["stiffness"] * np.maximum(w - v["gap"], 0.0)},
     phrase="a one-sided stop",
 )
 
@@ -173,17 +215,25 @@ def _friction_starts(evidence, _):
                 yield {**place_values(place.at), "force": 2 * force, "smoothing_speed": share * speed}
 
 
+def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
+    """Far below its smoothing speed friction is a viscous damper."""
+    coefficient = friction.values["force"] / friction.values["smoothing_speed"]
+    return (Effect(POINT_DAMPER, None, {**place_values(friction.at), "coefficient": coefficient}),)
+
+
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
     parameters=lambda rig, _: (
         *place_parameters(rig),
-        Parameter("force", "N", 1e-12, 1e9, logarithmic=True),
-        Parameter("smoothing_speed", "m/s", 1e-9, 1e6, logarithmic=True),
+        _force("force", rig),
+        _speed("smoothing_speed", rig),
     ),
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_friction_starts,
     nonlinear=True,
+    simpler=_viscous,
+    force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
     phrase="a friction force",
 )
 
@@ -191,23 +241,22 @@ COULOMB_FRICTION = Kind(
 # --- bouc_wen
 
 
-@njit(cache=True, nogil=True)
-def _hysteresis(displacement: np.ndarray, limit: float) -> np.ndarray:
-    """z of a Bouc-Wen spring along a path of displacements."""
-    z = np.zeros_like(displacement)
-    for k in range(1, displacement.size):
-        z[k], _ = yield_update(z[k - 1], displacement[k] - displacement[k - 1], limit)
-    return z
-
-
 def _bouc_wen_starts(evidence, _):
     for place in evidence.at_peaks[:2]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
-            k = strength_along(place.force, _hysteresis(place.displacement, share * size))
+            k = strength_along(place.force, hysteresis(place.displacement, share * size))
             if k > 0:
                 yield {**place_values(place.at), "stiffness": k, "yield_displacement": share * size}
                 yield {**place_values(place.at), "stiffness": 2 * k, "yield_displacement": share * size}
+
+
+def _sliding(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """One that always slides is friction: z is then as far as it goes, and turns round over about twice that path."""
+    v = spring.values
+    speed = v["yield_displacement"] * float(rig.modes.omega[rig.modes.omega > 0].min())
+    numbers = {"force": v["stiffness"] * v["yield_displacement"], "smoothing_speed": speed}
+    return (Effect(COULOMB_FRICTION, None, {**place_values(spring.at), **numbers}),)
 
 
 BOUC_WEN = Kind(
@@ -215,13 +264,96 @@ BOUC_WEN = Kind(
     path="structure",
     parameters=lambda rig, _: (
         *place_parameters(rig),
-        _stiffness("stiffness"),
-        Parameter("yield_displacement", "m", 1e-12, 1e6, logarithmic=True),
+        _stiffness("stiffness", rig),
+        _distance("yield_displacement", rig),
     ),
     apply=lambda rig, _, v: with_element(rig, BoucWen(place_of(v), v["stiffness"], v["yield_displacement"])),
     starts=_bouc_wen_starts,
     nonlinear=True,
+    simpler=lambda spring, rig: (*_spring_alone(spring, rig), *_sliding(spring, rig)),
     phrase="a hysteretic spring",
+)
+
+# --- two_way_friction
+
+
+def _two_way_starts(evidence, _):
+    for place in evidence.at_peaks:
+        speed = float(np.sqrt(np.mean(place.velocity**2)))
+        for share in (0.02, 0.1, 0.3):
+            basis = np.column_stack([np.tanh(place.velocity / (share * speed)), np.ones(place.velocity.size)])
+            force, offset = -np.linalg.lstsq(basis, place.force, rcond=None)[0]
+            if force > abs(offset):
+                both = {"force_forward": force + offset, "force_backward": force - offset}
+                yield {**place_values(place.at), **both, "smoothing_speed": share * speed}
+
+
+def _sliding_both_ways(v: Mapping[str, Any]) -> tuple[float, float]:
+    """Friction force and offset."""
+    return 0.5 * (v["force_forward"] + v["force_backward"]), 0.5 * (v["force_forward"] - v["force_backward"])
+
+
+def _same_both_ways(friction: Effect, _: Rig) -> tuple[Effect, ...]:
+    numbers = {
+        "force": _sliding_both_ways(friction.values)[0],
+        "smoothing_speed": friction.values["smoothing_speed"],
+    }
+    return (Effect(COULOMB_FRICTION, None, {**place_values(friction.at), **numbers}),)
+
+
+def _two_way_element(v: Mapping[str, Any]) -> CoulombFriction:
+    force, offset = _sliding_both_ways(v)
+    return CoulombFriction(place_of(v), force, v["smoothing_speed"], offset)
+
+
+def _two_way_law(v: Mapping[str, Any], u: np.ndarray) -> np.ndarray:
+    force, offset = _sliding_both_ways(v)
+    return -force * np.tanh(u / v["smoothing_speed"]) - offset
+
+
+TWO_WAY_FRICTION = Kind(
+    name="two_way_friction",
+    path="structure",
+    parameters=lambda rig, _: (
+        *place_parameters(rig),
+        _force("force_forward", rig),
+        _force("force_backward", rig),
+        _speed("smoothing_speed", rig),
+    ),
+    apply=lambda rig, _, v: with_element(rig, _two_way_element(v)),
+    starts=_two_way_starts,
+    nonlinear=True,
+    simpler=_same_both_ways,
+    force_laws={"velocity": _two_way_law},
+    phrase="a friction force that differs between the two directions",
+)
+
+
+# --- quadratic_damper
+
+
+def _quadratic_starts(evidence, _):
+    for place in evidence.at_peaks:
+        c = strength_along(place.force, np.abs(place.velocity) * place.velocity)
+        for share in (0.4, 1.0, 2.5) if c > 0 else ():
+            yield {**place_values(place.at), "coefficient": share * c}
+
+
+def _quadratic_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+    unit = Scales.of(rig).damping / Scales.of(rig).speed
+    coefficient = Parameter("coefficient", "N s^2/m^2", 1e-12 * unit, 1e12 * unit, logarithmic=True, neutral=0.0)
+    return (*place_parameters(rig), coefficient)
+
+
+QUADRATIC_DAMPER = Kind(
+    name="quadratic_damper",
+    path="structure",
+    parameters=_quadratic_parameters,
+    apply=lambda rig, _, v: with_element(rig, PowerDamper(place_of(v), v["coefficient"], 1.0, 2.0)),
+    starts=_quadratic_starts,
+    nonlinear=True,
+    force_laws={"velocity": lambda v, u: -v["coefficient"] * np.abs(u) * u},
+    phrase="a damper quadratic in velocity",
 )
 
 KINDS = (
@@ -232,4 +364,6 @@ KINDS = (
     ONE_SIDED_STOP,
     COULOMB_FRICTION,
     BOUC_WEN,
+    TWO_WAY_FRICTION,
+    QUADRATIC_DAMPER,
 )

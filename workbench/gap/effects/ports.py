@@ -1,16 +1,22 @@
 """Effects on the way in and on the way out: actuators and sensors."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import combinations, permutations
+from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import ALL, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.effect import ALL, Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.scales import Scales
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval, NamedPoints
 
 OF_THE_SENSOR = "unit of the sensor"
+ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
+SLOW = 0.1  # of the rms step between samples: faster, a reading does not come to rest
+OVERSTAYED = 6.0  # steps over their decrease: three times as long as free flight up and back
 
 # --- targets and changes
 
@@ -46,6 +52,18 @@ def _change_sensors(rig: Rig, target: str, **changes) -> Rig:
     return replace(rig, sensors=tuple(replace(s, **changes) if target in (s.name, ALL) else s for s in rig.sensors))
 
 
+def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
+    """Two actuators or two sensors on each other's wires: a channel keeps its name and its noise."""
+    by_name = {port.name: port for port in getattr(rig, side)}
+    elsewhere = {pair[0]: by_name[pair[1]], pair[1]: by_name[pair[0]]}
+    kept = ("name", "noise_std") if side == "sensors" else ("name",)
+    ports: Any = tuple(
+        replace(elsewhere.get(name, port), **{field: getattr(port, field) for field in kept})
+        for name, port in by_name.items()
+    )
+    return replace(rig, **{side: ports})
+
+
 def _commands(evidence, target: str) -> np.ndarray:
     """All commands to the target that are not at rest, joined."""
     names = each_actuator(evidence.rig) if target == ALL else (target,)
@@ -65,16 +83,26 @@ def _sample_time(evidence) -> float:
 
 
 def _actuator(
-    name: str, field: str, unit: str, phrase: str, *, targets, starts, low, high, log=True, **options
+    name: str,
+    field: str,
+    unit: str,
+    phrase: str,
+    *,
+    targets,
+    starts,
+    low,
+    high,
+    log=True,
+    attribute: str | None = None,
+    neutral: float | None = None,
+    **options,
 ) -> Kind:
-    """A kind that sets one figure of an actuator."""
-    attribute = {"gain": "gain", "time_constant": "time_constant", "delay": "delay", "limit": "limit"}.get(
-        field, "dead_zone"
-    )
+    """A kind that sets one number of an actuator, the attribute of that name unless another one is given."""
+    attribute = attribute or field
     return Kind(
         name=name,
         path="actuator",
-        parameters=lambda rig, _: (Parameter(field, unit, low, high, logarithmic=log, scale=0.1),),
+        parameters=lambda rig, _: (Parameter(field, unit, low, high, logarithmic=log, scale=0.1, neutral=neutral),),
         apply=lambda rig, target, v: _change_actuators(rig, target, **{attribute: v[field]}),
         starts=starts,
         targets=targets,
@@ -88,11 +116,13 @@ ACTUATOR_GAIN = _actuator(
     "gain",
     "",
     "a wrong actuator gain",
+    neutral=1.0,
     targets=each_actuator,
     low=-20.0,
     high=20.0,
     log=False,
     starts=lambda evidence, _: [{"gain": 0.9}],
+    signed=True,
 )
 
 ACTUATOR_LAG = _actuator(
@@ -100,6 +130,7 @@ ACTUATOR_LAG = _actuator(
     "time_constant",
     "s",
     "a lag of the actuators",
+    neutral=0.0,
     targets=actuators_or_all,
     low=1e-6,
     high=1e4,
@@ -111,6 +142,7 @@ ACTUATOR_DELAY = _actuator(
     "delay",
     "s",
     "a delay of the actuators",
+    neutral=0.0,
     targets=actuators_or_all,
     low=1e-9,
     high=1e4,
@@ -138,6 +170,8 @@ ACTUATOR_DEAD_ZONE = _actuator(
     "width",
     "N",
     "a dead zone of the actuators",
+    attribute="dead_zone",
+    neutral=0.0,
     targets=actuators_or_all,
     low=1e-12,
     high=1e12,
@@ -145,6 +179,94 @@ ACTUATOR_DEAD_ZONE = _actuator(
     starts=lambda evidence, target: [
         {"width": float(q)} for q in np.quantile(_commands(evidence, target), (0.03, 0.08, 0.15, 0.3, 0.5, 0.7))
     ],
+)
+
+
+ACTUATOR_BIAS = Kind(
+    name="actuator_bias",
+    path="actuator",
+    parameters=lambda rig, _: (
+        Parameter("force", "N", -1e6 * _force(rig), 1e6 * _force(rig), scale=1e-3 * _force(rig), neutral=0.0),
+    ),
+    apply=lambda rig, target, v: _change_actuators(rig, target, bias=v["force"]),
+    starts=lambda evidence, target: [{"force": 0.1 * float(np.sqrt(np.mean(_commands(evidence, target) ** 2)))}],
+    targets=each_actuator,
+    signed=True,
+    phrase="a constant force of an actuator",
+)
+
+
+def _force(rig: Rig) -> float:
+    return Scales.of(rig).force
+
+
+def _rate_starts(evidence, target: str) -> list[dict[str, float]]:
+    """From slower than most changes of the command to as fast as its fastest."""
+    steps = _changes(evidence, target) / _sample_time(evidence)
+    return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
+
+
+ACTUATOR_RATE_LIMIT = _actuator(
+    "actuator_rate_limit",
+    "rate",
+    "N/s",
+    "a rate limit of the actuators",
+    attribute="rate_limit",
+    targets=actuators_or_all,
+    low=1e-300,
+    high=1e300,
+    nonlinear=True,
+    starts=_rate_starts,
+)
+
+
+def _changes(evidence, target: str) -> np.ndarray:
+    """All changes of commands to the target from sample to sample, joined, those of none left out."""
+    names = each_actuator(evidence.rig) if target == ALL else (target,)
+    changes = [
+        np.abs(np.diff(row))
+        for record in evidence.data.records
+        for channel, row in zip(record.input_channels, record.inputs, strict=True)
+        if channel.name in names
+    ]
+    values = np.concatenate(changes)
+    values = values[values > 0]
+    return values if values.size else np.ones(1)
+
+
+def _hysteresis_starts(evidence, target: str) -> Iterator[dict[str, float]]:
+    for width in np.quantile(_commands(evidence, target), (0.2, 0.5, 0.8)):
+        for share in (0.1, 0.4):
+            yield {"share": share, "width": float(width)}
+
+
+ACTUATOR_HYSTERESIS = Kind(
+    name="actuator_hysteresis",
+    path="actuator",
+    parameters=lambda rig, _: (
+        Parameter("share", "", 1e-4, 1.0, scale=0.1, neutral=0.0),
+        Parameter("width", "N", 1e-300, 1e300, logarithmic=True),
+    ),
+    apply=lambda rig, target, v: _change_actuators(
+        rig, target, hysteresis_share=v["share"], hysteresis_width=v["width"]
+    ),
+    starts=_hysteresis_starts,
+    targets=actuators_or_all,
+    nonlinear=True,
+    simpler=lambda effect, _: (  # of no width
+        (Effect(ACTUATOR_GAIN, effect.target, {"gain": 1.0 - effect.values["share"]}),) if effect.target != ALL else ()
+    ),
+    phrase="hysteresis of the actuators",
+)
+
+SWAPPED_INPUTS = Kind(
+    name="swapped_inputs",
+    path="actuator",
+    parameters=lambda rig, _: (),
+    apply=lambda rig, pair, _: _change_swapped(rig, "actuators", pair),
+    starts=lambda evidence, _: [{}],
+    targets=lambda rig: tuple(combinations((a.name for a in rig.actuators), 2)),
+    phrase="two inputs that are exchanged",
 )
 
 
@@ -201,13 +323,14 @@ def _sensor(name: str, field: str, phrase: str, starts: Callable, unit: str = ""
     attribute = {"drift_over_record": "drift"}.get(field, field)
     log = options.pop("log", False)
     low, high = options.pop("low", -1e12), options.pop("high", 1e12)
+    neutral = options.pop("neutral", None)
 
     def parameters(rig: Rig, target) -> tuple[Parameter, ...]:
         noise = max((s.noise_std for s in rig.sensors if target in (s.name, ALL)), default=1.0)
         scale = 0.1 if field == "gain" else max(noise, 1e-300)
         quantity = next((s.quantity for s in rig.sensors if target in (s.name, ALL)), "")
         shown = QUANTITIES.get(quantity, "") if unit == OF_THE_SENSOR else unit
-        return (Parameter(field, shown, low, high, logarithmic=log, scale=scale),)
+        return (Parameter(field, shown, low, high, logarithmic=log, scale=scale, neutral=neutral),)
 
     return Kind(
         name=name,
@@ -222,7 +345,14 @@ def _sensor(name: str, field: str, phrase: str, starts: Callable, unit: str = ""
 
 
 SENSOR_GAIN = _sensor(
-    "sensor_gain", "gain", "a wrong sensor gain", lambda evidence, _: [{"gain": 0.9}], low=-20.0, high=20.0
+    "sensor_gain",
+    "gain",
+    "a wrong sensor gain",
+    lambda evidence, _: [{"gain": 0.9}],
+    low=-20.0,
+    high=20.0,
+    signed=True,
+    neutral=1.0,
 )
 
 
@@ -237,6 +367,7 @@ SENSOR_BIAS = _sensor(
     "a sensor bias",
     lambda evidence, target: [{"bias": _mean_residual(evidence, target)}],
     OF_THE_SENSOR,
+    signed=True,
 )
 
 SENSOR_DRIFT = _sensor(
@@ -245,6 +376,7 @@ SENSOR_DRIFT = _sensor(
     "a sensor drift",
     lambda evidence, target: [{"drift_over_record": 2.0 * _mean_residual(evidence, target)}],
     OF_THE_SENSOR,
+    signed=True,
 )
 
 SENSOR_LAG = _sensor(
@@ -256,16 +388,112 @@ SENSOR_LAG = _sensor(
     log=True,
     low=1e-6,
     high=1e4,
+    neutral=0.0,
     targets=sensors_or_all,
 )
 
 
+SENSOR_DELAY = _sensor(
+    "sensor_delay",
+    "delay",
+    "a delay of a sensor",
+    lambda evidence, _: [{"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 2.5, 5.0)],
+    "s",
+    log=True,
+    low=1e-9,
+    high=1e4,
+    neutral=0.0,
+)
+
+
+def _predicted(evidence, name: str) -> np.ndarray:
+    j = each_sensor(evidence.rig).index(name)
+    records = zip(evidence.data.counted, evidence.residuals, strict=True)
+    return np.concatenate([record.outputs[j] - residual[j] for record, residual in records])
+
+
+def _residual(evidence, name: str) -> np.ndarray:
+    j = each_sensor(evidence.rig).index(name)
+    return np.concatenate([residual[j] for residual in evidence.residuals])
+
+
+def _crosstalk_starts(evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+    """The share of the other sensor's reading in this one's residual, where it is more than a little of it."""
+    residual, source = _residual(evidence, pair[0]), _predicted(evidence, pair[1])
+    size = float(source @ source)
+    share = float(residual @ source) / size if size > 0 else 0.0
+    return [{"share": share}] if share**2 * size > ALIKE * float(residual @ residual) else []
+
+
+def _share_parameters(rig: Rig, pair: tuple[str, str]) -> tuple[Parameter, ...]:
+    noise = {sensor.name: max(sensor.noise_std, 1e-300) for sensor in rig.sensors}
+    ratio = noise[pair[0]] / noise[pair[1]]
+    return (Parameter("share", "", -1e3 * ratio, 1e3 * ratio, scale=0.1 * ratio, neutral=0.0),)
+
+
+SENSOR_CROSSTALK = Kind(
+    name="sensor_crosstalk",
+    path="sensor",
+    parameters=_share_parameters,
+    apply=lambda rig, pair, v: _change_sensors(rig, pair[0], crosstalk=((pair[1], v["share"]),)),
+    starts=_crosstalk_starts,
+    targets=lambda rig: tuple(permutations(each_sensor(rig), 2)),
+    signed=True,
+    second_channel="from",
+    joined=" from ",
+    phrase="cross-talk between sensors",
+)
+
+
+def _exchanged_starts(evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+    """Where each of the two reads rather what the model predicts of the other."""
+    noise = {sensor.name: max(sensor.noise_std, 1e-300) for sensor in evidence.rig.sensors}
+    own = crossed = 0.0
+    for name, other in (pair, pair[::-1]):
+        residual = _residual(evidence, name)
+        measured = _predicted(evidence, name) + residual
+        own += float(residual @ residual) / noise[name] ** 2
+        crossed += float(np.sum((measured - _predicted(evidence, other)) ** 2)) / noise[name] ** 2
+    return [{}] if crossed < own else []
+
+
+SWAPPED_OUTPUTS = Kind(
+    name="swapped_outputs",
+    path="sensor",
+    parameters=lambda rig, _: (),
+    apply=lambda rig, pair, _: _change_swapped(rig, "sensors", pair),
+    starts=_exchanged_starts,
+    targets=lambda rig: tuple(combinations(each_sensor(rig), 2)),
+    phrase="two outputs that are exchanged",
+)
+
+
 def clipped_level(evidence, target: str) -> float | None:
-    """The level that a sensor's readings stop at: its largest magnitude, where it is met again and again."""
+    """The level that a sensor's readings stop at: its largest magnitude, met again and again, where it is cut off."""
     j = each_sensor(evidence.rig).index(target)
-    readings = np.abs(np.concatenate([record.outputs[j] for record in evidence.data.records]))
-    top = readings.max()
-    return float(top) if np.sum(readings >= top * (1 - 1e-6)) >= 3 and top > 0 else None
+    rows = [record.outputs[j] for record in evidence.data.records]
+    top = max(float(np.abs(row).max()) for row in rows)
+    at_top = [np.abs(row) >= top * (1 - 1e-6) for row in rows]
+    if not top > 0 or sum(int(flags.sum()) for flags in at_top) < 3:
+        return None
+    return None if _rests(rows, at_top) else top
+
+
+def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
+    """Whether readings come to rest at the top rather than being cut off there.
+
+    What comes to rest slows down before it, and stays longer than its own deceleration would have let it fly on.
+    """
+    entering, overstayed = [], []
+    for row, flags in zip(rows, at_top, strict=True):
+        ends = np.flatnonzero(np.diff(np.r_[False, flags, False]))
+        for first, last in zip(ends[::2], ends[1::2], strict=True):
+            if first >= 3:
+                before, step, into = np.abs(np.diff(row[first - 3 : first + 1]))
+                entering.append(into)
+                overstayed.append((last - first) * abs(before - step) > OVERSTAYED * step)
+    typical = np.sqrt(np.mean(np.concatenate([np.diff(row) for row in rows]) ** 2))
+    return bool(entering) and float(np.median(entering)) < SLOW * typical and float(np.mean(overstayed)) > 0.5
 
 
 def rounding_step(evidence, target: str) -> float | None:
@@ -306,6 +534,7 @@ SENSOR_CLIPPING = _sensor(
     log=True,
     low=1e-300,
     nonlinear=True,
+    found_in="readings",
 )
 
 
@@ -323,6 +552,8 @@ SENSOR_QUANTISATION = _sensor(
     log=True,
     low=1e-300,
     nonlinear=True,
+    found_in="readings",
+    remainder="Rounding leaves a remainder of a step over the root of twelve that no model can predict.",
 )
 
 KINDS = (
@@ -332,11 +563,18 @@ KINDS = (
     ACTUATOR_SATURATION,
     ACTUATOR_DEAD_ZONE,
     ACTUATOR_MISPLACEMENT,
+    ACTUATOR_HYSTERESIS,
+    ACTUATOR_BIAS,
+    ACTUATOR_RATE_LIMIT,
+    SWAPPED_INPUTS,
     SENSOR_GAIN,
     SENSOR_BIAS,
     SENSOR_DRIFT,
     SENSOR_LAG,
     SENSOR_MISPLACEMENT,
+    SENSOR_DELAY,
+    SENSOR_CROSSTALK,
+    SWAPPED_OUTPUTS,
     SENSOR_CLIPPING,
     SENSOR_QUANTISATION,
 )

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.scales import Scales
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between
@@ -20,6 +21,7 @@ from workbench.structure.supports import HELD, Attachment, End, PointDamper, Poi
 RESOLUTION, ROUGHLY = 1e-6, 1e-4  # of a frequency; of the highest of many
 MANY, FEWER = 60, 6  # modes of a surface for each that is asked for: in closed form, or solved
 EDGE = 1e-9  # of the length
+BESIDE = 0.1  # of the length: farther out a spring does not turn the hinge, it holds the beam
 
 
 def resolved(rig: Rig, structure) -> Rig:
@@ -131,7 +133,7 @@ def _modulus_starts(evidence, _):
 MODULUS_ERROR = Kind(
     name="modulus_error",
     path="structure",
-    parameters=lambda rig, _: (Parameter("factor", "", 0.2, 5.0, logarithmic=True),),
+    parameters=lambda rig, _: (Parameter("factor", "", 0.2, 5.0, logarithmic=True, neutral=1.0),),
     apply=solved_once(_modulus),
     starts=_modulus_starts,
     phrase="an overall stiffness error",
@@ -147,7 +149,7 @@ def _regressed(place, series: str) -> float:
     return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))
 
 
-def _point_starts(name: str, series: str, typical, *, between: bool = True):
+def _point_starts(name: str, series: str, typical, *, between: bool = True, signed: bool = False):
     def starts(evidence, _) -> Iterable[dict[str, float]]:
         size = typical(evidence.rig)
         for place in evidence.at_peaks:
@@ -155,7 +157,7 @@ def _point_starts(name: str, series: str, typical, *, between: bool = True):
                 continue
             k = _regressed(place, series)
             for share in (0.4, 1.0, 2.0):
-                if k > 0:
+                if k > 0 or signed:
                     yield {**place_values(place.at), name: share * k}
         for where in evidence.places_to_try:
             for share in (0.004, 0.02, 0.1, 0.4):
@@ -165,26 +167,21 @@ def _point_starts(name: str, series: str, typical, *, between: bool = True):
 
 
 def _total_mass(rig: Rig) -> float:
-    if not isinstance(rig.structure, Structure):
-        elastic = int(np.argmax(rig.modes.omega > 0))
-        return 1.0 / float(np.mean(rig.modes.phi(rig.modes.domain.grid(12))[:, elastic] ** 2))
-    x = (np.arange(50) + 0.5) / 50 * rig.structure.length
-    return float(np.mean(rig.structure.mass_per_length(x)) * rig.structure.length)
+    return Scales.of(rig).mass
 
 
 def _typical_stiffness(rig: Rig) -> float:
-    elastic = rig.modes.omega[rig.modes.omega > 0]
-    return _total_mass(rig) * float(elastic.min()) ** 2
+    return Scales.of(rig).stiffness
 
 
 def _typical_damping(rig: Rig) -> float:
-    return _total_mass(rig) * float(rig.modes.omega[rig.modes.omega > 0].min())
+    return Scales.of(rig).damping
 
 
 def _positive(name: str, unit: str, typical):
     def parameters(rig: Rig, _) -> tuple[Parameter, ...]:
         size = typical(rig)
-        return (*place_parameters(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True))
+        return (*place_parameters(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True, neutral=0.0))
 
     return parameters
 
@@ -198,13 +195,34 @@ POINT_MASS = Kind(
     phrase="an added mass",
 )
 
+
+def _spring_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+    size = Scales.of(rig).stiffness
+    bounds = -1e5 * size, 1e5 * size
+    stiffness = Parameter("stiffness", "N/m", *bounds, logarithmic=True, scale=1e-8 * size, neutral=0.0)
+    return (*place_parameters(rig), stiffness)
+
+
+def _turning_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
+    """A spring beside a hinge is a hinge that resists turning, by k a²."""
+    if not isinstance(rig.structure, Structure):
+        return ()
+    length, v = rig.structure.length, spring.values
+    end, arm = ("left", v["at"]) if v["at"] < 0.5 * length else ("right", length - v["at"])
+    if arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
+        return ()
+    return (Effect(SUPPORT_ROTATION, end, {"rotational_stiffness": v["stiffness"] * arm**2}),)
+
+
 GROUND_SPRING = Kind(
     name="ground_spring",
     path="structure",
-    parameters=_positive("stiffness", "N/m", _typical_stiffness),
+    parameters=_spring_parameters,
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointSpring(place_of(v), v["stiffness"]))),
-    starts=_point_starts("stiffness", "displacement", _typical_stiffness),
+    starts=_point_starts("stiffness", "displacement", _typical_stiffness, signed=True),
     phrase="a spring to ground",
+    simpler=_turning_spring,
+    force_laws={"displacement": lambda v, w: -v["stiffness"] * w},
 )
 
 POINT_DAMPER = Kind(
@@ -214,6 +232,7 @@ POINT_DAMPER = Kind(
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", _typical_damping),
     phrase="a viscous damper to ground",
+    force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
 )
 
 
@@ -236,7 +255,7 @@ def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
     return (
         *place_parameters(rig),
         Parameter("width", "m", 0.005 * length, 0.2 * length, scale=0.02 * length),
-        Parameter("loss", "", 1e-4, 0.95, scale=0.1),
+        Parameter("loss", "", 1e-4, 0.95, scale=0.1, neutral=0.0),
     )
 
 
@@ -290,6 +309,10 @@ SUPPORT_ROTATION = Kind(
     ],
     targets=_ends,
     phrase="a support that is neither hinged nor clamped",
+    stands=lambda support, rig: (
+        0.0 if support.target == "left" else _beam(rig).length,
+        f"at the {support.target} end",
+    ),
 )
 
 
@@ -312,7 +335,9 @@ AXIAL_LOAD = Kind(
     name="axial_load",
     path="structure",
     parameters=lambda rig, _: (
-        Parameter("tension", "N", -4.0 * _buckling(rig), 200.0 * _buckling(rig), scale=0.05 * _buckling(rig)),
+        Parameter(
+            "tension", "N", -4.0 * _buckling(rig), 200.0 * _buckling(rig), scale=0.05 * _buckling(rig), neutral=0.0
+        ),
     ),
     apply=solved_once(_pulled),
     starts=lambda evidence, _: [
@@ -349,6 +374,11 @@ def _truncated(rig: Rig, count, _) -> Rig:
     return replace(rig, modes=_member(rig).modes(count, tolerance=RESOLUTION))
 
 
+def _one_mode_fewer(truncation: Effect, rig: Rig) -> tuple[Effect, ...]:
+    fewer = truncation.target - 1
+    return (Effect(TRUNCATED_MODES, fewer, {}),) if fewer > rig.modes.n_modes else ()
+
+
 TRUNCATED_MODES = Kind(
     name="truncated_modes",
     path="structure",
@@ -357,6 +387,10 @@ TRUNCATED_MODES = Kind(
     starts=lambda evidence, _: [{}],
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
+    simpler=_one_mode_fewer,
+    alone=True,
+    numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
+    remark=lambda truncation, rig: f"{truncation.target} are needed, {rig.modes.n_modes} are kept",
 )
 
 
@@ -377,7 +411,7 @@ def _damped(rig: Rig, _, values) -> Rig:
 MODAL_DAMPING = Kind(
     name="modal_damping",
     path="structure",
-    parameters=lambda rig, _: (Parameter("factor", "", 1e-3, 100.0, logarithmic=True),),
+    parameters=lambda rig, _: (Parameter("factor", "", 1e-3, 100.0, logarithmic=True, neutral=1.0),),
     apply=solved_once(_damped),
     starts=lambda evidence, _: [{"factor": f} for f in (0.2, 0.4, 0.6, 0.8, 0.9, 1.1, 1.25, 1.6, 2.2, 3.0, 5.0, 8.0)],
     phrase="a damping error common to all modes",
@@ -394,7 +428,7 @@ def _duration(evidence) -> float:
 STIFFNESS_DRIFT = Kind(
     name="stiffness_drift",
     path="structure",
-    parameters=lambda rig, _: (Parameter("rate", "1/s", -1.0, 10.0, scale=1e-4),),
+    parameters=lambda rig, _: (Parameter("rate", "1/s", -1.0, 10.0, scale=1e-4, neutral=0.0),),
     apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
     starts=lambda evidence, _: [
         {"rate": share / _duration(evidence)}

@@ -114,7 +114,9 @@ def _unrounded(rig: Rig) -> Rig:
 
 def _at_once(rig: Rig) -> Rig:
     """The rig itself where no sensor is late, lags or clips."""
-    if not any(sensor.delay or sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors):
+    if not any(
+        sensor.crosstalk or sensor.delay or sensor.time_constant or np.isfinite(sensor.limit) for sensor in rig.sensors
+    ):
         return rig
-    sensors = tuple(replace(sensor, delay=0.0, time_constant=0.0, limit=np.inf) for sensor in rig.sensors)
+    sensors = tuple(replace(sensor, crosstalk=(), delay=0.0, time_constant=0.0, limit=np.inf) for sensor in rig.sensors)
     return replace(rig, sensors=sensors)

@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import group_of
-from workbench.gap.effects.ports import SENSOR_QUANTISATION
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import simulate
@@ -112,7 +110,7 @@ def budget_of(
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     for i, effect in enumerate(order):  # what no model can predict is theirs
-        if effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION):
+        if effect.kind.remainder:
             rows[i], rest = rows[i] + rest, np.zeros_like(rest)
     shares = np.array([*rows, rest, noise])
     whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)

@@ -7,7 +7,6 @@ import numpy as np
 
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind
-from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.structural import modes_of
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
@@ -187,7 +186,7 @@ def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) ->
     rig, data = evidence.rig, evidence.data.stepped(COARSELY)
     base = data.residual(rig)
     labels, signatures, strengths = [], [], {}
-    things = [(k, target) for k in catalogue if k is not RANDOM_DISTURBANCE for target in k.targets(rig)]
+    things = [(k, target) for k in catalogue if k.found_in != "residual" for target in k.targets(rig)]
     for effect, change in evidence.workers.map(lambda thing: _first_seen(*thing, evidence, data, base), things):
         if effect is None:
             continue

@@ -8,9 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect
-from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
-from workbench.gap.effects.ports import SENSOR_CLIPPING, SENSOR_QUANTISATION
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.experiment import Experiment
@@ -63,11 +61,12 @@ class Verdict:
     def _told(self) -> tuple[Effect, ...]:
         """The effects, rounding or clipping of every sensor told once."""
         told = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
-        for kind, field in ((SENSOR_QUANTISATION, "step"), (SENSOR_CLIPPING, "limit")):
+        for kind in dict.fromkeys(e.kind for e in told if e.kind.found_in == "readings"):
             same = [e for e in told if e.kind is kind]
             if len(same) == len(self.nominal.sensors) > 1:
                 told = [e for e in told if e.kind is not kind]
-                told.insert(0, Effect(kind, ALL, {field: float(np.median([e.values[field] for e in same]))}))
+                median = {name: float(np.median([e.values[name] for e in same])) for name in same[0].values}
+                told.insert(0, Effect(kind, ALL, median))
         return tuple(told)
 
     @property
@@ -99,7 +98,7 @@ class Verdict:
                 return "There is no gap beyond the noise of the sensors."
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
-        if any(effect.kind in (RANDOM_DISTURBANCE, SENSOR_QUANTISATION) for effect in self.effects):
+        if any(effect.kind.remainder for effect in self.effects):
             verb = "accounts" if len(named) == 1 else "account"
             text = f"{words} {verb} for the gap, part of which nothing can predict."
         elif self.outcome == "explained":
@@ -191,24 +190,25 @@ class Verdict:
 
 def effect_json(effect: Effect, nominal: Rig) -> dict:
     """One effect: kind, parameters with their standard deviations, place, input or output."""
-    values = {name: value for name, value in effect.values.items() if name not in COORDINATES}
-    if effect.kind.name == "truncated_modes":
-        values = {"kept": nominal.modes.n_modes, "needed": int(effect.target or 0)}
-    if "phase" in values:
-        values["phase"] = float((values["phase"] + np.pi) % (2.0 * np.pi) - np.pi)
-    entry: dict = {"kind": effect.kind.name, "parameters": {n: _rounded(v) for n, v in values.items()}}
+    kind = effect.kind
+    entry: dict = {"kind": kind.name, "parameters": {n: _rounded(v) for n, v in effect.stated(nominal).items()}}
     deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n not in COORDINATES}
     if deviations:
         entry["parameters_std"] = deviations
-    if effect.kind.path in ("actuator", "sensor"):
-        entry["input" if effect.kind.path == "actuator" else "output"] = effect.target
-    if effect.kind.name == "support_rotation":
-        entry["at"], entry["at_std"] = (0.0 if effect.target == "left" else nominal.modes.length), 0.0
+    if kind.path in ("actuator", "sensor"):
+        entry |= _channels_json("input" if kind.path == "actuator" else "output", effect.target, kind.second_channel)
+    if kind.stands is not None:
+        entry["at"], entry["at_std"] = kind.stands(effect, nominal)[0], 0.0
     elif effect.at is not None:
         entry |= _place_json(effect.at)
         spread = [_rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
         entry["at_std"] = spread if len(spread) > 1 else spread[0]
     return entry
+
+
+def _channels_json(side: str, target: Any, second: str) -> dict[str, Any]:
+    """The input or output that an effect acts on, and the other one of two."""
+    return {side: target[0], second: target[1]} if isinstance(target, tuple) else {side: target}
 
 
 def _place_json(where: Any) -> dict[str, Any]:
@@ -256,16 +256,17 @@ def _described(effect: Effect, nominal: Rig) -> str:
         for name, unit in units.items()
         if name not in COORDINATES
     ]
-    text = effect.kind.words
-    if effect.kind.name == "truncated_modes":
-        text += f" ({effect.target} are needed, {nominal.modes.n_modes} are kept)"
+    kind, text = effect.kind, effect.kind.words
+    if kind.remark is not None:
+        text += f" ({kind.remark(effect, nominal)})"
     elif numbers:
         text += f" ({', '.join(n.strip() for n in numbers)})"
-    if effect.kind.path in ("actuator", "sensor"):
-        text += ", all of them" if effect.target == ALL else f", {effect.target}"
-    elif effect.kind.name == "support_rotation":
-        text += f" at the {effect.target} end"
-    if effect.at is not None:
+    if kind.path in ("actuator", "sensor"):
+        names = effect.target if isinstance(effect.target, tuple) else (effect.target,)
+        text += ", all of them" if effect.target == ALL else f", {kind.joined.join(names)}"
+    if kind.stands is not None:
+        text += f" {kind.stands(effect, nominal)[1]}"
+    elif effect.at is not None:
         text += f" {place_in_words(effect.at, effect.deviations)}"
     return text
 

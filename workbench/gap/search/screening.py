@@ -7,7 +7,6 @@ import numpy as np
 
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all
-from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.workers import shared_array
 from workbench.gap.search.fit import finite_residual, slopes
@@ -153,8 +152,7 @@ def _bounds(starts: list[Effect]) -> tuple[float, float]:
     """Of the strength of one kind and target, in units of a start's."""
     if not starts[0].values:
         return 1.0, 1.0
-    # a lone start is of an effect that is linear in its number, and may be of either sign
-    return (WEAKER if len(starts) > 1 else -STRONGER), STRONGER
+    return (-STRONGER if starts[0].kind.signed else WEAKER), STRONGER
 
 
 def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[list[Effect]]:
@@ -164,7 +162,7 @@ def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> li
     starts = [
         [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
         for kind in search.catalogue
-        if kind is not RANDOM_DISTURBANCE and kind.name not in ("sensor_quantisation", "sensor_clipping")
+        if kind.found_in == "search"
         for target in _worthwhile(kind, rig, left)
     ]
     return [task for task in starts if task and not any(_repeats(task[0], effect) for effect in given)]
@@ -178,7 +176,12 @@ def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple:
     by_sensor = left.max(axis=0)
     names = [s.name for s in rig.sensors]
     worst = {names[j] for j in np.argsort(-by_sensor)[:3]}
-    return tuple(t for t in targets if t == ALL or t in worst or by_sensor[names.index(t)] > 0.2 * by_sensor.max())
+
+    def disagrees(target) -> bool:
+        name = target[0] if isinstance(target, tuple) else target
+        return name == ALL or name in worst or by_sensor[names.index(name)] > 0.2 * by_sensor.max()
+
+    return tuple(target for target in targets if disagrees(target))
 
 
 def _repeats(one: Effect, other: Effect) -> bool:
@@ -186,4 +189,4 @@ def _repeats(one: Effect, other: Effect) -> bool:
     kind = one.kind
     if other.kind is not kind or not (kind.path in ("actuator", "sensor") or other.at is None):
         return False
-    return one.target == other.target or ALL in (one.target, other.target) or kind.name == "truncated_modes"
+    return one.target == other.target or ALL in (one.target, other.target) or kind.alone

@@ -1,0 +1,203 @@
+"""Laws that hold for every kind of the catalogue, and what single kinds promise of themselves."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter
+from workbench.gap.effects.limiting_cases import contained, simpler_forms
+from workbench.gap.effects.ports import clipped_level
+from workbench.gap.report.verdict import _described, effect_json
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import LAWS, simulate
+from workbench.rig.stepping import element_force
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+DT = 0.05
+NEW_UNITS = {"m": 1e3, "kg": 1e-3, "N": 1.0, "s": 1.0, "rad": 1.0, "Hz": 1.0, "": 1.0}  # mm, t, s: N stays N
+
+
+def rig(length: float = 1.0, mass: float = 1.0) -> Rig:
+    """A beam of 2 m and 6 kg, in units of which a metre and a kilogram are so many."""
+    beam = Beam(
+        length=2.0 * length,
+        mass_per_length=3.0 * mass / length,
+        bending_stiffness=5.0 * mass * length**3,
+        left="hinged",
+        right="clamped",
+        damping=ModalDamping(0.02),
+    )
+    actuators = (Actuator("F1", 0.5 * length), Actuator("F2", 1.4 * length), Actuator("tap", 1.1 * length, direct=True))
+    sensors = (
+        Sensor("d", 0.3 * length, noise_std=1e-4 * length),
+        Sensor("v", 0.9 * length, "velocity", noise_std=1e-4 * length),
+        Sensor("d2", 1.5 * length, noise_std=1e-4 * length),
+    )
+    return Rig(beam.modes(4), actuators, sensors, structure=beam)
+
+
+def drive(n: int = 200) -> np.ndarray:
+    return np.random.default_rng(1).standard_normal((3, n))
+
+
+def values_of(parameters: tuple[Parameter, ...], changed: float | None) -> dict[str, float]:
+    """Numbers at which the effect changes nothing, or somewhat, at the middle of the structure."""
+    values = {}
+    for p in parameters:
+        if p.name == "at":
+            values[p.name] = 0.45 * p.high
+        elif p.neutral is not None and changed is None:
+            values[p.name] = p.neutral
+        else:
+            values[p.name] = float(np.sqrt(p.low * p.high)) if p.logarithmic and p.low > 0 else 0.5 * p.high
+    return values
+
+
+def has_neutral(kind: Kind) -> bool:
+    return any(p.neutral is not None for target in kind.targets(rig()) for p in kind.parameters(rig(), target))
+
+
+NEUTRAL = [kind for kind in CATALOGUE if has_neutral(kind)]
+
+
+@pytest.mark.parametrize("kind", NEUTRAL, ids=lambda kind: kind.name)
+def test_a_kind_of_no_strength_changes_nothing(kind):
+    nominal = rig()
+    target = kind.targets(nominal)[0]
+    changed = kind.apply(nominal, target, values_of(kind.parameters(nominal, target), None))
+    expected = simulate(nominal, drive(), sample_time=DT, substeps=32).outputs
+    found = simulate(changed, drive(), sample_time=DT, substeps=32).outputs
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+
+
+OF_THE_STRUCTURE = [kind for kind in CATALOGUE if kind.path == "structure"]
+
+
+@pytest.mark.parametrize("kind", OF_THE_STRUCTURE, ids=lambda kind: kind.name)
+def test_bounds_are_those_of_the_rig_in_any_units(kind):
+    """The same beam in millimetres and tonnes has the same bounds, converted."""
+    one, other = rig(), rig(length=1e3, mass=1e-3)
+    for target in kind.targets(one):
+        for p, q in zip(kind.parameters(one, target), kind.parameters(other, target), strict=True):
+            factor = _factor(p.unit)
+            assert (q.low, q.high) == (pytest.approx(p.low * factor), pytest.approx(p.high * factor)), p.name
+            if not p.logarithmic or p.low < 0:
+                assert q.scale == pytest.approx(p.scale * factor), p.name
+
+
+def _factor(unit: str) -> float:
+    """From metres and kilograms to millimetres and tonnes: N s^2/m^3 is 1e-9."""
+    over, _, under = unit.partition("/")
+    factor = 1.0
+    for part, sign in [*((p, 1) for p in over.split()), *((p, -1) for p in under.split())]:
+        name, _, power = part.partition("^")
+        factor *= NEW_UNITS.get(name, 1.0) ** (sign * int(power or 1))
+    return factor
+
+
+@pytest.mark.parametrize("low", [1e-9, -10.0])
+def test_a_parameter_goes_to_its_free_coordinate_and_back(low):
+    parameter = Parameter("stiffness", "N/m", low, 10.0, logarithmic=True, scale=1e-9)
+    for value in (3e-7, 0.02, 9.0, *((-0.02, -9.0) if low < 0 else ())):
+        free = parameter.to_free(value)
+        assert parameter.from_free(free) == pytest.approx(value, rel=1e-12)
+        step = 1e-6
+        slope = (parameter.from_free(free + step) - parameter.from_free(free - step)) / (2.0 * step)
+        assert parameter.slope(value) == pytest.approx(slope, rel=1e-6)
+
+
+def test_a_spring_to_ground_may_be_negative():
+    nominal, spring = rig(), kind_named("ground_spring")
+    softer = spring.apply(nominal, None, {"at": 0.8, "stiffness": -1.0})
+    stiffer = spring.apply(nominal, None, {"at": 0.8, "stiffness": 1.0})
+    assert (softer.modes.omega < nominal.modes.omega).all() and (stiffer.modes.omega > nominal.modes.omega).all()
+    first_order = (stiffer.modes.omega**2 - softer.modes.omega**2) / 2.0
+    np.testing.assert_allclose(first_order, nominal.modes.phi(0.8)[0] ** 2, rtol=0.05)
+    with pytest.raises(ValueError, match="unstable"):
+        spring.apply(nominal, None, {"at": 0.8, "stiffness": -1e6})
+
+
+def test_a_hysteretic_spring_that_always_slides_is_friction():
+    effect = Effect(kind_named("bouc_wen"), None, {"at": 0.8, "stiffness": 500.0, "yield_displacement": 1e-3})
+    spring, friction = simpler_forms(effect, rig())
+    assert spring.kind is kind_named("ground_spring") and friction.kind is kind_named("coulomb_friction")
+    assert friction.values["force"] == pytest.approx(0.5)
+    assert ("point_damper",) in contained((effect,), rig()), "which far below its smoothing speed is a damper"
+
+
+def test_friction_alike_both_ways_is_friction():
+    numbers = {"force_forward": 0.3, "force_backward": 0.1, "smoothing_speed": 0.02}
+    (friction,) = simpler_forms(Effect(kind_named("two_way_friction"), None, {"at": 0.8, **numbers}), rig())
+    assert friction.values == {"at": 0.8, "force": pytest.approx(0.2), "smoothing_speed": 0.02}
+
+
+def test_exchanged_channels_are_named_by_both():
+    nominal = rig()
+    effect = Effect(kind_named("swapped_outputs"), ("d", "d2"), {})
+    plain, exchanged = (simulate(r, drive(), sample_time=DT).outputs for r in (nominal, effect.apply(nominal)))
+    np.testing.assert_array_equal(exchanged, plain[[2, 1, 0]])
+    assert effect.label == "swapped_outputs[d, d2]"
+    assert effect_json(effect, nominal) == {"kind": "swapped_outputs", "parameters": {}, "output": "d", "with": "d2"}
+    assert _described(effect, nominal) == "two outputs that are exchanged, d and d2"
+    inputs = Effect(kind_named("swapped_inputs"), ("F1", "F2"), {})
+    swapped = simulate(inputs.apply(nominal), drive(), sample_time=DT).outputs
+    np.testing.assert_allclose(swapped, simulate(nominal, drive()[[1, 0, 2]], sample_time=DT).outputs, atol=1e-12)
+
+
+def test_cross_talk_adds_a_share_of_another_reading():
+    nominal = rig()
+    effect = Effect(kind_named("sensor_crosstalk"), ("d", "v"), {"share": 0.2})
+    plain, leaking = (simulate(r, drive(), sample_time=DT).outputs for r in (nominal, effect.apply(nominal)))
+    np.testing.assert_allclose(leaking, plain + np.array([[0.2], [0.0], [0.0]]) * plain[1], atol=1e-12)
+    assert effect_json(effect, nominal)["from"] == "v"
+    assert _described(effect, nominal) == "cross-talk between sensors (share 0.2), d from v"
+
+
+def test_a_number_whose_deviation_exceeds_it_is_not_significant():
+    damper, nominal = kind_named("point_damper"), rig()
+    sure = Effect(damper, None, {"at": 0.8, "coefficient": 1.0}, {"at": 0.01, "coefficient": 0.1})
+    unsure = Effect(damper, None, {"at": 0.8, "coefficient": 1.1e6}, {"at": 0.01, "coefficient": 7e7})
+    gain = Effect(kind_named("sensor_gain"), "d", {"gain": 1.0}, {"gain": 0.01})
+    assert sure.significant(nominal) and not unsure.significant(nominal) and not gain.significant(nominal)
+
+
+def _readings(series: np.ndarray) -> SimpleNamespace:
+    record = Record(0.01, series[None], (Channel("d", "displacement"),))
+    return SimpleNamespace(rig=SimpleNamespace(sensors=(Sensor("d", 0.0),)), data=SimpleNamespace(records=(record,)))
+
+
+def test_what_comes_to_rest_at_a_level_is_not_clipped_there():
+    t = 0.01 * np.arange(1200)
+    assert clipped_level(_readings(np.clip(np.sin(2.0 * t), -0.8, 0.8)), "d") == 0.8
+    assert clipped_level(_readings(np.clip(np.sin(2.0 * t), -0.99, 0.99)), "d") == 0.99
+    moving = np.clip(np.mod(t, 4.0) - 0.5, 0.0, 1.0)
+    rest = np.where(np.mod(t, 8.0) < 4.0, 1.0, -1.0) * (0.5 - 0.5 * np.cos(np.pi * moving))
+    there_and_back = np.where(np.mod(t, 8.0) < 4.0, rest, rest + 1.0)
+    assert clipped_level(_readings(there_and_back), "d") is None
+    noisy = there_and_back + 0.01 * np.random.default_rng(0).standard_normal(t.size)
+    assert clipped_level(_readings(np.clip(noisy, -1.0, 1.0)), "d") == 1.0, "noise is cut off where the mass rests"
+
+
+@pytest.mark.parametrize("kind", [kind for kind in CATALOGUE if kind.force_laws], ids=lambda kind: kind.name)
+def test_the_law_that_is_drawn_is_the_law_that_acts(kind):
+    nominal = rig()
+    values = {p.name: 1.0 for p in kind.parameters(nominal, None) if p.name not in COORDINATES}
+    values |= {"at": 0.8, "gap": 0.01, "smoothing_speed": 0.05, "yield_displacement": 0.02}
+    changed = kind.apply(nominal, None, {p.name: values[p.name] for p in kind.parameters(nominal, None)})
+    if not changed.elements:
+        pytest.skip("a change of the structure, not an element of the rig")
+    (one,) = changed.elements
+    code, numbers = LAWS[type(one)]
+    row = np.zeros((1, 3))
+    row[0, : len(numbers(one))] = numbers(one)
+    grid = np.linspace(-0.1, 0.1, 41)
+    for motion, law in kind.force_laws.items():
+        paths = [(x, 0.0) if motion == "displacement" else (0.0, x) for x in grid]
+        acting = [element_force(code, row, 0, w, v, 0.0, 0.0)[0] for w, v in paths]
+        np.testing.assert_allclose(law(values, grid), acting, atol=1e-12)

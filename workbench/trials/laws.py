@@ -1,0 +1,134 @@
+"""Laws of force at a point that a plant may hide: the force, its parameters in a label, and how they are drawn.
+
+A new law is a code, a line in `law_force`, and an entry in `POINT_LAWS`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+DAMPER, CUBIC, CLEARANCE, STOP, FRICTION, BOUC_WEN, QUADRATIC, QUINTIC, CUBIC_DAMPER, SQUEEZE, MAGNET = range(11)
+SLIDING, QUADRATIC_DAMPER = range(11, 13)
+
+
+@njit(cache=True)
+def law_force(code, p, w, v, z):
+    """Force of a law at a point, from displacement, velocity and hysteretic variable there."""
+    if code == DAMPER:
+        return -p[0] * v
+    if code == CUBIC:
+        return -p[0] * w**3
+    if code == CLEARANCE:
+        return -p[0] * (max(w - p[1], 0.0) + min(w + p[1], 0.0))
+    if code == STOP:
+        return -p[0] * max(w - p[1], 0.0)
+    if code == FRICTION:
+        return -p[0] * np.tanh(v / p[1])
+    if code == BOUC_WEN:
+        return -p[0] * z
+    if code == QUADRATIC:
+        return -p[0] * w * abs(w)
+    if code == QUINTIC:
+        return -p[0] * w**5
+    if code == CUBIC_DAMPER:
+        return -p[0] * v**3
+    if code == SQUEEZE:
+        return -p[0] * w * w * v
+    if code == SLIDING:
+        return -0.5 * (p[0] + p[1]) * np.tanh(v / p[2]) - 0.5 * (p[0] - p[1])
+    if code == QUADRATIC_DAMPER:
+        return -p[0] * abs(v) * v
+    return p[0] * w / (1.0 + (w / p[1]) ** 2) ** 2
+
+
+@dataclass(frozen=True)
+class PointSizes:
+    """What is typical at a point: a stiffness (N/m), rms displacement (m) and velocity (m/s), and a force (N)."""
+
+    stiffness: float
+    displacement: float
+    velocity: float
+    force: float
+
+
+Strengths = Callable[[float], dict[str, float]]
+
+
+@dataclass(frozen=True)
+class PointLaw:
+    """A law at a point.
+
+    Attributes:
+        code: of `law_force`.
+        parameters: their names in a label, in the order of the law.
+        draw: sizes, rng -> numbers at a strength near 1; None where they are drawn otherwise.
+        outside: whether no catalogue of a diagnosis holds it: an honest verdict on it is "unknown".
+    """
+
+    code: int
+    parameters: tuple[str, ...]
+    draw: Callable[[PointSizes, np.random.Generator], Strengths] | None = None
+    outside: bool = False
+
+
+def _clearance(p: PointSizes, rng: np.random.Generator) -> Strengths:
+    gap = float(rng.uniform(0.3, 0.8)) * 1.5 * p.displacement
+    return lambda s: {"stiffness": s * p.stiffness, "gap": gap}
+
+
+def _friction(p: PointSizes, rng: np.random.Generator) -> Strengths:
+    speed = float(rng.uniform(0.01, 0.05)) * p.velocity
+    return lambda s: {"force": 0.02 * s * p.force, "smoothing_speed": speed}
+
+
+def _two_way_friction(p: PointSizes, rng: np.random.Generator) -> Strengths:
+    speed, ratio = float(rng.uniform(0.01, 0.05)) * p.velocity, float(rng.uniform(0.3, 0.8))
+    names = ("force_forward", "force_backward")
+    stronger, weaker = names if rng.random() < 0.5 else names[::-1]
+
+    def law(s: float) -> dict[str, float]:
+        force = 0.02 * s * p.force
+        return {stronger: force, weaker: ratio * force, "smoothing_speed": speed}
+
+    return law
+
+
+def _bouc_wen(p: PointSizes, rng: np.random.Generator) -> Strengths:
+    limit = float(rng.uniform(0.2, 0.8)) * p.displacement
+    return lambda s: {"stiffness": 0.1 * s * p.stiffness, "yield_displacement": limit}
+
+
+def _magnet(p: PointSizes, rng: np.random.Generator) -> Strengths:
+    reach = float(rng.uniform(0.5, 1.0)) * p.displacement
+    return lambda s: {"stiffness": 0.1 * s * p.stiffness, "reach": reach}
+
+
+def _power(name: str, share: float, of_displacement: float, of_velocity: float = 0.0):
+    """One number, such that the force is that share of the typical spring's at the typical motion."""
+
+    def draw(p: PointSizes, rng: np.random.Generator) -> Strengths:
+        force = share * p.stiffness * p.displacement
+        motion = p.displacement**of_displacement * p.velocity**of_velocity
+        return lambda s: {name: s * force / motion}
+
+    return draw
+
+
+CONTACT = ("stiffness", "gap")
+POINT_LAWS: dict[str, PointLaw] = {
+    "point_damper": PointLaw(DAMPER, ("coefficient",)),
+    "cubic_spring": PointLaw(CUBIC, ("stiffness",), _power("stiffness", 0.1, 3)),
+    "clearance": PointLaw(CLEARANCE, CONTACT, _clearance),
+    "one_sided_stop": PointLaw(STOP, CONTACT, _clearance),
+    "coulomb_friction": PointLaw(FRICTION, ("force", "smoothing_speed"), _friction),
+    "bouc_wen": PointLaw(BOUC_WEN, ("stiffness", "yield_displacement"), _bouc_wen),
+    "two_way_friction": PointLaw(SLIDING, ("force_forward", "force_backward", "smoothing_speed"), _two_way_friction),
+    "quadratic_damper": PointLaw(QUADRATIC_DAMPER, ("coefficient",), _power("coefficient", 0.05, 0, 2)),
+    "quadratic_spring": PointLaw(QUADRATIC, ("stiffness",), _power("stiffness", 0.1, 2), outside=True),
+    "quintic_spring": PointLaw(QUINTIC, ("stiffness",), _power("stiffness", 0.05, 5), outside=True),
+    "cubic_damper": PointLaw(CUBIC_DAMPER, ("coefficient",), _power("coefficient", 0.05, 0, 3), outside=True),
+    "squeeze_film": PointLaw(SQUEEZE, ("coefficient",), _power("coefficient", 0.1, 2, 1), outside=True),
+    "magnet": PointLaw(MAGNET, ("stiffness", "reach"), _magnet, outside=True),
+}
