@@ -12,7 +12,7 @@ import pytest
 from typer.main import get_command
 
 import workbench
-from workbench.cases.case import INPUT, MEMBER, MODAL, OUTPUT, RECORD, SINGLE, STRUCTURES, TABLES
+from workbench.cases.case import EDGES, INPUT, MEMBER, MODAL, OUTPUT, PLATE, RECORD, SINGLE, STRUCTURES, TABLES
 from workbench.cli.app import app
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.rig.actuators import Actuator
@@ -74,6 +74,8 @@ def test_the_case_format_names_every_key_and_every_effect():
     keys = {
         *TABLES,
         *MEMBER,
+        *PLATE,
+        *EDGES,
         *MODAL,
         *SINGLE,
         *INPUT,
@@ -81,7 +83,7 @@ def test_the_case_format_names_every_key_and_every_effect():
         *RECORD,
         *(k for keys in STRUCTURES.values() for k in keys),
     }
-    missing = [key for key in keys if f"`{key}`" not in text and f"[{key}]" not in text and f"{key} = " not in text]
+    missing = [key for key in keys if not re.search(rf"`{key}`|\[{key}\]|^{key} = ", text, re.M)]
     assert not missing
     rows = dict(re.findall(r"^\| `(\w+)` \| .* \| (.*) \|$", text, re.M))
     beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="clamped")
