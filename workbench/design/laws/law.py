@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.design.laws.printed import Printed, numbered, place_text
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Between, NamedPoints, Rectangle
@@ -19,8 +20,8 @@ class DesignError(ValueError):
     """A design that cannot be: what conflicts, and the way out."""
 
 
-@dataclass(frozen=True, eq=False)
-class Law:
+@dataclass(frozen=True, eq=False, repr=False)
+class Law(Printed):
     """u = -K x, x = (q_1..q_n, q_1'..q_n') of the controlled modes.
 
     Attributes:
@@ -48,6 +49,17 @@ class Law:
     @property
     def n_controlled(self) -> int:
         return len(self.controlled)
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        count = len(self.actuators)
+        line = f"{self.name}, u = -K x: modes {numbered(self.controlled)} by {count} actuator{'s' * (count > 1)}"
+        modes = [str(r + 1) for r in self.controlled]
+        headings = ["actuator", "place [m]", *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
+        rows = [
+            [a.name, place_text(a.at), *(f"{k:.4g}" for k in gains)]
+            for a, gains in zip(self.actuators, self.gain, strict=True)
+        ]
+        return line, headings, rows, ()
 
 
 def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[int, ...]:

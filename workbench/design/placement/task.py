@@ -4,6 +4,7 @@ With IMSC the modal forces do not depend on the places, so W_R = ½ Σ_r E|φ_r(
 transforms f̂_r = f̂(iω_r) known once and for all, in the mean over the disturbances that may come.
 """
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -13,6 +14,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.printed import Printed
 from workbench.design.placement.peak import largest
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import Between
@@ -25,8 +27,8 @@ NOTHING = 1e-7
 MOST_FORCES = 10_000_000
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
+@dataclass(frozen=True, eq=False, repr=False)
+class Placement(Printed):
     """A control law with its actuators placed, and what it costs.
 
     Attributes:
@@ -54,6 +56,22 @@ class Placement:
     def __post_init__(self) -> None:
         object.__setattr__(self, "positions", frozen(self.positions))
         object.__setattr__(self, "by_mode", frozen(self.by_mode))
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        names = [f"F{i + 1}" for i in range(self.positions.size)]
+        if self.law is not None:
+            names = [actuator.name for actuator in self.law.actuators]
+        count = self.positions.size
+        n_controlled = count if self.law is None else self.law.n_controlled
+        line = f"{count} actuator{'s' * (count > 1)} placed: W_R = {self.residual_work:.4g}, effort {self.effort:.4g}"
+        rows = [(name, f"{x:.4g}") for name, x in zip(names, self.positions, strict=True)]
+        most = int(np.argmax(self.by_mode))
+        remarks = (
+            f"largest W_r = {self.by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
+            f" {self.peak_force:.4g}; condition of B {self.condition:.3g}",
+            *((f"search: {self.status}",) if self.status else ()),
+        )
+        return line, ("actuator", "x [m]"), rows, remarks
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.laws.printed import Printed
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
@@ -26,8 +27,8 @@ from workbench.structure.modes import Modes, frozen
 GAUSS_POINTS = 12
 
 
-@dataclass(frozen=True, eq=False)
-class Spillover:
+@dataclass(frozen=True, eq=False, repr=False)
+class Spillover(Printed):
     """Work by mode, J (or the consistent unit).
 
     Attributes:
@@ -66,6 +67,15 @@ class Spillover:
     def total(self) -> float:
         """W = W_C + W_R (5.27)."""
         return float(self.by_mode.sum())
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        until = "for all time" if np.isinf(self.final_time) else f"until {self.final_time:g} s"
+        line = f"work of the actuators {until}: W_C = {self.controlled_total:.4g}, W_R = {self.residual_total:.4g}"
+        rows = [
+            (str(r + 1), "controlled" if r in self.controlled else "residual", f"{work:.4g}")
+            for r, work in enumerate(self.by_mode)
+        ]
+        return line, ("mode", "", "W_r"), rows, ()
 
 
 def force_transform(modes: Modes, law: Law, state: np.ndarray, s: np.ndarray) -> np.ndarray:
