@@ -11,6 +11,7 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.on_off_response import Switched
 from workbench.design.placement.how_many import HowMany
 from workbench.design.placement.placement import Placement
+from workbench.design.placement.velocity_feedback import FeedbackPlacement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
@@ -320,4 +321,18 @@ def plot_switching(law: OnOffLaw, switched: Switched, which: int = 0) -> Figure:
         pushes[inside] = s.steady + s.ramp * tau[inside] + s.fading * np.exp(-relay.slope * tau[inside])
     axes[1].plot(response.time, pushes, color=COLOURS[0])
     axes[1].set(xlabel="time [s]", ylabel="modal force", title="modal force; its mean where the mode slides")
+    return figure
+
+
+def plot_feedback_index(places: np.ndarray, index: np.ndarray, found: dict[int, FeedbackPlacement]) -> Figure:
+    """Energy integral of one collocated pair by the place of its middle, and the best places of several pairs."""
+    figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=[3, 1.3])
+    axes[0].plot(places, index, color=COLOURS[0], label="one pair")
+    axes[1].set(xlabel="middle of the patch, x [m]", ylabel="pairs", yticks=list(found), ylim=(0.4, max(found) + 0.6))
+    for (count, best), colour in zip(found.items(), COLOURS[1:], strict=False):
+        axes[0].axhline(best.index, color=colour, linestyle="--", label=f"best of {count}: E = {best.index:.4f}")
+        axes[1].plot(best.positions, np.full(best.positions.size, count), "s", color=colour, markersize=9)
+    axes[0].set(ylabel="energy integral E [J s]")
+    axes[0].set_title("direct velocity feedback by collocated piezo pairs")
+    axes[0].legend()
     return figure
