@@ -2,7 +2,7 @@
 
 import numpy as np
 from matplotlib.figure import Figure
-from scipy.signal import welch
+from scipy.signal import coherence, csd, welch
 
 from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
@@ -43,4 +43,28 @@ def plot_transfer(measured: TransferFunctions) -> Figure:
         axes[0, 0].legend(fontsize=8)
     axes[0, 0].set_title("magnitude of the transfer functions, output per input")
     axes[-1, 0].set_xlabel("frequency [Hz]")
+    return figure
+
+
+def plot_frf(record: Record) -> Figure:
+    """Frequency response of each output to the one input, H1 = S_uy / S_uu, over its coherence.
+
+    Raises:
+        ValueError: a record with no input, or several.
+    """
+    if record.n_inputs != 1:
+        raise ValueError(f"a frequency response by H1 needs one input; record {record.name!r} has {record.n_inputs}")
+    rate, segment = record.sample_rate_hz, min(LINES, max(record.n_samples // SEGMENTS, 1))
+    u = record.inputs[0] - record.inputs[0].mean()
+    lines, power = welch(u, rate, nperseg=segment)
+    figure, axes = new_figure(2, 1, width=9, height=5.5, sharex=True, height_ratios=(3, 1))
+    for channel, row in list(zip(record.output_channels, record.outputs))[:MOST_PANELS]:
+        y = row - row.mean()
+        cross = np.abs(csd(u, y, rate, nperseg=segment)[1])
+        response = np.divide(cross, power, out=np.full_like(power, np.nan), where=power > SHOWN * power.max())
+        axes[0].semilogy(lines[1:], response[1:], linewidth=0.9, label=channel.name)
+        axes[1].plot(lines[1:], coherence(u, y, rate, nperseg=segment)[1][1:], linewidth=0.9)
+    axes[0].set(ylabel=f"output per {record.input_channels[0].name}", title="frequency response (H1)")
+    axes[1].set(xlabel="frequency [Hz]", ylabel="coherence", ylim=(0.0, 1.05))
+    axes[0].legend(ncols=4, fontsize=8)
     return figure

@@ -11,7 +11,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import find_peaks, welch
 
 from workbench.draw.plot import plot
-from workbench.draw.spectra import plot_spectra, plot_transfer
+from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
 from workbench.identification.signal.data_quality import data_faults
 from workbench.identification.signal.decay import decay_start
 from workbench.records.record import Channel, Record
@@ -83,6 +83,7 @@ def _record(record: Record, path: Path) -> Look:
     if faulty and kept:
         options += ["--outputs", ",".join(kept)]
     moving = record.only([name for name in record.output_names if name not in faulty]) if kept or forces else record
+    driven = moving.n_inputs == 1 and bool(np.ptp(moving.inputs)) and moving.n_samples >= 16 * SEGMENTS
     story = Story(
         title=f"What {path.name} holds",
         lead=heading,
@@ -90,6 +91,7 @@ def _record(record: Record, path: Path) -> Look:
         blocks=[
             block(plot(record), "The signals as recorded."),
             block(plot_spectra(moving), "Power spectral density, by Welch's method."),
+            *([block(plot_frf(moving), "Frequency response functions and coherence.")] if driven else []),
         ],
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",

@@ -147,6 +147,9 @@ class Verdict:
         near = [label for label, probability in self.alternatives if probability > 0.01]
         return f"; {' and '.join(near)} cannot be excluded." if near else "."
 
+    def __repr__(self) -> str:
+        return f"<Verdict on {self.case}: {self.sentence}>"
+
     def to_json(self) -> dict:
         """The verdict as the case format asks for it, and what stands behind it."""
         known = self.outcome in ("none", "explained")

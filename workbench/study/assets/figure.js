@@ -43,7 +43,7 @@ var workbench = (function () {
       var first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9);
       var every = Math.max(1, Math.ceil((last - first + 1) / wanted));
       for (var e = first; e <= last; e += every) found.push([Math.pow(10, e)]);
-      var plain = low > 0.009 && high < 1100;
+      var plain = low > 9e-5 && high < 1.1e5;  // else powers of ten
       return found.map(function (t) { return [t[0], plain ? String(parseFloat(t[0].toPrecision(3))) : power(t[0])]; });
     }
     var raw = (high - low) / wanted, unit = Math.pow(10, Math.floor(Math.log10(raw)));
