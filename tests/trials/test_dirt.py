@@ -79,9 +79,9 @@ def test_late_sensors_read_what_was_a_fraction_of_a_sample_before(bench):
     """The late reading is that of a plant sampled ten times as often, three of its samples before."""
     dt, n = bench.sample_time, 60
     commands = np.random.default_rng(0).standard_normal((len(bench.rig.actuators), n))
-    late = Dirt(delays=(0.3,) * len(bench.rig.sensors)).on(Plant.of(bench.rig), dt).rooted()
+    late = Dirt(delays=(0.3,) * len(bench.rig.sensors)).on(Plant.of(bench.rig), dt).solved()
     readings = late.readings(late.move(commands, dt)[0], dt)
-    fine = Plant.of(bench.rig).rooted()
+    fine = Plant.of(bench.rig).solved()
     moved, _ = fine.move(np.repeat(commands, 10, axis=1), dt / 10)
     expected = fine.readings(moved, dt / 10)
     shifted = np.c_[np.zeros((len(expected), 3)), expected][:, ::10][:, :n]
@@ -119,7 +119,7 @@ def test_shape_errors_are_those_of_a_member_with_that_mass_stiffness_and_damping
     )
     rig = replace(bench.rig, structure=changed, modes=changed.modes(bench.rig.modes.n_modes, tolerance=1e-9))
     commands = np.random.default_rng(0).standard_normal((len(rig.actuators), 200))
-    plant = dirt.on(Plant.of(bench.rig), bench.sample_time).rooted()
+    plant = dirt.on(Plant.of(bench.rig), bench.sample_time).solved()
     readings = plant.readings(plant.move(commands, bench.sample_time)[0], bench.sample_time)
     expected = simulate(rig, commands, sample_time=bench.sample_time).outputs
     np.testing.assert_allclose(readings, expected, atol=2e-3 * np.abs(expected).max())

@@ -140,17 +140,17 @@ EFFECTS = {
 }
 
 
-def _reference(rooted, forces, extra) -> np.ndarray:
+def _reference(solved, forces, extra) -> np.ndarray:
     """Modal motion (3, N, n) by DOP853, started afresh at each sample, as the forces jump there."""
-    n = rooted.modes.omega.size
-    omega, zeta = rooted.modes.omega, 0.02
+    n = solved.modes.omega.size
+    omega, zeta = solved.modes.omega, 0.02
     y, out = np.zeros(2 * n + 1), np.zeros((3, N, n))
     for k in range(N):
 
         def rates(t, y, k=k):
             q, v, z = y[:n], y[n : 2 * n], y[-1]
             modal, dz = extra(t, q, v, z)
-            a = -(omega**2) * q - 2 * zeta * omega * v + rooted.at_actuators.T @ forces(t, k) + modal
+            a = -(omega**2) * q - 2 * zeta * omega * v + solved.at_actuators.T @ forces(t, k) + modal
             return np.r_[v, a, dz]
 
         out[0, k], out[1, k], out[2, k] = y[:n], y[n : 2 * n], rates(k * DT, y)[n : 2 * n]
@@ -161,16 +161,16 @@ def _reference(rooted, forces, extra) -> np.ndarray:
 
 @pytest.mark.parametrize("kind", list(LAWS))
 def test_laws_at_a_point_agree_with_an_adaptive_integrator(rig, commands, kind):
-    rooted = hide(Plant.of(rig), [{"kind": kind, "at": 0.8, **EFFECTS[kind]}]).rooted()
-    shape, law = rooted.at_laws[0], LAWS[kind]
+    solved = hide(Plant.of(rig), [{"kind": kind, "at": 0.8, **EFFECTS[kind]}]).solved()
+    shape, law = solved.at_laws[0], LAWS[kind]
 
     def extra(t, q, v, z):
         w, speed = shape @ q, shape @ v
         return shape * law(w, speed, z), speed - (abs(speed) * z + speed * abs(z)) / (2 * 0.03)
 
-    moved, _ = rooted.move(commands, DT, finest=0.02)
-    expected = _reference(rooted, lambda t, k: commands[:, k], extra)
-    plain, _ = Plant.of(rig).rooted().move(commands, DT, finest=0.02)
+    moved, _ = solved.move(commands, DT, finest=0.02)
+    expected = _reference(solved, lambda t, k: commands[:, k], extra)
+    plain, _ = Plant.of(rig).solved().move(commands, DT, finest=0.02)
     for got, want, without in zip(moved[:3], expected, plain[:3], strict=True):
         assert np.abs(want - without).max() > 0.02 * np.abs(want).max(), "the law must matter"
         np.testing.assert_allclose(got, want, atol=2e-5 * np.abs(want).max())
@@ -183,11 +183,11 @@ def test_what_acts_all_along_agrees_with_an_adaptive_integrator(rig, commands):
         {"kind": "stiffness_drift", "rate": 0.05},
         {"kind": "periodic_disturbance", "at": 0.4, "frequency": 0.7, "amplitude": 0.9, "phase": 0.4},
     ]
-    rooted = hide(Plant.of(rig), effects).rooted()
+    solved = hide(Plant.of(rig), effects).solved()
     x = np.linspace(0.0, 2.0, 801)
     r = np.arange(1, 5)
     shapes = np.sqrt(1.0 / 3.0) * np.sin(np.outer(x, r) * np.pi / 2.0)
-    signs = np.sign(rooted.at_sensors[0] * shapes[120])  # at 0.3 m; the solver is free in them
+    signs = np.sign(solved.at_sensors[0] * shapes[120])  # at 0.3 m; the solver is free in them
     shapes *= signs
     at = np.sqrt(1.0 / 3.0) * np.sin(0.4 * r * np.pi / 2.0) * signs
 
@@ -196,11 +196,11 @@ def test_what_acts_all_along_agrees_with_an_adaptive_integrator(rig, commands):
         drag = np.trapezoid(-0.5 * np.abs(speed) * speed * shapes.T, x)
         slope = (r * np.pi / 2.0) ** 2 / 3.0  # ∫ φ_r'² dx
         stretch = -3.0 * np.sum(slope * q**2) * slope * q
-        drift = -0.05 * t * rooted.modes.omega**2 * q
+        drift = -0.05 * t * solved.modes.omega**2 * q
         return drag + stretch + drift + at * 0.9 * np.sin(2 * np.pi * 0.7 * t + 0.4), 0.0
 
-    moved, _ = rooted.move(commands, DT, finest=0.02)
-    expected = _reference(rooted, lambda t, k: commands[:, k], extra)
+    moved, _ = solved.move(commands, DT, finest=0.02)
+    expected = _reference(solved, lambda t, k: commands[:, k], extra)
     for got, want in zip(moved[:3], expected, strict=True):
         np.testing.assert_allclose(got, want, atol=3e-5 * np.abs(want).max())
 
@@ -213,15 +213,15 @@ def test_actuators_lose_gain_dead_zone_limit_delay_and_lag_in_that_order(rig, co
         {"kind": "actuator_delay", "input": "all", "delay": 1.4 * DT},
         {"kind": "actuator_lag", "input": "all", "time_constant": 0.05},
     ]
-    rooted = hide(Plant.of(rig), effects).rooted()
+    solved = hide(Plant.of(rig), effects).solved()
     aim = commands * np.array([[1.7], [1.0], [1.0]])
     aim[:2] = np.clip(np.sign(aim[:2]) * np.maximum(np.abs(aim[:2]) - 0.3, 0.0), -0.9, 0.9)
     # exact: piecewise-constant aims between the edges k DT and (k + 0.4) DT, state (q, v, F1, F2) by matrix exponential
-    n, b = 4, rooted.at_actuators
+    n, b = 4, solved.at_actuators
     system = np.zeros((2 * n + 5, 2 * n + 5))
     system[:n, n : 2 * n] = np.eye(n)
-    system[n : 2 * n, :n] = -np.diag(rooted.modes.omega**2)
-    system[n : 2 * n, n : 2 * n] = -np.diag(0.04 * rooted.modes.omega)
+    system[n : 2 * n, :n] = -np.diag(solved.modes.omega**2)
+    system[n : 2 * n, n : 2 * n] = -np.diag(0.04 * solved.modes.omega)
     system[n : 2 * n, 2 * n : 2 * n + 2] = b[:2].T
     system[2 * n : 2 * n + 2, 2 * n : 2 * n + 2] = -np.eye(2) / 0.05
     system[2 * n : 2 * n + 2, 2 * n + 2 : 2 * n + 4] = np.eye(2) / 0.05
@@ -234,17 +234,17 @@ def test_actuators_lose_gain_dead_zone_limit_delay_and_lag_in_that_order(rig, co
             state[2 * n + 2 : 2 * n + 4] = aim[:2, k - back] if k >= back else 0.0
             state[2 * n + 4] = commands[2, k]
             state = step @ state
-    moved, _ = rooted.move(commands, DT, finest=0.02)
+    moved, _ = solved.move(commands, DT, finest=0.02)
     np.testing.assert_allclose(moved[0], expected, atol=1e-7 * np.abs(expected).max())
 
 
 def test_the_controller_acts_on_what_really_happens(rig, commands):
-    rooted = Plant.of(rig).rooted()
-    moved, sent = rooted.move(commands, DT, feedback=0.3)
-    speeds = rooted.at_actuators @ moved[1].T
+    solved = Plant.of(rig).solved()
+    moved, sent = solved.move(commands, DT, feedback=0.3)
+    speeds = solved.at_actuators @ moved[1].T
     np.testing.assert_allclose(sent[:2], commands[:2] - 0.3 * speeds[:2], atol=1e-12)
     np.testing.assert_array_equal(sent[2], commands[2])
-    replayed, _ = rooted.move(sent, DT)
+    replayed, _ = solved.move(sent, DT)
     np.testing.assert_allclose(replayed[0], moved[0], atol=1e-12)
 
 
@@ -253,25 +253,25 @@ def test_sensors_lose_lag_gain_bias_noise_limit_and_step_in_that_order(rig):
         replace(s, time_constant=0.1, gain=2.0, bias=0.3, drift=0.5, limit=1.2, step=0.05, noise_std=0.0)
         for s in rig.sensors
     )
-    rooted = replace(Plant.of(rig), sensors=sensors).rooted()
+    solved = replace(Plant.of(rig), sensors=sensors).solved()
     t = DT * np.arange(N)
     ramp = np.outer(t, np.ones(4))
-    y = rooted.readings((ramp, ramp, ramp), DT, np.random.default_rng(0))
+    y = solved.readings((ramp, ramp, ramp), DT, np.random.default_rng(0))
     lagged = t - 0.1 * (1.0 - np.exp(-t / 0.1))  # of a ramp, exactly
-    for row, shape in zip(y, rooted.at_sensors, strict=True):
+    for row, shape in zip(y, solved.at_sensors, strict=True):
         exact = np.clip(2.0 * shape.sum() * lagged + 0.3 + 0.5 * t / t[-1], -1.2, 1.2)
         np.testing.assert_allclose(row, 0.05 * np.round(exact / 0.05), atol=1e-9)
 
 
 def test_the_mean_of_rounded_readings_is_their_mean(rig):
     sensors = tuple(replace(s, step=0.05, noise_std=0.01) for s in rig.sensors)
-    rooted = replace(Plant.of(rig), sensors=sensors).rooted()
+    solved = replace(Plant.of(rig), sensors=sensors).solved()
     ramp = np.outer(np.linspace(0.0, 0.2, 40), np.ones(4))
     rng = np.random.default_rng(0)
-    many = np.mean([rooted.readings((ramp, ramp, ramp), DT, rng) for _ in range(4000)], axis=0)
-    mean = rooted.readings((ramp, ramp, ramp), DT)
+    many = np.mean([solved.readings((ramp, ramp, ramp), DT, rng) for _ in range(4000)], axis=0)
+    mean = solved.readings((ramp, ramp, ramp), DT)
     np.testing.assert_allclose(mean, many, atol=6.0 * 0.05 / np.sqrt(12.0 * 4000))
-    assert np.abs(mean - rooted.truth((ramp, ramp, ramp), DT)).max() > 0.005, "rounding must matter"
+    assert np.abs(mean - solved.truth((ramp, ramp, ramp), DT)).max() > 0.005, "rounding must matter"
 
 
 def test_modes_beyond_the_nominal_ones_take_its_damping(rig):
@@ -279,7 +279,7 @@ def test_modes_beyond_the_nominal_ones_take_its_damping(rig):
     shown = hide(Plant.of(rig), [truncated, {"kind": "modal_damping", "factor": 2.0}])
     pulse = np.zeros((3, 40))
     pulse[2, 0] = 1.0
-    moved, _ = shown.rooted().move(pulse, 0.02)
+    moved, _ = shown.solved().move(pulse, 0.02)
     assert moved[0].shape == (40, 7)
     omega, zeta = WAVE * (7 * np.pi) ** 2, 0.04
     decay = np.hypot(moved[0][:, 6], (moved[1][:, 6] + zeta * omega * moved[0][:, 6]) / (omega * np.sqrt(1 - zeta**2)))

@@ -10,7 +10,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
-from workbench.trials.plant import ModalMotion, Plant, RootedPlant, coloured_noise
+from workbench.trials.plant import ModalMotion, Plant, SolvedPlant, coloured_noise
 
 SAMPLES = 2000
 LEVELS = {"low": 0.25, "high": 1.0, "mid": 0.625}
@@ -83,7 +83,7 @@ def _suited(rig: Rig, rng: np.random.Generator) -> Bench:
     band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
     snr_db = float(rng.choice([30.0, 40.0, 50.0]))
     bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, snr_db, None)
-    plant = Plant.of(rig).rooted()
+    plant = Plant.of(rig).solved()
     commands = multisine(bench, rng)
     moved, _ = plant.move(commands, bench.sample_time)
     widest = np.sqrt(np.mean((plant.at_actuators @ moved[0].T) ** 2, axis=1)).max()
@@ -139,7 +139,7 @@ def experiments(bench: Bench, rng: np.random.Generator) -> dict[str, np.ndarray]
 
 
 def tested(
-    plant: RootedPlant, bench: Bench, name: str, commands: np.ndarray, rng: np.random.Generator | None = None
+    plant: SolvedPlant, bench: Bench, name: str, commands: np.ndarray, rng: np.random.Generator | None = None
 ) -> tuple[ModalMotion, np.ndarray]:
     """The motion of a plant in one of the experiments, and the commands that were sent."""
     feedback = (bench.feedback or 0.0) if name == "closed_loop" else 0.0

@@ -16,7 +16,7 @@ from workbench.trials.chance import draw_effect
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
 from workbench.trials.draws import DRAWS
 from workbench.trials.hidden import HIDE, OUTSIDE, hide
-from workbench.trials.plant import Plant, RootedPlant
+from workbench.trials.plant import Plant, SolvedPlant
 from workbench.trials.scene import Scene, Unsuitable, extent
 
 NONE, UNKNOWN = "none", "unknown"
@@ -136,10 +136,10 @@ def _case(
     bench: Bench, tests: dict[str, np.ndarray], effects: list[dict], dirt: Dirt, rng: np.random.Generator, name: str
 ) -> tuple[Case, dict]:
     dirty = dirt.on(Plant.of(bench.rig), bench.sample_time)
-    nominal = Plant.of(bench.rig).rooted()
-    real = hide(dirty, effects).rooted()
+    nominal = Plant.of(bench.rig).solved()
+    real = hide(dirty, effects).solved()
     if dirt != Dirt() and effects:
-        _check_strong(bench, tests, nominal, dirty.rooted(), real, rng)
+        _check_strong(bench, tests, nominal, dirty.solved(), real, rng)
     fit: list[Record] = []
     validation: list[Record] = []
     figures = {}
@@ -177,9 +177,9 @@ def _case(
 def _check_strong(
     bench: Bench,
     tests: dict[str, np.ndarray],
-    nominal: RootedPlant,
-    dirty: RootedPlant,
-    real: RootedPlant,
+    nominal: SolvedPlant,
+    dirty: SolvedPlant,
+    real: SolvedPlant,
     rng: np.random.Generator,
 ) -> None:
     """Some record to fit must show the effects at least nearly as strongly as the dirt, else nothing strong hides."""
@@ -221,7 +221,7 @@ def _check_visible(figures: dict[str, dict], effects: list[dict]) -> None:
         raise Unsuitable(f"the largest gap of a record to fit is {np.sqrt(max(max(shown), 0.0)):.2g}")
 
 
-def _predicted(plant: RootedPlant, sent: np.ndarray, bench: Bench) -> np.ndarray:
+def _predicted(plant: SolvedPlant, sent: np.ndarray, bench: Bench) -> np.ndarray:
     return plant.readings(plant.move(sent, bench.sample_time)[0], bench.sample_time)
 
 

@@ -62,7 +62,7 @@ class Plant:
         """The real structure that is just what it is taken for."""
         return cls(nominal, nominal.actuators, nominal.sensors, nominal.modes.n_modes)
 
-    def rooted(self) -> "RootedPlant":
+    def solved(self) -> "SolvedPlant":
         """The plant with its modes solved."""
         gauss, weights = np.polynomial.legendre.leggauss(DRAG_POINTS)
         length = self.nominal.modes.length if self.drag else 0.0
@@ -83,7 +83,7 @@ class Plant:
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
         inputs, sensors, laws, tones, noises, field = shapes
         drag = np.c_[field, 0.5 * length * weights[: len(field_places)]]
-        return RootedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
+        return SolvedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
 
 
 class ModalMotion(NamedTuple):
@@ -102,7 +102,7 @@ class ModalMotion(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RootedPlant:
+class SolvedPlant:
     """A plant with its modes; shapes are (n_places, n_modes), `field` carries the weights of a quadrature too."""
 
     plant: Plant

@@ -6,7 +6,7 @@ import numpy as np
 
 from workbench.structure.domain import Domain, NamedPoints, Place, Rectangle
 from workbench.trials.benches import Bench
-from workbench.trials.plant import ModalMotion, Plant, RootedPlant
+from workbench.trials.plant import ModalMotion, Plant, SolvedPlant
 
 COARSE = 0.2  # radians of the highest mode in one step: enough to draw a strength by
 
@@ -31,14 +31,14 @@ class Scene:
     """
 
     bench: Bench
-    nominal: RootedPlant
+    nominal: SolvedPlant
     commands: np.ndarray
     moved: ModalMotion
     outputs: np.ndarray
 
     @classmethod
     def of(cls, bench: Bench, commands: np.ndarray) -> "Scene":
-        nominal = Plant.of(bench.rig).rooted()
+        nominal = Plant.of(bench.rig).solved()
         moved, _ = nominal.move(commands, bench.sample_time, finest=COARSE)
         return cls(bench, nominal, commands, moved, nominal.readings(moved, bench.sample_time))
 
@@ -67,10 +67,10 @@ class Scene:
         outputs = [self.outputs]
         for one in (plant, reference):
             if one is not None:
-                rooted = one.rooted()
+                solved = one.solved()
                 own = np.random.default_rng(rng.integers(2**31))
-                moved, _ = rooted.move(self.commands, self.bench.sample_time, rng=own, finest=COARSE)
-                outputs.append(rooted.readings(moved, self.bench.sample_time))
+                moved, _ = solved.move(self.commands, self.bench.sample_time, rng=own, finest=COARSE)
+                outputs.append(solved.readings(moved, self.bench.sample_time))
         measured, predicted = outputs[1], outputs[2] if reference is not None else outputs[0]
         scale = measured.std(axis=1, keepdims=True)
         gap = float(np.sqrt(np.mean(((measured - predicted) / np.where(scale > 0, scale, 1.0)) ** 2)))
