@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.cases.writing import write_case
+from workbench.rig.simulate import simulate
 from workbench.trials.make import make_trial
 
 
@@ -45,3 +46,30 @@ def test_a_validation_record_that_repeats_a_fit_record_is_refused(run, tmp_path)
     write_case(replace(case, fit=case.fit[:1], validation=(replace(case.fit[0], name="again"),)), tmp_path / "same")
     refused = run("diagnose", tmp_path / "same")
     assert refused.exit_code == 2 and "repeats the fit record" in refused.output
+
+
+def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, monkeypatch):
+    real, _ = make_trial(2)
+    rng, seen = np.random.default_rng(0), []
+    dt = real.fit[0].sample_time
+    rig = replace(real.rig, modes=real.rig.modes.select(range(2)), actuators=real.rig.actuators[:1], structure=None)
+    for name, level in (("low", 1.0), ("high", 10.0)):
+        clean = simulate(rig, level * rng.standard_normal((1, 3000)), sample_time=dt)
+        outputs = clean.outputs + 1e-3 * clean.outputs.std(axis=1, keepdims=True) * rng.standard_normal((5, 3000))
+        columns = np.column_stack([clean.time, clean.inputs.T, outputs.T])
+        header = ",".join(["t", "F1", *clean.output_names])
+        np.savetxt(tmp_path / f"{name}.csv", columns, delimiter=",", header=header, comments="")
+
+    def search(rig, records, **options):
+        seen.extend([rig, *records])
+        raise ValueError("the search has begun")
+
+    monkeypatch.setattr("workbench.gap.diagnose.diagnose", search)
+    options = ("--nominal", tmp_path / "low.csv", "--records", tmp_path / "high.csv", "--inputs", "F1")
+    assert "--quantity" in run("diagnose", *options).output
+    assert "the search has begun" in run("diagnose", *options, "--quantity", "displacement").output
+    found, high = seen
+    np.testing.assert_allclose(found.modes.omega, rig.modes.omega, rtol=1e-3)
+    predicted = simulate(found, high.inputs, sample_time=dt).outputs
+    assert np.std(predicted - high.outputs) < 0.05 * np.std(high.outputs)
+    assert "not both" in run("diagnose", tmp_path, *options).output

@@ -7,14 +7,25 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short
+from workbench.cli.terminal import JsonPath, PagePath, guarded, names_in, progress_bar, reporter, say, short
 
 SHOWN_RIVALS = 3
 
 
 @guarded
 def diagnose(
-    case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
+    case: Annotated[Path | None, typer.Argument(help="Case folder: case.toml and its records.")] = None,
+    nominal: Annotated[
+        Path | None, typer.Option(help="In place of a case: a record at low level, whose linear model is the nominal.")
+    ] = None,
+    records: Annotated[list[Path] | None, typer.Option(help="With --nominal: a record to diagnose; repeat.")] = None,
+    validate: Annotated[
+        list[Path] | None, typer.Option(help="With --nominal: a record that only measures the gap; repeat.")
+    ] = None,
+    inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="With --nominal: channels that are inputs.")] = "",
+    quantity: Annotated[
+        str, typer.Option(help="With --nominal: of outputs that state none: displacement, velocity, acceleration.")
+    ] = "",
     json_path: JsonPath = None,
     page: PagePath = None,
     free_nominal: Annotated[
@@ -31,17 +42,27 @@ def diagnose(
     """Locate the gap between a simulation and a test, name the missing effect, and measure how far the gap closes.
 
     Example: workbench diagnose cases/arm --json verdict.json
+
+    Example: workbench diagnose --nominal low.csv --records high.csv --inputs F --quantity acceleration
     """
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
+    from workbench.study.measured_case import measured_case
     from workbench.study.verdict_page import verdict_page
     from workbench.study.whole_file import check_target, write_whole
 
     check_target(json_path)
-    found = read_case(case)
+    if (case is None) == (nominal is None):
+        raise ValueError("give a case folder, or --nominal and --records; not both")
+    if nominal is not None:
+        if not records:
+            raise ValueError("--nominal needs at least one record to diagnose: give --records")
+        found = measured_case(nominal, records, validate or (), inputs=names_in(inputs), quantity=quantity)
+    elif case is not None:
+        found = read_case(case)
     check_kept_apart(found.fit, found.validation)
     faults = wiring(found.rig, found.fit)
     for fault in faults:

@@ -1,0 +1,48 @@
+"""A case from records alone: a linear model learnt at a low level, and records of a higher level to diagnose."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from workbench.cases.case import Case
+from workbench.identification.driven import identify_driven
+from workbench.identification.rig_from import rig_from
+from workbench.records.files import read_record
+from workbench.records.record import Record
+from workbench.rig.sensors import MEASURED
+
+
+def measured_case(
+    nominal: Path,
+    records: Sequence[Path],
+    validation: Sequence[Path] = (),
+    *,
+    inputs: tuple[str, ...] = (),
+    quantity: str = "",
+) -> Case:
+    """The case whose nominal rig is identified from one driven record.
+
+    Args:
+        nominal: file of a record at a level so low that the structure is linear.
+        records: files to diagnose, of the same channels.
+        validation: files that only measure how far the gap shrinks.
+        inputs: names of the input channels, where the files do not say.
+        quantity: of outputs whose files state none: "displacement", "velocity" or "acceleration".
+
+    Raises:
+        ValueError: no inputs, outputs of no known quantity, files of other channels.
+    """
+
+    def read(path: Path) -> Record:
+        record = read_record(path, inputs=inputs)
+        channels = [replace(c, quantity=c.quantity or quantity, unit=c.unit) for c in record.output_channels]
+        return replace(record, output_channels=tuple(channels), name=path.stem)
+
+    low = read(nominal)
+    if not low.n_inputs:
+        raise ValueError(f"{nominal}: no channel is an input, so no model can be simulated; name them by --inputs")
+    unknown = [channel.name for channel in low.output_channels if channel.quantity not in MEASURED]
+    if unknown:
+        raise ValueError(f"{nominal}: the quantity of {', '.join(unknown)} is not stated; give --quantity acceleration")
+    rig = rig_from(identify_driven([low]))
+    return Case(nominal.stem, rig, tuple(map(read, records)), tuple(map(read, validation)))
