@@ -1,0 +1,54 @@
+"""Parameters of finite-element models from measured modes: the truth, its standard errors, and what is refused."""
+
+import numpy as np
+import pytest
+
+from workbench.identification.updating.model_updating import update_model
+from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.finite_elements import FiniteElements
+from workbench.structure.supports import PointSpring
+
+NAMES = tuple(f"m{i}" for i in range(6))
+TRUTH = np.array([90.0, 25.0])  # of the ground spring and of the joint, N/m
+
+
+def row_of_masses(parameters):
+    """Six masses in a row on springs; unknown are the spring to ground at one end and the joint in the middle."""
+    stiffness = np.zeros((6, 6))
+    for i in (0, 1, 3, 4):
+        stiffness[i : i + 2, i : i + 2] += 100.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+    model = FiniteElements(np.diag([1.0, 1.2, 0.8, 1.0, 1.5, 0.7]), stiffness, nodes=NamedPoints(NAMES))
+    ground, joint = parameters
+    return model.attached([PointSpring("m0", ground), PointSpring(Between("m2", "m3"), joint)]).modes(5)
+
+
+def measured(seed, noise):
+    modes, rng = row_of_masses(TRUTH), np.random.default_rng(seed)
+    std = noise * modes.omega[:4]
+    omega = modes.omega[:4] + std * rng.standard_normal(4)
+    return {"omega": omega, "omega_std": std, "shapes": -3.0 * modes.phi(NAMES)[:, :4], "places": NAMES}
+
+
+def test_without_noise_the_parameters_are_found():
+    found = update_model(row_of_masses, [80.0, 30.0], **(measured(0, 0.0) | {"omega_std": 1e-3}))
+    np.testing.assert_allclose(found.parameters, TRUTH, rtol=1e-6)
+    assert found.converged and list(found.paired) == [0, 1, 2, 3] and found.mac.min() > 0.999999
+
+
+def test_standard_errors_are_those_of_repeated_measurements():
+    runs = [update_model(row_of_masses, [80.0, 30.0], **measured(seed, 2e-3)) for seed in range(30)]
+    spread = np.std([run.parameters for run in runs], axis=0)
+    np.testing.assert_allclose(runs[0].std, spread, rtol=0.35)
+    score = np.array([(run.parameters - TRUTH) / run.std for run in runs])
+    assert 0.85 < (np.abs(score) < 1.96).mean() <= 1.0
+
+
+def test_what_cannot_be_told_is_refused():
+    with pytest.raises(ValueError, match="cannot tell 5 parameters"):
+        update_model(row_of_masses, np.ones(5), **measured(0, 1e-3))
+    with pytest.raises(ValueError, match="cannot tell the parameters apart"):
+        update_model(lambda p: row_of_masses([p[0] * p[1], 25.0]), [9.0, 10.0], **measured(0, 1e-3))
+    strange = measured(0, 1e-3)
+    strange["shapes"][:, 3] = np.linalg.svd(row_of_masses(TRUTH).phi(NAMES))[0][:, 5]  # unlike any of five modes
+    with pytest.raises(ValueError, match=r"measured mode 4, .* resembles no mode of the model"):
+        update_model(row_of_masses, [80.0, 30.0], **strange)

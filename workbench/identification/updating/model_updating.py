@@ -1,0 +1,125 @@
+"""Model updating: chosen parameters of a model, with standard errors, from measured frequencies and shapes.
+
+Friswell & Mottershead, Finite Element Model Updating in Structural Dynamics (1995), chapter 8: weighted least squares
+on frequencies, modes paired by their shapes at every step.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import least_squares, linear_sum_assignment
+
+from workbench.identification.shapes.mode_pairing import subspace_mac
+from workbench.structure.modes import Modes, frozen
+
+LEAST_MAC = 0.5  # below it a measured mode is no mode of the model
+STEP = 1e-4  # of the logarithm of a parameter, for central differences
+INDISTINCT = 1e-6  # smallest singular value of the scaled Jacobian over the largest: parameters that do the same
+
+
+@dataclass(frozen=True, eq=False)
+class UpdatedModel:
+    """A model fitted to measured modes.
+
+    Attributes:
+        parameters: (n_parameters,) in their own units.
+        covariance: (n_parameters, n_parameters) of them.
+        modes: of the model at these parameters.
+        paired: (n_measured,) index of the model's mode that each measured mode is.
+        mac: (n_measured,) of each pair; repeated modes as a subspace.
+        residuals: (n_measured,) (model - measured) / standard error, of the frequencies.
+        converged: whether the search ended at a minimum.
+        reason: why it ended.
+    """
+
+    parameters: np.ndarray
+    covariance: np.ndarray
+    modes: Modes
+    paired: np.ndarray
+    mac: np.ndarray
+    residuals: np.ndarray
+    converged: bool
+    reason: str
+
+    def __post_init__(self) -> None:
+        for name in ("parameters", "covariance", "mac", "residuals"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def std(self) -> np.ndarray:
+        """(n_parameters,) standard errors."""
+        deviations: np.ndarray = np.sqrt(np.diag(self.covariance))
+        return deviations
+
+
+def update_model(
+    build: Callable[[np.ndarray], Modes],
+    start: ArrayLike,
+    *,
+    omega: ArrayLike,
+    omega_std: ArrayLike,
+    shapes: ArrayLike,
+    places: object,
+) -> UpdatedModel:
+    """The parameters p > 0 that minimise Σ ((ω_r(p) - ω_r) / σ_r)², and their standard errors.
+
+    The search goes downhill from where it starts; far from there it may end in another minimum, which residuals well
+    beyond one and a low MAC show. The covariance is (Jᵀ J)⁻¹ at the minimum, J = ∂(ω(p) / σ)/∂p: errors of the
+    measurement, not of the model's form.
+
+    Args:
+        build: modes of the model with parameters p, at least as many as were measured.
+        start: (n_parameters,) p to start from, all positive.
+        omega, omega_std: (n_measured,) measured frequencies and their standard errors, rad/s.
+        shapes: (n_places, n_measured) measured shapes, of any scale, by which modes are paired.
+        places: where they were measured, as the model's `Modes.phi` takes places.
+
+    Raises:
+        ValueError: more parameters than frequencies, a measured mode that no mode of the model resembles, parameters
+            that cannot be told apart.
+    """
+    first, target = np.asarray(start, float), np.asarray(omega, float)
+    deviation, measured = np.broadcast_to(np.asarray(omega_std, float), target.shape), np.asarray(shapes)
+    if first.size > target.size:
+        raise ValueError(f"{target.size} measured frequencies cannot tell {first.size} parameters; choose fewer")
+    if not (first > 0).all() or not (deviation > 0).all():
+        raise ValueError("parameters to start from and standard errors must be positive")
+    if measured.shape[1] != target.size:
+        raise ValueError(f"{target.size} measured frequencies need as many shapes; got {measured.shape[1]}")
+
+    def paired(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
+        agreement = subspace_mac(measured, modes.phi(places), modes.omega)
+        rows, columns = linear_sum_assignment(-agreement)
+        if rows.size < target.size or agreement[rows, columns].min() < LEAST_MAC:
+            lost = int(np.argmin(agreement.max(axis=1)))
+            raise ValueError(
+                f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
+                f" best MAC is {agreement[lost].max():.2f}; let the model give more modes, or leave this one out"
+            )
+        return columns, agreement[rows, columns]
+
+    def residuals(logarithms: np.ndarray) -> np.ndarray:
+        modes = build(first * np.exp(logarithms))
+        difference: np.ndarray = (modes.omega[paired(modes)[0]] - target) / deviation
+        return difference
+
+    def jacobian(logarithms: np.ndarray) -> np.ndarray:
+        steps = STEP * np.eye(first.size)
+        columns = [residuals(logarithms + step) - residuals(logarithms - step) for step in steps]
+        return np.column_stack(columns) / (2.0 * STEP)
+
+    found = least_squares(residuals, np.zeros(first.size), jac=jacobian, method="lm")
+    parameters = first * np.exp(found.x)
+    singular = np.linalg.svd(found.jac, compute_uv=False)
+    if singular[-1] <= INDISTINCT * singular[0]:
+        raise ValueError(
+            "the measured frequencies cannot tell the parameters apart: some change them alike; choose fewer"
+        )
+    modes = build(parameters)
+    columns, agreement = paired(modes)
+    covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(parameters, parameters)
+    return UpdatedModel(
+        parameters, covariance, modes, columns, agreement, found.fun, bool(found.success), str(found.message)
+    )
