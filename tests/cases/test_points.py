@@ -106,3 +106,11 @@ def test_points_go_through_a_file_unchanged(tmp_path):
 def test_what_is_wrong_is_refused_by_name(tmp_path, case, points, words):
     with pytest.raises(CaseError, match=words):
         read_case(written(tmp_path, case, points))
+
+
+def test_rigid_modes_have_damping_of_their_own(tmp_path):
+    table = FRAME.replace("[3.0, 7.0]", "[0.0, 7.0]").replace("points =", "rigid_damping = [2.5]\npoints =")
+    modes = read_case(written(tmp_path, table)).rig.modes
+    np.testing.assert_allclose(modes.damping, np.diag([2.5, 2 * 0.02 * 2 * np.pi * 7.0]))
+    with pytest.raises(CaseError, match="there are none"):
+        read_case(written(tmp_path, FRAME.replace("points =", "rigid_damping = [2.5]\npoints =")))

@@ -42,7 +42,7 @@ MOST_MODES = 200
 TABLES = ("title", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
-MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "points")
+MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
 PLATE = (
     "kind",
     "length",
@@ -210,7 +210,7 @@ def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
         values = np.tile(shape, (len(inputs) + len(outputs), 1))
     else:
         omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
-        damping = numbers(table, "damping_ratios", "[structure]", omega.size)
+        damping = _modal_damping(table, omega)
         values = np.array(
             [
                 numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
@@ -228,7 +228,7 @@ def _rig_at_points(table: dict, inputs: list[dict], outputs: list[dict], path: P
     check_keys(table, MODAL, "[structure]")
     _check_ports(inputs, outputs, "point")
     omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
-    damping = numbers(table, "damping_ratios", "[structure]", omega.size)
+    damping = _modal_damping(table, omega)
     file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
     points, values = read_points(file, omega.size)
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
@@ -240,6 +240,17 @@ def _rig_at_points(table: dict, inputs: list[dict], outputs: list[dict], path: P
 
     actuators = tuple(_actuator(e, point(e, "[[input]]")) for e in inputs)
     return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]")) for e in outputs))
+
+
+def _modal_damping(table: dict, omega: np.ndarray) -> np.ndarray:
+    """Coefficients c_rs (n_modes, n_modes), 1/s: 2 ζ_r ω_r, and for rigid modes what the table gives, or none."""
+    rates = 2.0 * numbers(table, "damping_ratios", "[structure]", omega.size) * omega
+    if "rigid_damping" in table:
+        rigid = omega == 0
+        if not rigid.any():
+            raise CaseError("[structure]: rigid_damping is for modes of 0 Hz, and there are none; leave it out")
+        rates[rigid] = numbers(table, "rigid_damping", "[structure]", int(rigid.sum()))
+    return np.diag(rates)
 
 
 def _check_ports(inputs: list[dict], outputs: list[dict], *places: str) -> None:

@@ -49,7 +49,8 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | Non
         _check_stable(eigenvalues)
         vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
         omega = np.sqrt(np.maximum(eigenvalues, 0.0))
-        damping = np.diag(2.0 * modes.zeta * omega)
+        # a rigid mode has no ratio: what damps it stays as it is
+        damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
     for part in extra_damping:

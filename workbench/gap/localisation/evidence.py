@@ -128,11 +128,12 @@ class Evidence:
 
     @cached_property
     def places_to_try(self) -> Sequence[Any]:
-        """Fewer of them, spread out, where linear effects are tried whatever force is missing."""
+        """Fewer of them, spread out, where linear effects are tried in any case; of many points the likeliest."""
         if isinstance(self.domain, Interval):
             return [float(x) for x in self.places[::2]]
         if isinstance(self.domain, NamedPoints):
-            return self.domain.grid() if len(self.domain.names) <= CROWD else ()
+            crowded = len(self.domain.names) > CROWD
+            return [p for p in self.peaks if not isinstance(p, Between)] if crowded else self.domain.grid()
         return self.domain.grid(6)
 
     @cached_property

@@ -5,7 +5,7 @@ filter with an unknown force at x (a first-order random process) gives the likel
 of the law, and its smoother gives the force, and the motion there, to look at.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -16,6 +16,7 @@ from workbench.rig.stepping import FAST, LANES
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
+TETHER = 1e-4  # radians a sample
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +37,17 @@ class SampledModel:
     noise_variance: np.ndarray
 
 
+def _tethered(modes: Modes, sample_time: float) -> Modes:
+    """Modes that are all rigid, on a spring too soft to show: sensors of velocity see no displacement."""
+    if modes.omega[-1] > 0:
+        return modes
+    return replace(modes, omega=np.full(modes.n_modes, TETHER / sample_time), damping=modes.damping)
+
+
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
     """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,)."""
     n = modes.n_modes
-    own = modes.state_matrix
+    own = _tethered(modes, sample_time).state_matrix
     a = np.zeros((3 * n, 3 * n))
     a[: 2 * n, : 2 * n] = own
     a[n : 2 * n, 2 * n :] = np.eye(n)
@@ -115,6 +123,7 @@ def wandering_force_filter(
     n = modes.n_modes
     size = 2 * n + 1
     a = np.zeros((size, size))
+    modes = _tethered(modes, sample_time)
     a[: 2 * n, : 2 * n] = modes.state_matrix
     a[n : 2 * n, -1] = shape
     a[-1, -1] = -1.0 / correlation_time
