@@ -6,13 +6,17 @@ from functools import lru_cache
 import numpy as np
 
 from workbench.rig.rig import Rig
+from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 
 
 @dataclass(frozen=True)
 class Scales:
-    """Length (m), mass (kg) and time (s) of a rig: its extent, its mass, and 1 / ω of its lowest elastic mode."""
+    """Length (m), mass (kg) and time (s) of a rig: its extent, its mass, and 1 / ω of its lowest elastic mode.
+
+    Points whose positions are not known have an extent of 1; modes that are all rigid have the time of their damping.
+    """
 
     length: float
     mass: float
@@ -46,8 +50,10 @@ class Scales:
 @lru_cache(maxsize=64)
 def _scales(modes: Modes, structure: object) -> Scales:
     elastic = modes.omega[modes.omega > 0]
-    slowest = float(elastic.min()) if elastic.size else 1.0
-    return Scales(modes.domain.size, _mass(modes, structure), 1.0 / slowest)
+    rate = float(elastic.min()) if elastic.size else float(np.diag(modes.damping).max())
+    domain = modes.domain
+    placed = not isinstance(domain, NamedPoints) or domain.positions is not None
+    return Scales((domain.size if placed else 0.0) or 1.0, _mass(modes, structure), 1.0 / (rate or 1.0))
 
 
 def _mass(modes: Modes, structure: object) -> float:
