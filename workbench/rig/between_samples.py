@@ -99,7 +99,7 @@ class BetweenSamples:
             rows = motion[order]
         sources = (*self.start, *self.forces)
         parts = [(shape * row) @ source[:, intervals] for row, source in zip(rows, sources, strict=True)]
-        return np.sum(parts, axis=0)
+        return np.asarray(np.sum(parts, axis=0))
 
 
 def _propagators(omega: np.ndarray, damping: np.ndarray, span: float, time: float | None = None) -> np.ndarray:

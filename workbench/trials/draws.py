@@ -169,8 +169,9 @@ def _push(scene, rng):
 
 
 def _rate(scene, rng):
+    """No faster than twice the changes of the command: beyond, an accelerometer shows a delay and nothing else."""
     steps = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
-    return lambda s: float(np.quantile(steps, 0.9)) / s
+    return lambda s: float(np.quantile(steps, 0.9)) / max(s, 0.5)
 
 
 def _swapped_inputs(scene, rng):

@@ -5,6 +5,7 @@ A new law is a code, a line in `law_force`, and an entry in `POINT_LAWS`.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -14,7 +15,7 @@ SLIDING, QUADRATIC_DAMPER = range(11, 13)
 
 
 @njit(cache=True)
-def law_force(code, p, w, v, z):
+def law_force(code: int, p: np.ndarray, w: float, v: float, z: float) -> Any:
     """Force of a law at a point, from displacement, velocity and hysteretic variable there."""
     if code == DAMPER:
         return -p[0] * v
@@ -54,6 +55,7 @@ class PointSizes:
 
 
 Strengths = Callable[[float], dict[str, float]]
+Draw = Callable[[PointSizes, np.random.Generator], Strengths]
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class PointLaw:
 
     code: int
     parameters: tuple[str, ...]
-    draw: Callable[[PointSizes, np.random.Generator], Strengths] | None = None
+    draw: Draw | None = None
     outside: bool = False
 
 
@@ -105,7 +107,7 @@ def _magnet(p: PointSizes, rng: np.random.Generator) -> Strengths:
     return lambda s: {"stiffness": 0.1 * s * p.stiffness, "reach": reach}
 
 
-def _power(name: str, share: float, of_displacement: float, of_velocity: float = 0.0):
+def _power(name: str, share: float, of_displacement: float, of_velocity: float = 0.0) -> Draw:
     """One number, such that the force is that share of the typical spring's at the typical motion."""
 
     def draw(p: PointSizes, rng: np.random.Generator) -> Strengths:

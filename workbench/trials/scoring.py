@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 
@@ -32,8 +33,13 @@ class Tally:
 
 
 def score(
-    verdict: dict, label: dict, *, length: float, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
-) -> dict:
+    verdict: dict[str, Any],
+    label: dict[str, Any],
+    *,
+    length: float,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+) -> dict[str, Any]:
     """How a verdict (as JSON) agrees with a label.
 
     Args:
@@ -64,8 +70,13 @@ def score(
 
 
 def score_dirty(
-    verdict: dict, label: dict, *, length: float, inputs: Sequence[str] = (), outputs: Sequence[str] = ()
-) -> dict:
+    verdict: dict[str, Any],
+    label: dict[str, Any],
+    *,
+    length: float,
+    inputs: Sequence[str] = (),
+    outputs: Sequence[str] = (),
+) -> dict[str, Any]:
     """How a verdict (as JSON) agrees with the label of a trial that has small errors beside its effects.
 
     Args:
@@ -105,7 +116,7 @@ def score_dirty(
     }
 
 
-def tally_dirty(scores: Iterable[dict]) -> dict[str, float]:
+def tally_dirty(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
     """Shares over many scores of `score_dirty`.
 
     Returns:
@@ -133,8 +144,12 @@ def _share(flags: Sequence[bool]) -> float:
 
 
 def _found(
-    hidden: list[dict], told: list[dict], length: float, inputs: Sequence[str], outputs: Sequence[str]
-) -> list[tuple[dict, dict]]:
+    hidden: list[dict[str, Any]],
+    told: list[dict[str, Any]],
+    length: float,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """Hidden effects beside those told of the same kind and channel, each once, the nearest first."""
     alike = [
         (_distance(h, t) / length, i, j)
@@ -149,11 +164,11 @@ def _found(
     return [(hidden[i], told[j]) for i, j in pairs]
 
 
-def _distance(hidden: dict, told: dict) -> float:
-    return abs(hidden["at"] - told["at"]) if "at" in hidden and told.get("at") is not None else 0.0
+def _distance(hidden: dict[str, Any], told: dict[str, Any]) -> float:
+    return float(abs(hidden["at"] - told["at"])) if "at" in hidden and told.get("at") is not None else 0.0
 
 
-def _inside(hidden: dict, told: dict) -> Iterable[bool]:
+def _inside(hidden: dict[str, Any], told: dict[str, Any]) -> Iterable[bool]:
     """Whether each number that has a standard deviation is within its 95 % interval of the truth."""
     deviations = {**told.get("parameters_std", {}), "at": told.get("at_std")}
     values = {**told.get("parameters", {}), "at": told.get("at")}
@@ -165,7 +180,7 @@ def _inside(hidden: dict, told: dict) -> Iterable[bool]:
             yield bool(abs(off) <= NORMAL_95 * deviation)
 
 
-def tally(scores: Iterable[dict]) -> Tally:
+def tally(scores: Iterable[dict[str, Any]]) -> Tally:
     """Count scores into a confusion matrix and shares."""
     counts: Counter[tuple[str, str]] = Counter()
     right: Counter[str] = Counter()
@@ -181,7 +196,7 @@ def tally(scores: Iterable[dict]) -> Tally:
     return Tally(dict(counts), shares, misplaced, placed)
 
 
-def _family(hidden: list[dict]) -> str:
+def _family(hidden: list[dict[str, Any]]) -> str:
     if not hidden:
         return NONE
     if any(e["kind"] == UNKNOWN for e in hidden):
@@ -189,14 +204,16 @@ def _family(hidden: list[dict]) -> str:
     return "single" if len(hidden) == 1 else "pair"
 
 
-def _words(effects: list[dict]) -> str:
+def _words(effects: list[dict[str, Any]]) -> str:
     return " + ".join(sorted(e["kind"] for e in effects)) or NONE
 
 
-def _matched(hidden: list[dict], told: list[dict], length: float) -> list[tuple[dict, dict]]:
+def _matched(
+    hidden: list[dict[str, Any]], told: list[dict[str, Any]], length: float
+) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """Hidden and told effects of one kind side by side, two of a kind by their places."""
 
-    def cost(order: Iterable[dict]) -> float:
+    def cost(order: Iterable[dict[str, Any]]) -> float:
         pairs = list(zip(hidden, order, strict=True))
         if any(h["kind"] != t["kind"] for h, t in pairs):
             return float("inf")
@@ -205,7 +222,7 @@ def _matched(hidden: list[dict], told: list[dict], length: float) -> list[tuple[
     return list(zip(hidden, min(permutations(told), key=cost), strict=True)) if hidden else []
 
 
-def _same_channel(hidden: dict, told: dict, inputs: Sequence[str], outputs: Sequence[str]) -> bool:
+def _same_channel(hidden: dict[str, Any], told: dict[str, Any], inputs: Sequence[str], outputs: Sequence[str]) -> bool:
     for side, names in (("input", inputs), ("output", outputs)):
         if side in hidden:
             name = hidden[side]

@@ -118,7 +118,7 @@ class Kind:
     parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
     apply: Callable[[Rig, Any, dict[str, Any]], Rig]
     starts: Callable[[Any, Any], Iterable[dict[str, Any]]]
-    targets: Callable[[Rig], tuple] = lambda rig: (None,)
+    targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
