@@ -60,4 +60,6 @@ def identify(
     console.print(table)
     for line in found.lines:
         say(f"  {line}")
+    for remark in dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ())):
+        say(f"  as read: {remark}")
     write_json(json_path, {**found.content, "heading": found.heading, "lines": found.lines})

@@ -121,9 +121,14 @@ def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> 
 def _points(path: Path, arrays: Mapping, names: list[str], n_references: int):
     """Channels and references: as the file tells them, else numbered."""
     if TOLD in arrays:
-        told = json.loads(str(arrays[TOLD]))
-        channels = tuple(Channel(legible(path, c["name"]), c["quantity"]) for c in told["outputs"])
-        return channels, tuple(legible(path, name) for name in told["references"])
+        try:
+            told = json.loads(str(arrays[TOLD]))
+            channels = tuple(Channel(legible(path, str(c["name"])), str(c["quantity"])) for c in told["outputs"])
+            return channels, tuple(legible(path, str(name)) for name in told["references"])
+        except RecordFileError:
+            raise
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise RecordFileError(f"{path}: its description of the points is damaged: {error}") from error
     at = [np.ravel(arrays[name]) for name in PLACES if name in arrays]
     if at and at[0].shape != (len(names),):
         raise RecordFileError(f"{path} tells {at[0].size} places of {len(names)} points; give each its own")
