@@ -113,7 +113,7 @@ def identify_ambient(
         longest: lag, s, as in `correlation_functions`.
         references: names of outputs, as in `correlation_functions`.
         false_alarm: chance that noise alone is taken for a mode.
-        seconds: after which the best so far is returned, with a remark; None for no limit.
+        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
 
     Raises:
         ValueError: as `correlation_functions`, or no mode found.

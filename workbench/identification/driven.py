@@ -15,6 +15,7 @@ import numpy as np
 from workbench.identification.input_output.fit_errors import errors, fixed_std, pole_covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
+from workbench.identification.input_output.mode_clusters import overlap_remarks
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.signal.budget import SECONDS, Budget
@@ -73,16 +74,16 @@ class Driven(ModalEstimates):
     @property
     def noise_std(self) -> np.ndarray:
         """Of each output (n_outputs,), root mean square over the records."""
-        return np.sqrt((self.noise**2).mean(axis=0))
+        return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))
 
     @property
     def residues(self) -> np.ndarray:
         """c_r l_r^T, (n_modes, n_outputs, n_inputs) complex."""
-        return np.einsum("jr,ri->rji", self._measured_shapes, self.participation)
+        return np.asarray(np.einsum("jr,ri->rji", self._measured_shapes, self.participation))
 
     @property
     def _measured_shapes(self) -> np.ndarray:
-        return self.modes.shapes * self.modes.poles ** time_derivatives(self.output_channels)[:, None]
+        return np.asarray(self.modes.shapes * self.modes.poles ** time_derivatives(self.output_channels)[:, None])
 
     @property
     def state_space(self) -> control.StateSpace:
@@ -139,7 +140,7 @@ def identify_driven(
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
-        seconds: after which the best so far is returned, with a remark; None for no limit.
+        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
 
     Returns:
         `Driven`. Its standard errors hold in noise of any smooth spectrum.
@@ -166,7 +167,8 @@ def identify_driven(
             " inputs and outputs belong together"
         )
     selected, remarks = _without_artefacts(data, selected, budget)
-    return _report(records, data, selected, (*remarks, *budget.remarks))
+    overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
+    return _report(records, data, selected, (*remarks, *overlap, *budget.remarks))
 
 
 def _selected(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
@@ -218,7 +220,7 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
 def _oscillate(data: KnownInputs, selected: Selected) -> np.ndarray:
     """Which modes oscillate within a record and hardly grow; others may be noise that is not white."""
     poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
-    return (np.abs(poles) > data.resolution) & (poles.real * span < MOST_GROWTH)
+    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < MOST_GROWTH))
 
 
 def _with_noise(
@@ -277,7 +279,7 @@ def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, re
     scale = 0.5 * seen[largest, each] / shapes[largest, each]
     participation = fit.participation * scale[:, None]
 
-    def figures(poles, participation, amplitudes):
+    def figures(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         seen = amplitudes / poles**derivative
         relative = seen / seen[largest, each]
         driven = (participation * (0.5 * seen[largest, each] / shapes[largest, each])[:, None])[:, :n_inputs]

@@ -95,7 +95,7 @@ def ring_down(
         records: of the same sensors at one rate, of any length before the decay.
         start: where the decay is free, s, in every record; found in each unless given.
         n_modes: number of modes; selected unless given.
-        seconds: after which the best so far is returned, with a note; None for no limit.
+        seconds: of processor time, after which the best so far is returned, with a note; None for no limit.
 
     Raises:
         ValueError: records that differ in sensors or rate; a faulty channel; too few samples; nothing that decays

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 
 from workbench.identification.input_output.fit_errors import errors, pole_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.mode_clusters import NARROW, parts_of
+from workbench.identification.input_output.mode_clusters import NARROW, overlap_remarks, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.budget import SECONDS, Budget
@@ -55,7 +55,7 @@ class TransferModes(ModalEstimates):
             not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
         frequencies_hz: (n_frequencies,) those lines.
-        remarks: what was left undone, where the time was up.
+        remarks: what is doubtful, and what was left undone where the time was up.
     """
 
     modes: SampledModes
@@ -91,7 +91,7 @@ def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int)
             f"coherence must have the shape {h.shape} of the transfer functions, lie in (0, 1], and rest on two"
             f" averages or more; got shape {squared.shape}, {averages} averages"
         )
-    return np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages))
+    return np.asarray(np.abs(h) * np.sqrt((1.0 - squared) / (2.0 * squared * averages)))
 
 
 @one_blas_thread
@@ -122,7 +122,7 @@ def identify_transfer(
             residual about each mode where that is larger than elsewhere.
         most_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
-        seconds: after which the best so far is returned, with a remark; None for no limit.
+        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
 
     Raises:
         ValueError: shapes that do not fit, values that are not finite, a band with too few lines, no mode.
@@ -145,7 +145,9 @@ def identify_transfer(
             false_alarm=false_alarm / n_bands,
         )
         found.append(_modes_of(*selected, channels, edges, f[first:last]))
-    whole = replace(_together(found, channels) if n_bands > 1 else found[0], remarks=budget.remarks)
+    whole = _together(found, channels) if n_bands > 1 else found[0]
+    overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
+    whole = replace(whole, remarks=(*overlap, *budget.remarks))
     if whole.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
@@ -182,7 +184,13 @@ def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     return bool(np.log(one / other).std(axis=(1, 2)).max() < ALIKE)
 
 
-def _modes_of(lines: Lines, selected: Selected, channels, edges_hz: tuple[float, float], shown_hz) -> TransferModes:
+def _modes_of(
+    lines: Lines,
+    selected: Selected,
+    channels: Sequence[Channel],
+    edges_hz: tuple[float, float],
+    shown_hz: np.ndarray,
+) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
     fit, parts_hz = _clustered(lines, selected, channels)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
@@ -198,7 +206,7 @@ def _modes_of(lines: Lines, selected: Selected, channels, edges_hz: tuple[float,
     seen = fit.amplitudes[:, inside] / poles**derivative
     largest, each = np.abs(seen).argmax(axis=0), np.arange(n)
 
-    def relative(poles, participation, amplitudes):
+    def relative(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         seen = amplitudes[:, inside] / poles[inside] ** derivative
         return (seen / seen[largest, each]).real.ravel()
 
@@ -224,7 +232,7 @@ def _modes_of(lines: Lines, selected: Selected, channels, edges_hz: tuple[float,
     )
 
 
-def _clustered(lines: Lines, selected: Selected, channels) -> tuple[Fit, list[tuple[float, ...]]]:
+def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) -> tuple[Fit, list[tuple[float, ...]]]:
     """The fit with one mode a cluster, and the frequencies of its other members, Hz."""
     fit = selected.fit
     shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
@@ -241,7 +249,7 @@ def _clustered(lines: Lines, selected: Selected, channels) -> tuple[Fit, list[tu
     return settled(lines, projected(lines, middle[kept], fit.participation[kept])), parts_hz
 
 
-def _together(found: Sequence[TransferModes], channels) -> TransferModes:
+def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> TransferModes:
     """The modes of all bands, each fitted in its own."""
     each = [band.modes for band in found]
     n = [modes.n_modes for modes in each]
@@ -266,18 +274,24 @@ def _together(found: Sequence[TransferModes], channels) -> TransferModes:
     )
 
 
-def _residual_powers(channels) -> list[int]:
+def _residual_powers(channels: Sequence[Channel]) -> list[int]:
     """Of s, in the residual terms of modes above and below the band."""
     measured = {k for k, c in zip(time_derivatives(channels), channels, strict=True) if c.quantity in MEASURED}
     above = measured or {0, 2}
     return sorted({int(power) for k in above for power in (k, k - 2)})
 
 
-def _places(channels) -> np.ndarray:
+def _places(channels: Sequence[Channel]) -> np.ndarray:
     return np.array([np.nan if channel.at is None else channel.at for channel in channels])
 
 
-def _checked(transfer, frequencies_hz, channels, band_hz, noise_std):
+def _checked(
+    transfer: ArrayLike,
+    frequencies_hz: ArrayLike,
+    channels: Sequence[Channel],
+    band_hz: tuple[float, float] | None,
+    noise_std: ArrayLike | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     h, f = np.asarray(transfer, complex), np.asarray(frequencies_hz, float)
     h = h[:, None] if h.ndim == 2 else h
     if h.ndim != 3 or h.shape[0] != len(channels) or h.shape[1] == 0 or f.shape != h.shape[2:]:

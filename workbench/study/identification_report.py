@@ -127,7 +127,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
 
 def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     """Records with their inputs."""
-    lines = [] if found.converged else ["the search did not converge: try other --modes"]
+    lines = [*found.remarks] if found.converged else [*found.remarks, "the search did not converge: try other --modes"]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
         **_content(records[0].output_channels, found),
@@ -141,13 +141,15 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
 
 def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
     """A record under unknown broadband forces."""
-    lines = ["modes and standard errors by the likelihood of the spectrum"]
+    lines = ["modes and standard errors by the likelihood of the spectrum", *found.remarks]
     return _report([record], found, lines, _content(record.output_channels, found))
 
 
 def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
     """Transfer functions."""
-    lines = [] if found.converged else ["the search did not converge: try other --modes, or a narrower --band-hz"]
+    lines = [*found.remarks]
+    if not found.converged:
+        lines.append("the search did not converge: try other --modes, or a narrower --band-hz")
     broad = np.flatnonzero(found.modes.zeta > BROAD)
     if broad.size:
         which = ", ".join(str(r + 1) for r in broad)

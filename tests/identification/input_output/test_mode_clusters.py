@@ -1,6 +1,6 @@
 import numpy as np
 
-from workbench.identification.input_output.mode_clusters import parts_of
+from workbench.identification.input_output.mode_clusters import overlap_remarks, parts_of
 
 
 def poles(hz, zeta):
@@ -22,3 +22,9 @@ def test_two_beside_each_other_or_three_in_phase_stand_for_themselves():
 def test_a_broad_part_leads_no_other_peak_into_the_crowd():
     near = poles([100.0, 100.5, 110.0, 125.0], [0.005, 0.005, 0.2, 0.005])
     assert parts_of(near, np.array([0.99, 0.5, 0.3, 1.0]), np.array([9.0, 3.0, 2.0, 8.0])) == {0: [1, 2]}
+
+
+def test_one_input_and_output_cannot_tell_a_drift_from_two_modes():
+    poles = np.array([-1.0 + 100.0j, -1.0 + 101.9j, -1.0 + 104.0j])
+    assert overlap_remarks(poles, 1)[0].startswith("modes 1 and 2 overlap: ")
+    assert overlap_remarks(poles, 2) == () and overlap_remarks(poles[[0, 2]], 1) == ()

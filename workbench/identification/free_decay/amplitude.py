@@ -52,7 +52,7 @@ class AmplitudeDependence:
     @property
     def depends(self) -> np.ndarray:
         """Modes (n_modes,) that depend on amplitude: chance under one in a thousand over all that was compared."""
-        return np.any(self.probability < SURE / self.probability.size, axis=0)
+        return np.asarray(np.any(self.probability < SURE / self.probability.size, axis=0))
 
 
 @one_blas_thread

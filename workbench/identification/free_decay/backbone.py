@@ -88,15 +88,15 @@ class _Backbone:
         return self.y - q @ seen, -(slopes - q @ (q.T @ slopes))
 
     def _apart(self, columns: np.ndarray) -> np.ndarray:
-        return columns - self.beside @ (self.beside.T @ columns)
+        return np.asarray(columns - self.beside @ (self.beside.T @ columns))
 
     def _held(self, real: np.ndarray) -> list[np.ndarray]:
         """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
         t = np.linspace(0.0, self.time[-1], STEPS + 1)
         h, u, rates = t[1], np.zeros((STEPS + 1, len(real))), np.zeros((STEPS + 1, len(real)))
 
-        def rate(u):
-            return -(real * np.exp(-np.outer(np.clip(u, -1.0, FADED), self.powers))).sum(axis=1)
+        def rate(u: np.ndarray) -> np.ndarray:
+            return np.asarray(-(real * np.exp(-np.outer(np.clip(u, -1.0, FADED), self.powers))).sum(axis=1))
 
         for k in range(STEPS):
             rates[k] = a = rate(u[k])

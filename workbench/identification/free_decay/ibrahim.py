@@ -153,4 +153,4 @@ def _leading_left(matrix: np.ndarray, order: int) -> np.ndarray:
     """Leading left singular vectors, by an orthogonal factorisation of the longer side first."""
     if matrix.shape[1] > matrix.shape[0]:
         matrix = np.asarray(np.linalg.qr(matrix.T, mode="r")).T
-    return svd(matrix, full_matrices=False)[0][:, :order]
+    return np.asarray(svd(matrix, full_matrices=False)[0][:, :order])

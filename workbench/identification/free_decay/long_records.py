@@ -261,7 +261,7 @@ class _Search:
     def _overlap(self, poles: np.ndarray, pole: complex) -> np.ndarray:
         """Shares of energy in common; none is narrower than the resolution of the record."""
         a, b = np.abs(poles.real) + 1.0 / self.span, abs(pole.real) + 1.0 / self.span
-        return 4.0 * a * b / ((a + b) ** 2 + (poles.imag - pole.imag) ** 2)
+        return np.asarray(4.0 * a * b / ((a + b) ** 2 + (poles.imag - pole.imag) ** 2))
 
     def _gain(self, r: int, near: np.ndarray) -> float:
         """χ² of mode r, the poles near it fitted anew without it.

@@ -69,7 +69,7 @@ def identify(
         records: free decay in noise, of the same sensors at one rate; each output may hold a constant.
         most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
         false_alarm: chance that noise alone is taken for a mode.
-        seconds: after which the best so far is returned, with a remark; None for no limit.
+        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
 
     Raises:
         ValueError: no mode rises above the noise; a faulty channel (`check_data_quality`); records that differ in

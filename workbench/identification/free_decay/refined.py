@@ -50,12 +50,12 @@ class Refined(ModalEstimates):
     @property
     def noise_std(self) -> np.ndarray:
         """Of each output (n_outputs,), root mean square over the records."""
-        return np.sqrt((self.noise**2).mean(axis=0))
+        return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))
 
     @property
     def shape_std(self) -> np.ndarray:
         """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        return np.sqrt(np.einsum("rjj->jr", self.shape_covariance))
+        return np.asarray(np.sqrt(np.einsum("rjj->jr", self.shape_covariance)))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -295,10 +295,10 @@ def _by_noise(fit: Projection, r: int, k: int, unit: np.ndarray, ratio: np.ndarr
     pair = np.array([1.0, -1j]) @ _root(fit.spread[np.ix_([r, fit.poles.size + r], [r, fit.poles.size + r])])
     each = np.sqrt(variance)[:, None] * pair * unit[:, None]
     common = (ratio[:, None] * each[k]).real
-    return common @ common.T + np.diag((each.real**2).sum(axis=1))
+    return np.asarray(common @ common.T + np.diag((each.real**2).sum(axis=1)))
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
     """R with R R^T = matrix, for a matrix that may be singular."""
     values, vectors = np.linalg.eigh(matrix)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

@@ -182,7 +182,7 @@ class _Poles:
 def _folded(poles: np.ndarray, sample_time: float) -> np.ndarray:
     """The same poles below the Nyquist frequency: real samples see no difference."""
     turn = np.abs(poles.imag) * sample_time
-    return poles.real + 1j * np.minimum(turn, 2.0 * np.pi - turn) / sample_time
+    return np.asarray(poles.real + 1j * np.minimum(turn, 2.0 * np.pi - turn) / sample_time)
 
 
 def _inadmissible(poles: np.ndarray, records: Sequence[Record]) -> np.ndarray:
@@ -214,4 +214,6 @@ def noise_level(records: Sequence[Record], fits: Sequence[Projection], weights: 
     squares = np.array([np.einsum("tj,tj->j", f.residual, f.residual) for f in fits])
     signal = _squares(records)
     floor = np.maximum(1e-32 * signal, 1e-32 * signal.max() + 1e-300)
-    return np.sqrt(variances(np.maximum(squares, floor), np.maximum(free - lost / records[0].n_outputs, 1.0)))
+    return np.asarray(
+        np.sqrt(variances(np.maximum(squares, floor), np.maximum(free - lost / records[0].n_outputs, 1.0)))
+    )

@@ -111,7 +111,9 @@ def stable_modes(
     return StableModes(modes, np.array([len(g) for g in stayed]) / len(diagram.orders), spread)
 
 
-def _nearest(groups, modes: SampledModes, r: int, frequency: float, shape: float) -> int | None:
+def _nearest(
+    groups: list[list[tuple[SampledModes, int]]], modes: SampledModes, r: int, frequency: float, shape: float
+) -> int | None:
     """The group whose last member is this mode, if any."""
     nearest, distance = None, frequency
     for i, group in enumerate(groups):

@@ -26,7 +26,7 @@ def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
         replace(part, coefficients=part.coefficients * _by_column(part, rows))
         for part, rows in _by_part(fit, noise_ratio)
     )
-    return bound @ normal(replace(fit, parts=loud), fit.noise)[0] @ bound
+    return np.asarray(bound @ normal(replace(fit, parts=loud), fit.noise)[0] @ bound)
 
 
 def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
@@ -38,7 +38,7 @@ def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarr
     jacobian = np.block(
         [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
     )
-    return jacobian @ covariance(fit, noise_ratio)[np.ix_(at, at)] @ jacobian.T
+    return np.asarray(jacobian @ covariance(fit, noise_ratio)[np.ix_(at, at)] @ jacobian.T)
 
 
 def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
@@ -109,4 +109,4 @@ def _root(matrix: np.ndarray) -> np.ndarray:
     """R with R R^T = matrix, which close modes may have made singular."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
     values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
-    return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))

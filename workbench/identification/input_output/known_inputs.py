@@ -86,7 +86,7 @@ class KnownInputs:
         loud = (
             np.array([np.sqrt((size**2).mean(axis=0)) for size in self.line_std]) if self.line_std is not None else 1.0
         )
-        return np.sqrt(variances(*self._squares(fit))) * loud
+        return np.asarray(np.sqrt(variances(*self._squares(fit))) * loud)
 
     def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
         """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""
@@ -149,7 +149,7 @@ class KnownInputs:
     def _free(self, fit: Fit) -> np.ndarray:
         length = np.array([rows.stop - rows.start for rows in self.rows])
         lost = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
-        return np.maximum(length * (1.0 - lost / length.sum()), 1.0)
+        return np.asarray(np.maximum(length * (1.0 - lost / length.sum()), 1.0))
 
     def _rows(self, samples: np.ndarray) -> np.ndarray:
         """Columns of samples as the fit sees them."""
@@ -240,7 +240,7 @@ def _flat(inputs: np.ndarray) -> bool:
     return bool((np.ptp(inputs, axis=0) == 0).any())
 
 
-def _sources(pole: complex, dt: float, straight: bool):
+def _sources(pole: complex, dt: float, straight: bool) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
     """c_0, c_1 and their derivatives by λ."""
     x = pole * dt
     powers = x ** np.arange(TERMS)

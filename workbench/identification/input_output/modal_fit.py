@@ -109,7 +109,7 @@ class Fit:
         left = self.residual
         free = max(left.shape[0] - self.coefficients.shape[0] - free_parameters(self).size / left.shape[1], 1.0)
         squares = (left**2).sum(axis=0)
-        return np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / free)
+        return np.asarray(np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / free))
 
 
 def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Fit:
@@ -157,7 +157,7 @@ def free_parameters(fit: Fit) -> np.ndarray:
 
 
 def _held(participation: np.ndarray) -> np.ndarray:
-    return np.argmin(np.abs(participation - 1.0), axis=1)
+    return np.asarray(np.argmin(np.abs(participation - 1.0), axis=1))
 
 
 def moves(fit: Fit, part: Part) -> np.ndarray:

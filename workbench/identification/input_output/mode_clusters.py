@@ -35,3 +35,22 @@ def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) 
         if len(cluster) >= FEWEST and collinearity[cluster].min() < IN_PHASE:
             clusters[cluster[0]] = cluster[1:]
     return clusters
+
+
+def overlap_remarks(poles: np.ndarray, n_channels: int) -> tuple[str, ...]:
+    """A remark on modes within each other's half-power bands that one pair of input and output cannot distinguish.
+
+    Args:
+        poles: (n_modes,) rad/s, by rising frequency.
+        n_channels: outputs times inputs; two and more distinguish modes by their shapes.
+    """
+    width = np.abs(poles.real)
+    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width
+    first, second = np.nonzero(np.triu(near, 1))
+    if n_channels > 1 or not first.size:
+        return ()
+    pairs = ", ".join(f"{r + 1} and {s + 1}" for r, s in zip(first, second, strict=True))
+    return (
+        f"modes {pairs} overlap: one mode that drifts or depends on amplitude looks like that to a single input and"
+        " output; compare parts of the record, or measure at another place",
+    )

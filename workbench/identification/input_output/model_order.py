@@ -115,7 +115,9 @@ def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
     width = np.maximum(np.abs(fit.poles.real), 0.5 * data.resolution)
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
     tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
-    return tries[(tries.imag > 0) & (tries.imag < data.highest) & (-tries.real < MOST_DAMPED * np.abs(tries))]
+    return np.asarray(
+        tries[(tries.imag > 0) & (tries.imag < data.highest) & (-tries.real < MOST_DAMPED * np.abs(tries))]
+    )
 
 
 def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
@@ -173,7 +175,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
     one = shapes.shape[0] * fit.participation.shape[1] == 1
     split = near & (alike > SAME_SHAPE) & (strength[:, None] < strength) & (not one)
-    return split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles))
+    return np.asarray(split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles)))
 
 
 def evidence_of(fit: Fit, r: int) -> float:

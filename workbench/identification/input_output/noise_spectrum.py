@@ -21,12 +21,12 @@ MOST_TAKEN = 0.9
 
 def lines_of(samples: np.ndarray) -> np.ndarray:
     """Orthonormal cosine transform of each column, (n_samples, n_columns)."""
-    return dct(samples, axis=0, norm="ortho")
+    return np.asarray(dct(samples, axis=0, norm="ortho"))
 
 
 def samples_of(lines: np.ndarray) -> np.ndarray:
     """Columns whose lines these are."""
-    return idct(lines, axis=0, norm="ortho")
+    return np.asarray(idct(lines, axis=0, norm="ortho"))
 
 
 def noise_spectrum(

@@ -20,7 +20,7 @@ class Lines:
     """Rows are real, then imaginary parts, reference by reference."""
 
     def __init__(
-        self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, guessed=False
+        self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, guessed: bool = False
     ) -> None:
         self.guessed = guessed
         self.omega, (_, self.refs, self.lines) = omega, h.shape
@@ -78,7 +78,7 @@ class Lines:
             strength.append(score[best])
         order = np.argsort(np.concatenate(strength))[::-1]
         beyond = np.r_[0.6 * self.omega[0], 0.9 * self.omega[0], np.array([1.05, 1.2, 1.5]) * self.omega[-1]]
-        return np.r_[np.concatenate(found)[order[: 3 * PEAKS_A_RATE]], (-0.01 + 1j) * beyond]
+        return np.asarray(np.r_[np.concatenate(found)[order[: 3 * PEAKS_A_RATE]], (-0.01 + 1j) * beyond])
 
     def fitted(self, fit: Fit) -> np.ndarray:
         """The model at the lines, (n_outputs, n_references, n_frequencies)."""
@@ -93,7 +93,7 @@ class Lines:
         if not self.guessed:
             return fit.noise
         raw = fit.residual / self.weights
-        return fit.noise * np.sqrt((raw**2).sum(axis=0) / (fit.residual**2).sum(axis=0))
+        return np.asarray(fit.noise * np.sqrt((raw**2).sum(axis=0) / (fit.residual**2).sum(axis=0)))
 
     def noise_ratio_near(self, fit: Fit) -> np.ndarray:
         """κ, the power of the residual about each mode over the mean of all lines, (n_modes,).

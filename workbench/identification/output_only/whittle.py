@@ -90,7 +90,7 @@ class SpectralMode:
         mu = np.exp(self.pole * dt)
         a = 0.5 * np.outer(self.shape, self.excitation)
         half = a * _resonance(mu, z)[:, None, None] + a.conj() * _resonance(mu.conj(), z)[:, None, None]
-        return half + _adjoint(half)
+        return np.asarray(half + _adjoint(half))
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +255,9 @@ class BandLikelihood:
 
     @property
     def _levels(self) -> np.ndarray:
-        return np.einsum("aij,dk->dakij", self.hermitian, self.across).reshape(-1, self.z.size, self.p, self.p)
+        return np.asarray(
+            np.einsum("aij,dk->dakij", self.hermitian, self.across).reshape(-1, self.z.size, self.p, self.p)
+        )
 
     def _changes(self, mode: SpectralMode, k: int) -> np.ndarray:
         """∂S by each unknown of a mode, (n_unknowns, n_lines, n_directions, n_directions)."""
@@ -272,7 +274,7 @@ class BandLikelihood:
                 up, down = matrix * f[:, None, None], matrix.conj() * g[:, None, None]
                 found += [up + down, 1j * (up - down)]
         half = np.array(found)
-        return half + _adjoint(half)
+        return np.asarray(half + _adjoint(half))
 
     def moved(self, state: State, step: np.ndarray) -> tuple[State, np.ndarray]:
         modes, background = state

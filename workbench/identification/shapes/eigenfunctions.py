@@ -90,11 +90,11 @@ class Spline:
         """Values (or derivatives) at x per value at each sensor, (n_points, n_sensors)."""
         if derivative > self.degree:
             return np.zeros((np.size(x), self.weights.shape[1]))
-        return BSpline(self.knots, self.weights, self.degree)(np.atleast_1d(x), derivative)
+        return np.asarray(BSpline(self.knots, self.weights, self.degree)(np.atleast_1d(x), derivative))
 
     def of_held(self, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """What the values at x would gain by what the ends held instead of zero, (n_points, n_conditions)."""
-        return BSpline(self.knots, self.held_weights, self.degree)(np.atleast_1d(x), derivative)
+        return np.asarray(BSpline(self.knots, self.held_weights, self.degree)(np.atleast_1d(x), derivative))
 
 
 def interpolating_spline(
@@ -217,7 +217,7 @@ def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = Know
         degrees.append(degree)
     if not degrees:
         return np.full(sampled.n_modes, DEFAULT_DEGREES[0])
-    return np.array(degrees)[np.argmin(errors, axis=0)]
+    return np.asarray(np.array(degrees)[np.argmin(errors, axis=0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,7 +307,7 @@ def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
         raise ValueError(f"two sensors stand at x = {ordered[:-1][alike][0]:g}; keep one of them")
 
 
-def _usable(zeros, degree: int, length: float) -> list[tuple[float, int]]:
+def _usable(zeros: Sequence[tuple[float, int]], degree: int, length: float) -> list[tuple[float, int]]:
     """Each end takes its value and at most (degree - 1) / 2 derivatives, below the degree."""
     kept = []
     for end in (0.0, length):
@@ -317,7 +317,7 @@ def _usable(zeros, degree: int, length: float) -> list[tuple[float, int]]:
     return kept
 
 
-def _knots(sites: np.ndarray, derivatives: list, length: float, degree: int) -> np.ndarray:
+def _knots(sites: np.ndarray, derivatives: list[tuple[float, int]], length: float, degree: int) -> np.ndarray:
     """Knots at the inner sites but those nearest each end, as many as that end's conditions leave over."""
     slack = 1e-9 * length
     inner = sites[(sites > slack) & (sites < length - slack)]
@@ -325,7 +325,7 @@ def _knots(sites: np.ndarray, derivatives: list, length: float, degree: int) -> 
     # An end with its value and (degree - 1) / 2 derivatives known keeps every inner site as a knot.
     left = (degree + 1) // 2 - known_left
     wanted = sites.size + len(derivatives) - degree - 1
-    return np.r_[[0.0] * (degree + 1), inner[left : left + wanted], [length] * (degree + 1)]
+    return np.asarray(np.r_[[0.0] * (degree + 1), inner[left : left + wanted], [length] * (degree + 1)])
 
 
 def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np.ndarray:
@@ -341,4 +341,4 @@ def _scaled_by_impulse(sampled: SampledModes, splines: Splines, x0: float) -> np
         )
     values = products / np.sqrt(at_impulse)
     clear = np.argmax(np.abs(values) > 0.05 * np.abs(values).max(axis=0), axis=0)
-    return values * np.sign(values[clear, np.arange(values.shape[1])])
+    return np.asarray(values * np.sign(values[clear, np.arange(values.shape[1])]))

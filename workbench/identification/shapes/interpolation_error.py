@@ -40,7 +40,7 @@ def peano_kernel(
     along = spline.matrix(x, derivative) @ _power(positions, u, order)
     if held:
         along = along + spline.of_held(x, derivative) @ np.array(held)
-    return (_power(x, u, order, derivative) - along) * np.sqrt(length / CELLS)
+    return np.asarray((_power(x, u, order, derivative) - along) * np.sqrt(length / CELLS))
 
 
 class LeaveOneOut:
@@ -74,9 +74,9 @@ class LeaveOneOut:
         error, noise, by_rough = self._errors(values, covariance)
         by_noise = np.diag(noise)
 
-        def unlikely(log_strength):
+        def unlikely(log_strength: float) -> float:
             power = by_noise + np.exp(log_strength) * by_rough
-            return (np.log(power) + error**2 / power).sum()
+            return float((np.log(power) + error**2 / power).sum())
 
         highest = np.log((np.maximum(error**2, by_noise) / by_rough).max())
         best = minimize_scalar(unlikely, bounds=(highest - 20.0, highest), method="bounded")

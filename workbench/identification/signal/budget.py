@@ -1,6 +1,6 @@
 """How long an identification may take, and what it left undone."""
 
-from time import monotonic
+from time import thread_time
 
 SECONDS = 30.0
 # Share of the time in which modes are searched; the rest is for refinement, standard errors and remarks.
@@ -8,10 +8,12 @@ SEARCH = 0.6
 
 
 class Budget:
-    """Time left for an identification; searches that find it spent return the best they have.
+    """Processor time left for an identification; searches that find it spent return the best they have.
+
+    Not time by the clock: a machine that others load gives the same result.
 
     Attributes:
-        seconds: allowed, from the construction on.
+        seconds: of processor time of this thread allowed, from the construction on.
         unfinished: the searches that were ended early, each once.
     """
 
@@ -20,11 +22,11 @@ class Budget:
             raise ValueError(f"identification needs time: seconds must be positive; got {seconds:g}")
         self.seconds = seconds
         self.unfinished: list[str] = []
-        self._end = float("inf") if seconds is None else monotonic() + seconds
+        self._end = float("inf") if seconds is None else thread_time() + seconds
 
     def spent(self, search: str) -> bool:
         """Whether the time is up; the search that asks is then noted as unfinished."""
-        if monotonic() < self._end:
+        if thread_time() < self._end:
             return False
         if search not in self.unfinished:
             self.unfinished.append(search)
@@ -32,7 +34,7 @@ class Budget:
 
     def share(self, share: float) -> "Budget":
         """A share of the time left, in (0, 1]; what it leaves unfinished counts here."""
-        part = Budget(None if self.seconds is None else share * max(self._end - monotonic(), 1e-3))
+        part = Budget(None if self.seconds is None else share * max(self._end - thread_time(), 1e-3))
         part.unfinished = self.unfinished
         return part
 

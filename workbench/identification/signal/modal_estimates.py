@@ -111,4 +111,4 @@ def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     turned = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
     turned = turned / np.abs(turned).max(axis=0)
     clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)
-    return turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0)
+    return np.asarray(turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0))

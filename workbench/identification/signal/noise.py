@@ -115,7 +115,7 @@ def white(power: np.ndarray, n_modes: int) -> np.ndarray:
     summed = np.cumsum(power, axis=0) / np.where(whole > 0, whole, 1.0)
     apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
     # The bins that the modes took are not coloured noise.
-    return apart < np.sqrt(0.5 * np.log(2.0 * m / FALSE_ALARM) / bins) + (n_modes + 1) / bins
+    return np.asarray(apart < np.sqrt(0.5 * np.log(2.0 * m / FALSE_ALARM) / bins) + (n_modes + 1) / bins)
 
 
 def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
@@ -128,7 +128,7 @@ def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = 
     """
     free = _each(free, squares)
     apart = differ(squares, free) if apart is None else apart
-    return np.where(apart, squares / free, squares.sum(axis=0) / free.sum(axis=0))
+    return np.asarray(np.where(apart, squares / free, squares.sum(axis=0) / free.sum(axis=0)))
 
 
 def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
@@ -138,7 +138,9 @@ def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
         return np.zeros(squares.shape[1], bool)
     whole = free.sum(axis=0)
     apart = whole * np.log(squares.sum(axis=0) / whole) - (free * np.log(squares / free)).sum(axis=0)
-    return apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1))) > chi2.isf(SPLIT, n - 1)
+    return np.asarray(
+        apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1))) > chi2.isf(SPLIT, n - 1)
+    )
 
 
 def _each(free: np.ndarray, squares: np.ndarray) -> np.ndarray:

@@ -183,4 +183,4 @@ def spurious_modes(
     if distinct is not None and others == 0:
         for r, s in np.argwhere(split):
             split[r, s] = not distinct(r, s)
-    return split.any(axis=1) | damped
+    return np.asarray(split.any(axis=1) | damped)

@@ -137,7 +137,7 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
     factor = cho_factor(whole * np.outer(scale, scale))
 
     def solve(right: np.ndarray) -> np.ndarray:
-        return scale[:, None] * cho_solve(factor, scale[:, None] * right)
+        return np.asarray(scale[:, None] * cho_solve(factor, scale[:, None] * right))
 
     coefficients, tilt = solve(seen), solve(tilted)
     squares = np.maximum(power - (coefficients * seen).sum(axis=0), 0.0)

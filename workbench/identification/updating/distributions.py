@@ -85,7 +85,7 @@ class Distribution:
         """Values at x, in the shape of x."""
         x = np.asarray(x, float)
         series = self.basis.functions(np.atleast_1d(x)) @ self.coefficients
-        return self.prior(x) + series.reshape(x.shape)
+        return np.asarray(self.prior(x) + series.reshape(x.shape))
 
     @property
     def profile(self) -> Profile:
@@ -156,7 +156,7 @@ def mass_and_stiffness(
     return Distributions(mass, stiffness, frozen(np.sqrt(a_squared) / scale))
 
 
-def _mass(modes: Modes, basis: Basis, prior: Profile, known) -> Distribution:
+def _mass(modes: Modes, basis: Basis, prior: Profile, known: Sequence[tuple[float, float]]) -> Distribution:
     if len(known) == 0:
         raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
     u, u0 = _relations(modes, 0, basis, prior, np.triu_indices(modes.n_modes, 1))
@@ -186,7 +186,7 @@ def _unit_mean_square(modes: Modes) -> tuple[Modes, np.ndarray]:
     return replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * scale), scale
 
 
-def _sampled(modes: Modes, derivative: int, breaks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Shapes (n_points, n_modes), weights and places of a Gauss rule that no break interrupts."""
     points, weights = np.polynomial.legendre.leggauss(12)
     n_pieces = 16 * (1 + modes.n_modes // 4)
@@ -196,14 +196,16 @@ def _sampled(modes: Modes, derivative: int, breaks) -> tuple[np.ndarray, np.ndar
     return modes.phi(x, derivative), (0.5 * h * weights).ravel(), x
 
 
-def _relations(modes: Modes, derivative: int, basis: Basis, prior: Profile, pairs):
+def _relations(
+    modes: Modes, derivative: int, basis: Basis, prior: Profile, pairs: tuple[np.ndarray, ...]
+) -> tuple[np.ndarray, np.ndarray]:
     """U_rsj (n_relations, n_terms) of (4.8) and U_rs0 (n_relations,) of (4.23) for pairs of modes (r, s)."""
     shapes, weights, x = _sampled(modes, derivative, (*basis.breaks, *prior.breaks))
     products = weights[:, None] * shapes[:, pairs[0]] * shapes[:, pairs[1]]
     return products.T @ basis.functions(x), products.T @ prior(x)
 
 
-def _constrained(matrix, target, rows, values) -> np.ndarray:
+def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Least squares of matrix @ c = target with rows @ c = values held exactly."""
     particular = np.linalg.lstsq(rows, values, rcond=None)[0]
     left = np.abs(rows @ particular - values).max()
@@ -214,10 +216,10 @@ def _constrained(matrix, target, rows, values) -> np.ndarray:
         )
     free = null_space(rows)
     if free.shape[1] == 0:
-        return particular
-    return particular + free @ np.linalg.lstsq(matrix @ free, target - matrix @ particular, rcond=None)[0]
+        return np.asarray(particular)
+    return np.asarray(particular + free @ np.linalg.lstsq(matrix @ free, target - matrix @ particular, rcond=None)[0])
 
 
-def _misfit(left, matrix, coefficients, offset) -> float:
+def _misfit(left: np.ndarray, matrix: np.ndarray, coefficients: np.ndarray, offset: np.ndarray) -> float:
     terms = np.sqrt(np.mean((np.abs(matrix) @ np.abs(coefficients) + np.abs(offset)) ** 2)) if left.size else 0.0
     return float(np.sqrt(np.mean(left**2)) / terms) if terms else 0.0

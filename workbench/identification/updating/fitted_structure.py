@@ -32,7 +32,7 @@ class UncertainProfile:
 
     def std(self, x: np.ndarray) -> np.ndarray:
         """Standard error at each x (n_points,)."""
-        return self.others(np.atleast_1d(np.asarray(x, float))).std(axis=0)
+        return np.asarray(self.others(np.atleast_1d(np.asarray(x, float))).std(axis=0))
 
     def band(self, x: np.ndarray, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
         """Limits at each x (n_points,), lower and upper, that hold the truth there with this probability."""

@@ -80,7 +80,7 @@ class LocatedDamage:
         )
         begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
         tail = 0.5 * (1.0 - level)
-        return np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T
+        return np.asarray(np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T)
 
 
 @one_blas_thread

@@ -1,6 +1,6 @@
 """The check of section 4.3: does the structure that was identified have the modes it was identified from?"""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -88,9 +88,9 @@ def choose_terms(
     kind: str,
     left: str | End,
     right: str | End,
-    known_mass,
+    known_mass: Sequence[tuple[float, float]],
     terms: Iterable[int] = range(1, 7),
-    basis=Basis.polynomial,
+    basis: Callable[[int], Basis] = Basis.polynomial,
     first_mode: int = 0,
     **priors,
 ) -> Identified:

@@ -11,6 +11,7 @@ moment is continuous there and the curvature is not, so ∂K_sr = (k⁻ - k⁺) 
 the nodes next to it has a kink that travels, which the sum follows to a few parts in a hundred; all else is exact.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -145,7 +146,7 @@ class SolvedSeries:
     @property
     def at_sensors(self) -> np.ndarray:
         """All shapes, (n_sensors, n_all)."""
-        return self.mesh.segments.evaluation(self.series.positions) @ self.coefficients
+        return np.asarray(self.mesh.segments.evaluation(self.series.positions) @ self.coefficients)
 
     def sensitivity(self, which: np.ndarray) -> Sensitivity:
         """Elastic modes `which` (from 0); parameters d, e and, with a loss, its share, centre and width."""
@@ -227,7 +228,7 @@ class _Mesh:
         return cls(segments, x, weights, values, strains, m(x), k(x), *terms, fixed_mass, fixed_stiffness, free)
 
 
-def _nodes(places, length: float) -> np.ndarray:
+def _nodes(places: Sequence[float], length: float) -> np.ndarray:
     """The ends and all places between them, none within a sliver of another."""
     nodes = [0.0]
     for at in sorted(places):
@@ -236,7 +237,7 @@ def _nodes(places, length: float) -> np.ndarray:
     return np.array([*nodes, length])
 
 
-def _tables(segments: Segments, order: int):
+def _tables(segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Points, weights, and the functions with their first and highest derivatives there, (n_points, n_functions)."""
     each = [[segments.tabulated(s, derivative) for s in range(segments.n_segments)] for derivative in (0, 1, order)]
     x, weights = (np.concatenate([segment[i] for segment in each[0]]) for i in range(2))
@@ -255,7 +256,7 @@ def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndar
     mass, stiffness = np.zeros((2, segments.n_functions, segments.n_functions))
     held = []
 
-    def add(matrix: np.ndarray, at: float, values) -> None:
+    def add(matrix: np.ndarray, at: float, values: Sequence[float]) -> None:
         for derivative, value in enumerate(values[:order]):
             if value:
                 row = segments.evaluation(at, derivative)

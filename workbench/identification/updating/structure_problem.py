@@ -129,7 +129,7 @@ class Problem:
 
     def carry(self, z: np.ndarray) -> np.ndarray:
         """∂(d, e, loss)/∂z."""
-        return block_diag(self.mass_held[1], self.stiffness_held[1], np.eye(z.size - self.n_free))
+        return np.asarray(block_diag(self.mass_held[1], self.stiffness_held[1], np.eye(z.size - self.n_free)))
 
     def misses(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What frequencies, shapes and prior are missed by, in standard errors, (n_rows,), and how it moves with z."""
@@ -228,7 +228,7 @@ class Problem:
             slopes = self.misses(z)[1]
             return _inverse(slopes.T @ slopes)
         carry = block_diag(np.eye(z.size - 2), FROM_EDGES)
-        return carry @ self._by_edges(self._edges_inside(z)) @ carry.T
+        return np.asarray(carry @ self._by_edges(self._edges_inside(z)) @ carry.T)
 
     def _by_edges(self, z: np.ndarray) -> np.ndarray:
         """The bound with the edges of the loss in place of centre and width."""
@@ -246,7 +246,7 @@ class Problem:
         depth = depth if inward > 0 else length - depth
 
         def moved(to: float) -> np.ndarray:
-            return np.r_[z[:-2], z[-2:] + inward * (to - depth) * FROM_EDGES[:, edge]]
+            return np.asarray(np.r_[z[:-2], z[-2:] + inward * (to - depth) * FROM_EDGES[:, edge]])
 
         def too_near(to: float) -> bool:
             return bool(self._by_edges(moved(to))[edge - 2, edge - 2] > to**2)
@@ -271,7 +271,7 @@ class Problem:
         if found.loss is None:
             return self._nearest(x, mass, stiffness)
         whole = stiffness / found.loss.of(Profile.constant(1.0), length)(x)
-        return np.r_[self._nearest(x, mass, whole), found.parameters[-3:]]
+        return np.asarray(np.r_[self._nearest(x, mass, whole), found.parameters[-3:]])
 
     def _start(self) -> np.ndarray:
         """Free parameters of the nominal structure, scaled to the known values and the measured frequencies."""
@@ -320,10 +320,18 @@ def _held(basis: Basis, known: np.ndarray, nominal: Profile, what: str) -> tuple
     return particular, null_space(rows)
 
 
-def _uncertain(nominal, basis, coefficients, draws, loss=None, loss_draws=None, length=0.0) -> UncertainProfile:
+def _uncertain(
+    nominal: Profile,
+    basis: Basis,
+    coefficients: np.ndarray,
+    draws: np.ndarray,
+    loss: LocalLoss | None = None,
+    loss_draws: np.ndarray | None = None,
+    length: float = 0.0,
+) -> UncertainProfile:
     """nominal (1 + series) (1 - loss), and as many others as there are draws."""
 
-    def values(x, coefficients, losses):
+    def values(x: np.ndarray, coefficients: np.ndarray, losses: np.ndarray | None) -> np.ndarray:
         series = nominal(x) * (1.0 + coefficients @ basis.functions(x).T)
         if losses is None:
             return series

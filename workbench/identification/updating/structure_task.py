@@ -43,7 +43,7 @@ class GaussianPrior:
         onto = np.linalg.pinv(basis.functions(x))
         kernel = self.std**2 * np.exp(-0.5 * ((x[:, None] - x) / self.correlation) ** 2)
         values, vectors = np.linalg.eigh(onto @ kernel @ onto.T)
-        return (vectors / np.sqrt(np.maximum(values, 1e-8 * values.max()))).T
+        return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-8 * values.max()))).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +67,8 @@ class Task:
         cls,
         measured: Refined,
         nominal: Bar | Beam,
-        known_mass=(),
-        known_stiffness=(),
+        known_mass: Sequence[tuple[float, float]] = (),
+        known_stiffness: Sequence[tuple[float, float]] = (),
         mass_prior: GaussianPrior | None = None,
         stiffness_prior: GaussianPrior | None = None,
         numbers: Sequence[int] | None = None,
@@ -135,10 +135,10 @@ def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
             f"measured mode {least + 1} at {modes.frequencies_hz[least]:.4g} Hz looks like no mode of the nominal"
             f" structure (best MAC {agreement[least].max():.2f}); leave it out, mend the nominal ends, or give numbers"
         )
-    return which
+    return np.asarray(which)
 
 
 def _unit(covariance: np.ndarray) -> np.ndarray:
     """W with W^T W the inverse of a covariance."""
     values, vectors = np.linalg.eigh(covariance)
-    return (vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T
+    return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T)
