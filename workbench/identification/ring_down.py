@@ -25,8 +25,9 @@ from workbench.structure.modes import SampledModes
 from workbench.threads import one_blas_thread
 
 MOST_MODES = 20
-# Rounds of modes and drift, and the degree of the drift before any mode is known.
-DRIFT_ROUNDS, PARABOLA = 3, 2
+# Rounds of modes and drift; before any mode is known, the degree of a drift, and the share of the variance that it must
+# leave at most to be removed.
+DRIFT_ROUNDS, PARABOLA, DOMINANT = 3, 2, 0.5
 # Energy of the second half over that of the first, either way; least correlation of such a record after a third of it.
 AS_STRONG, CORRELATED = 0.5, 0.5
 # Correlation of noise, times the root of its samples, is 1; more is an oscillation.
@@ -157,10 +158,12 @@ def _without_drift(
 ) -> tuple[Identified, list[Record], list[str]]:
     """Modes and drifts in turn, as each disturbs the other, until neither changes."""
     poles = np.zeros(0, complex)
-    # A drift as large as the modes would be searched for modes first; a parabola is none.
+    cleared, size = records, np.zeros((len(records), records[0].n_outputs))
+    # A drift larger than the modes would be searched for modes first; a parabola is none.
     drifts = [without_drift(record, poles, most=PARABOLA) for record in records]
-    size = np.array([drift.size for drift in drifts])
-    cleared = [drift.record for drift in drifts] if size.any() else records
+    pairs = zip(drifts, records, strict=True)
+    if any((drift.record.outputs.var(axis=1) < DOMINANT * record.outputs.var(axis=1)).any() for drift, record in pairs):
+        cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(DRIFT_ROUNDS):
         found = _identified(cleared, n_modes, budget)
