@@ -14,6 +14,7 @@ from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
+from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, frozen
 
 
@@ -45,8 +46,8 @@ class Controller:
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
-    def places(self) -> tuple[float, ...]:
-        """Distinct places of the sensors, m, increasing."""
+    def places(self) -> tuple[Place, ...]:
+        """Distinct places of the sensors, in order."""
         return tuple(sorted({sensor.at for sensor in self.sensors}))
 
 

@@ -51,8 +51,9 @@ class Law(Printed):
         return len(self.controlled)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        count = len(self.actuators)
-        line = f"{self.name}, u = -K x: modes {numbered(self.controlled)} by {count} actuator{'s' * (count > 1)}"
+        count, several = len(self.actuators), self.n_controlled > 1
+        line = f"{self.name}, u = -K x: mode{'s' * several} {numbered(self.controlled)} by {count} actuator"
+        line += "s" * (count > 1)
         modes = [str(r + 1) for r in self.controlled]
         headings = ["actuator", "place [m]", *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
         rows = [

@@ -63,7 +63,7 @@ class Intervals:
         most_bend, most_rate = (np.maximum(part[::2], part[1::2]) for part in (steep, rate))
         levels = [(most_bend, most_rate)]
         for _ in range(LEVELS):
-            levels.append(tuple(np.maximum(part[::2], part[1::2]) for part in levels[-1]))  # type: ignore[arg-type]
+            levels.append(tuple(np.maximum(part[::2], part[1::2]) for part in levels[-1]))
         at = np.concatenate([(2 * np.arange(2**k) + 1) * 2 ** (LEVELS - k) for k in range(LEVELS + 1)])
         half = np.concatenate([np.full(2**k, 0.5 * (last - first) / 2**k) for k in range(LEVELS + 1)])
         most_bend, most_rate = (np.concatenate([level[i] for level in reversed(levels)]) for i in (0, 1))

@@ -16,6 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.loop.closed_loop import ClosedLoop, close_with
 from workbench.rig.statespace import input_matrix
+from workbench.structure.domain import Place
 from workbench.structure.modes import Modes
 
 SECANT_STEPS = 40
@@ -29,13 +30,13 @@ class Path:
 
     Attributes:
         actuator: name.
-        sensor_at: place of the sensors, m; all the channels read there count together.
+        sensor_at: place of the sensors; all the channels read there count together.
         shift: its share of the exact shift, rad/s; the real part is what it adds to the growth.
         first_order: the same from the open-loop pole.
     """
 
     actuator: str
-    sensor_at: float
+    sensor_at: Place
     shift: complex
     first_order: complex
 

@@ -6,6 +6,7 @@ Every change is a new design, and every margin is that of the new loop on the fu
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -149,10 +150,10 @@ def _least(met: Callable[[float], float], most: float) -> float | None:
     return None
 
 
-def _moved_actuator(start: _Setting) -> Iterator[tuple[str, float, Callable[[float], _Setting]]]:
+def _moved_actuator(start: _Setting) -> Iterator[tuple[str, Any, Callable[[float], _Setting]]]:
     for j, actuator in enumerate(start.actuators):
 
-        def move(distance: float, j=j, actuator=actuator) -> _Setting:
+        def move(distance: float, j: int = j, actuator: Any = actuator) -> _Setting:
             moved = replace(actuator, at=actuator.at + distance)
             return replace(start, actuators=(*start.actuators[:j], moved, *start.actuators[j + 1 :]))
 
@@ -162,7 +163,7 @@ def _moved_actuator(start: _Setting) -> Iterator[tuple[str, float, Callable[[flo
 def _moved_sensor(start: _Setting) -> Iterator[tuple[str, float, Callable[[float], _Setting]]]:
     for i, at in enumerate(start.sensors):
 
-        def move(distance: float, i=i, at=at) -> _Setting:
+        def move(distance: float, i: int = i, at: float = at) -> _Setting:
             return replace(start, sensors=tuple(sorted((*start.sensors[:i], at + distance, *start.sensors[i + 1 :]))))
 
         yield f"sensor at x = {at:.4g}", at, move
