@@ -70,7 +70,7 @@ def designs(modes):
     }
 
 
-def survival(outcome):
+def robust(outcome):
     modes, found = identified()
     state = impulse_state(modes, 6.3)
     state[N_MODES + CONTROLLED :] = 0.0
@@ -91,11 +91,11 @@ def survival(outcome):
     for name in chosen:
         low, middle, high = spreads[name][0]
         outcome.say(
-            f"{name}: survives {shares[name][0]:.0%} of {DRAWS} draws, W_R {middle:.3g} ({low:.3g} to {high:.3g});"
+            f"{name}: stable on {shares[name][0]:.0%} of {DRAWS} draws, W_R {middle:.3g} ({low:.3g} to {high:.3g});"
             f" with errors a hundred times larger {shares[name][-1]:.0%}"
         )
     outcome.check(
-        "share of draws survived with the errors identified, least of the designs through a filter",
+        "share of draws that stay stable with the errors identified, least of the designs through a filter",
         min(values[0] for name, values in shares.items() if "filter" in name),
         1.0,
         at_least=True,
@@ -158,5 +158,5 @@ def drift(outcome):
 
 
 def study(outcome, data=None):
-    survival(outcome)
+    robust(outcome)
     drift(outcome)
