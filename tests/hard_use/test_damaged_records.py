@@ -304,3 +304,11 @@ def test_the_command_ends_in_one_line_and_writes_nothing(tmp_path, ending):
     assert result.exit_code == 2 and "Traceback" not in result.output, result.output
     assert path.name in result.output and len(result.output.strip().splitlines()) == 1
     assert not found.exists()
+
+
+@pytest.mark.parametrize("samples", [2, 3])
+def test_a_record_too_short_for_a_mode_is_refused_in_one_line(tmp_path, samples):
+    path = tmp_path / "x.csv"
+    path.write_text("time,a\n" + "".join(f"{0.1 * i:.1f},{(-1) ** i}\n" for i in range(samples)))
+    result = CliRunner().invoke(app, ["identify", str(path)])
+    assert result.exit_code == 2 and f"has {samples} samples" in result.output, result.output

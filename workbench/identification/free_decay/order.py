@@ -87,7 +87,10 @@ def identify_within(
     check_same_sensors(records)
     for record in records:
         check_data_quality(record)
-    fit_in = (min(r.n_samples for r in records) - 4) // 3
+    shortest = min(records, key=lambda record: record.n_samples)
+    fit_in = (shortest.n_samples - 4) // 3
+    if fit_in < 1:
+        raise ValueError(f"record {shortest.name!r} has {shortest.n_samples} samples; a mode needs 7: measure longer")
     if sum(r.outputs.size for r in records) > LONG:
         most = min(most_modes or 10 * MOST_MODES, fit_in)
         found = identify_long(records, most_modes=most, false_alarm=false_alarm, budget=budget)
