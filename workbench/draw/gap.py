@@ -10,6 +10,7 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -56,6 +57,25 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
     ax.set_xlim(-1.0, max(len(records), 3) - 0.5)
     ax.set(yscale="log", xlabel="record", ylabel="gap", title="the gap on records kept out of the fit")
     ax.legend()
+    return figure
+
+
+def plot_budget(budget: Budget) -> Figure:
+    """What causes the gap of each record: one bar a record, split by cause."""
+    causes = [label.replace("[", " (").replace("]", ")").replace("_", " ") for label in budget.effects]
+    causes += ["small errors of the model", "unexplained", "noise"]
+    colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]
+    records = list(budget.by_record)
+    figure, ax = new_figure(width=9, height=1.6 + 0.5 * len(records))
+    left = np.zeros(len(records))
+    for i, (cause, colour) in enumerate(zip(causes, colours, strict=True)):
+        share = 100.0 * np.array([max(float(budget.by_record[record][i]), 0.0) for record in records])
+        if share.max() > 0.05:
+            ax.barh(records, share, left=left, color=colour, label=cause, height=0.6)
+        left += share
+    ax.set(xlim=(0, 100), xlabel="share of the gap's power [%]", title="what causes the gap of each record")
+    ax.invert_yaxis()
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.35), ncols=3)
     return figure
 
 

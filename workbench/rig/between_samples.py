@@ -41,16 +41,22 @@ class BetweenSamples:
         stiffness: np.ndarray,
         damping: np.ndarray,
         sample_time: float,
+        *,
+        held: bool = False,
     ) -> "BetweenSamples":
         """From displacements, velocities and forces (n_modes, n_samples) at the samples.
 
         Args:
             stiffness: (n_modes, 1) or (n_modes, n_samples).
             damping: (n_modes, n_modes).
+            held: whether the forces stay as they are from sample to sample; then they are exact as they are.
         """
         omega, own = np.sqrt(stiffness.mean(axis=1)), np.diag(damping).copy()
         # what a mode alone does not have counts as a force
         beside = forces - (stiffness - omega[:, None] ** 2) * displacement - (damping - np.diag(own)) @ velocity
+        start = np.stack([displacement, velocity])
+        if held:
+            return cls(omega, own, start, np.stack([beside] * 2), sample_time, not start[:, :, 0].any())
         step = _propagators(omega, own, sample_time)
         free = step[:, 0, :, None] * displacement[:, :-1] + step[:, 1, :, None] * velocity[:, :-1]
         moved = np.stack([displacement[:, 1:], velocity[:, 1:]])
@@ -63,7 +69,6 @@ class BetweenSamples:
         ends = np.moveaxis(change, 1, 0) + beside[:, :-1]
         # after the last sample its force is held
         ends = np.concatenate([ends, np.stack([beside[:, -1:]] * 2)], axis=2)
-        start = np.stack([displacement, velocity])
         return cls(omega, own, start, ends, sample_time, not start[:, :, 0].any())
 
     def earlier(self, order: int, shape: np.ndarray, delay: float) -> np.ndarray:

@@ -77,6 +77,7 @@ class Motion:
         forces: (n_modes, n_samples) on them beside those of stiffness and damping.
         stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
         damping: (n_modes, n_modes).
+        held: whether the forces stay as they are from sample to sample.
     """
 
     displacement: np.ndarray
@@ -84,12 +85,13 @@ class Motion:
     forces: np.ndarray
     stiffness: np.ndarray
     damping: np.ndarray
+    held: bool = False
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
         """The motion at any time, s; worked out once, since sensors of many delays may read one motion."""
         if "_between_samples" not in self.__dict__:
             q, v, forces = self.displacement, self.velocity, self.forces
-            found = BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time)
+            found = BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time, held=self.held)
             object.__setattr__(self, "_between_samples", found)
         return self.__dict__["_between_samples"]
 
@@ -104,7 +106,7 @@ class Motion:
             return self
         stiffness = self.stiffness[:, lead:] if self.stiffness.shape[1] > 1 else self.stiffness
         q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
-        return Motion(q, v, forces, stiffness, self.damping)
+        return Motion(q, v, forces, stiffness, self.damping, self.held)
 
 
 def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, name: str = "simulated") -> Record:
@@ -254,7 +256,9 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
         response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
         acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
-    return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping)
+    held = modes.proportional and not any(isinstance(e, PeriodicForce) for e in rig.elements)
+    held = held and not any(a.delay or a.time_constant for a in rig.actuators)
+    return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping, held)
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:

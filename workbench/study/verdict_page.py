@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.cases.case import Case
-from workbench.draw.gap import plot_missing_force, plot_responses, plot_rivals, plot_where
+from workbench.draw.gap import plot_budget, plot_missing_force, plot_responses, plot_rivals, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.gap.report.verdict import Verdict
 from workbench.rig.rig import Rig
@@ -40,6 +40,11 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     if verdict.outcome != "none" and better:  # what makes the gap larger corrects nothing
         rigs[fitted] = verdict.corrected
     figures = [
+        (
+            plot_budget(verdict.budget),
+            "What causes the gap: the power of the nominal residual, split by cause, on"
+            + (" records that no fit has seen." if case.validation else " the records that were fitted."),
+        ),
         (
             plot_responses(rigs, records),
             f"Measured and simulated response ({', '.join(rigs)}) where they differ most. No fit has seen the"

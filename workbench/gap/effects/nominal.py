@@ -1,6 +1,6 @@
 """Small errors of the nominal model: uncertain parameters with normal priors, marginalised beside every effect."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,8 @@ from workbench.structure.member import Structure
 from workbench.structure.modes import Shapes
 from workbench.structure.profile import Profile
 
-WAVES = 9  # cosines of a smooth variation along the structure: the constant, and up to eight half waves
+FEW = 9  # cosines that may be as large as one another; of more, those beyond SMOOTH half waves fall off by the square,
+SMOOTH = 3  # as those of any function do that has a slope at its ends
 PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
 MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
@@ -30,6 +31,7 @@ class NominalPrior:
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
         sample_time: s.
+        waves: cosines of a smooth variation along the structure, the constant among them.
     """
 
     stiffness: float = 0.0
@@ -38,6 +40,7 @@ class NominalPrior:
     damping: float = 0.0
     delay: float = 0.0
     sample_time: float = 1.0
+    waves: int = 9
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -53,17 +56,24 @@ def group_of(parameter: str) -> str:
     return parameter.split("_", 1)[0]
 
 
+def weight_of(parameter: str, prior: NominalPrior) -> float:
+    """Prior standard deviation of a parameter over that of its group."""
+    if prior.waves <= FEW or group_of(parameter) not in ("stiffness", "mass"):
+        return 1.0
+    return min(1.0, (SMOOTH / max(int(parameter.split("_")[1]), 1)) ** 2)
+
+
 def _parameters(rig: Rig, prior: NominalPrior) -> tuple[Parameter, ...]:
     return tuple(_each(rig, prior))
 
 
 def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
     def believed(name: str, std: float, unit: float, most: float = np.inf) -> Parameter:
-        reach = min(WIDEST * max(std, unit), most)
-        return Parameter(name, "", -reach, reach, scale=unit, prior_std=max(std / unit, 1e-6))
+        reach, unit = min(WIDEST * max(std, unit), most), unit * weight_of(name, prior)
+        return Parameter(name, "", -reach, reach, scale=unit, prior_std=max(std * weight_of(name, prior) / unit, 1e-6))
 
     along = isinstance(rig.structure, Structure)
-    waves = WAVES if along else 1
+    waves = prior.waves if along else 1
     if prior.stiffness and along:
         yield from (believed(f"stiffness_{k}", prior.stiffness, PROFILE_UNIT) for k in range(waves))
     if prior.mass:
@@ -153,9 +163,14 @@ def _padded(values: np.ndarray, size: int) -> np.ndarray:
     return np.r_[values, np.zeros(max(size - values.size, 0))][:size]
 
 
-def nominal_errors(rig: Rig, prior: NominalPrior) -> Effect:
-    """Errors of the nominal model, all of them zero, to be fitted beside effects."""
-    return Effect(NOMINAL_ERRORS, prior, {p.name: 0.0 for p in _parameters(rig, prior)})
+def nominal_errors(rig: Rig, prior: NominalPrior, start: Mapping[str, float] | None = None) -> Effect:
+    """Errors of the nominal model, to be fitted beside effects.
+
+    Args:
+        start: errors to start from; all others are zero.
+    """
+    start = {} if start is None else start
+    return Effect(NOMINAL_ERRORS, prior, {p.name: start.get(p.name, 0.0) for p in _parameters(rig, prior)})
 
 
 NOMINAL_ERRORS = Kind(

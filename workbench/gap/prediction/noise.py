@@ -14,6 +14,7 @@ MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
 REACH, QUIET = 5, 0.25  # bands to either side, and their quantile: modes leave a quarter of them free of peaks
 LOWER = 0.67  # deviations by which that quantile lies below the mean
+ALIKE = 1.3  # times the power of the quietest record
 LOUD = 0.5  # of the mean square: peaks that hold less are not worth leaving out
 
 
@@ -27,7 +28,11 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     Args:
         residuals: (n_outputs, n_samples) measured less predicted, one a record.
     """
-    return np.sqrt(np.min([_power(residual) for residual in residuals], axis=0))
+    whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
+    under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
+    # what is as strong in two records of unequal level is noise, of whatever colour
+    alike = whole[1] < ALIKE * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
+    return np.sqrt(np.where(alike | (under > LOUD * whole[0]), whole[0], under))
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
@@ -62,9 +67,8 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     return float(min(np.sqrt(share), MOST_LOGGED))
 
 
-def _power(residual: np.ndarray) -> np.ndarray:
-    """Mean square (n_outputs,), or that under the peaks of the spectrum where it is far less."""
-    whole = (residual**2).mean(axis=1)
+def _under_peaks(residual: np.ndarray) -> np.ndarray:
+    """Mean square (n_outputs,) under the peaks of the spectrum."""
     n_outputs, n_samples = residual.shape
     window = np.hanning(n_samples)
     spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
@@ -73,5 +77,4 @@ def _power(residual: np.ndarray) -> np.ndarray:
     reach = min(REACH, (bands - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
     floor = np.quantile(around, QUIET, axis=2) * (1.0 + LOWER / np.sqrt(LINES))
-    under = np.minimum(means, floor).mean(axis=1)
-    return np.where(under < LOUD * whole, under, whole)
+    return np.minimum(means, floor).mean(axis=1)

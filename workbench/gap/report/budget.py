@@ -55,9 +55,13 @@ class Budget:
         return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
 
     def to_json(self) -> dict:
-        """Plain numbers, as the case format asks for them."""
+        """Plain numbers, as the case format asks for them: effects by kind."""
+        by_kind: dict[str, float] = {}
+        for label, share in self.effects.items():
+            kind = label.split("[")[0]
+            by_kind[kind] = by_kind.get(kind, 0.0) + share
         return {
-            "effects": {label: _rounded(share) for label, share in self.effects.items()},
+            "effects": {kind: _rounded(share) for kind, share in by_kind.items()},
             "nominal": _rounded(self.nominal),
             "unexplained": _rounded(self.unexplained),
             "noise": _rounded(self.noise),
@@ -76,10 +80,9 @@ def budget_of(
 ) -> Budget:
     """Take the mean square of the nominal residual apart.
 
-    Each sensor counts by the standard deviation of its readings, as in the gap of a record. Effects come in the order
-    of what they take away, each beside those before it. What effects and errors of the nominal model take away
-    together is shared between them by the mean over both orders (Shapley 1953): beside large errors, an effect alone
-    may take away nothing, and beside it they take away the less.
+    Each sensor counts by the standard deviation of its readings, as in the gap of a record. What effects and errors of
+    the nominal model take away together is shared in proportion to what is left without each of them alone; causes
+    that partly cancel one another would else take away nothing, or less.
 
     Args:
         rig: nominal.
@@ -96,17 +99,15 @@ def budget_of(
         real = apply_all(rig, chosen)
         return np.array([_mean_square(real, record, settle, substeps) for record in records])
 
-    nominal = squares(())
-    order, rows, left = _in_order(effects, nominal, squares)
-    if errors is not None:
-        with_errors, alone = squares((*order, errors)), squares((errors,))
-        by_effects = 0.5 * ((nominal - left) + (alone - with_errors))
-        split = np.array(rows).reshape(len(order), len(records))
-        rows = list(split * (by_effects / np.where(split.sum(axis=0) == 0, 1.0, split.sum(axis=0))))
-        rows.append(nominal - with_errors - np.sum(rows, axis=0))
-        left = with_errors
-    else:
-        rows.append(np.zeros_like(left))
+    causes = [*effects, *([] if errors is None else [errors])]
+    nominal, left = squares(()), squares(causes)
+    without = [squares([c for c in causes if c is not cause]) for cause in causes]
+    weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
+    total = weights.sum(axis=0)
+    taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
+    order = sorted(range(len(effects)), key=lambda i: -taken[i].sum())
+    rows = [*taken[order], taken[-1] if errors is not None else np.zeros_like(left)]
+    order = [effects[i] for i in order]
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     for i, effect in enumerate(order):  # what no model can predict is theirs
@@ -127,18 +128,6 @@ def budget_of(
         noise_found=tuple(noise_found.tolist()),
         sensors=tuple(s.name for s in rig.sensors),
     )
-
-
-def _in_order(effects, nominal, squares) -> tuple[list[Effect], list[np.ndarray], np.ndarray]:
-    """Effects by what they take away, what each takes away of every record, and what they leave."""
-    waiting, order, rows, left = list(effects), [], [], nominal
-    while waiting:
-        trials = [squares((*order, effect)) for effect in waiting]
-        best = int(np.argmin([trial.sum() for trial in trials]))
-        rows.append(left - trials[best])
-        left = trials[best]
-        order.append(waiting.pop(best))
-    return order, rows, left
 
 
 def _mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> float:

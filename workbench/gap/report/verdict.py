@@ -102,9 +102,9 @@ class Verdict:
             verb = "accounts" if len(named) == 1 else "account"
             text = f"{words} {verb} for the gap, part of which nothing can predict."
         elif self.outcome == "explained":
-            shares = list(self.budget.effects.values())
+            shares = [self._share_of(effect) for effect in self._told]
             if len(named) == 1:
-                text = f"{words} causes {_percent(sum(shares))} of the gap"
+                text = f"{words} causes {_percent(shares[0])} of the gap"
             else:
                 each = " and ".join(_percent(share) for share in shares)
                 text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
@@ -118,6 +118,13 @@ class Verdict:
             else:
                 text += f"; {words} explains {closed}it."
         return text[0].upper() + text[1:]
+
+    def _share_of(self, effect: Effect) -> float:
+        """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
+        shares = self.budget.effects
+        if effect.label in shares:
+            return shares[effect.label]
+        return sum(share for label, share in shares.items() if label.split("[")[0] == effect.kind.name)
 
     @property
     def _rest(self) -> str:

@@ -25,7 +25,7 @@ from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
+from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -166,9 +166,7 @@ def attribute(
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
     nominal = data.by_channel(data.residual(found.nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0, "read off the records")
-    telling = _telling(data, start)
-    quick, first = data.only(telling).stepped(2), data.only(telling[:1]).stepped(2)
-    search = Search(rig, data, quick, first, catalogue, report, workers, nominal)
+    search = Search(rig, data, *most_telling(data, start.cost_by_channel), catalogue, report, workers, nominal)
     decision: Decision | None = None
     singles: list[Fit] = []
     ahead: list[Fit] = []
@@ -187,13 +185,17 @@ def attribute(
         alone = decide(search, start, singles)
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
-        decision = decision or _with_a_second(search, start, ahead, weighed, evidence)
+        decision = decision or _with_a_second(search, start, singles, weighed, evidence)
     outcome, best, random, rivals, noise = decision
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
     if random is None:
         best = with_intervals(search.rig, best, search.data, workers)
+        if outcome == "explained":
+            standing = tuple(e for e in best.effects if e in seen or _stands_out(e, search.rig))
+            best = replace(best, effects=standing)
+            outcome = outcome if any(not e.kind.first for e in standing) else "none"
     report("done", 1.0)
     return Attribution(
         outcome=outcome,
@@ -221,6 +223,14 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
 
 def _stated(search: Search, noise: np.ndarray | None) -> np.ndarray:
     return search.data.noise if noise is None else noise
+
+
+def _stands_out(effect: Effect, rig: Rig) -> bool:
+    """Whether any number of an effect is farther from where it changes nothing than its standard deviation."""
+    if effect.kind.first:
+        return True
+    tested = [p for p in effect.parameters(rig) if p.neutral is not None and effect.deviations.get(p.name, 0.0) > 0]
+    return not tested or any(abs(effect.values[p.name] - p.neutral) > effect.deviations[p.name] for p in tested)
 
 
 def noise_of(search: Search, best: Fit) -> np.ndarray:
@@ -251,11 +261,18 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
     return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
 
 
-def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighed, evidence: Evidence) -> Decision:
+def _with_a_second(
+    search: Search, start: Fit, singles: Sequence[Fit], weighed: Weighed, evidence: Evidence
+) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
     beside = Stepwise(search)
-    if beside.explains(beside.last):
+    if beside.is_enough:
         return beside.decision()
+    if beside.last.fit.cost < min(f.cost for f in (start, *singles)):
+        beside.run()
+        decision = beside.decision()
+        if decision.outcome == "explained":
+            return decision
     law = one_law(search, evidence)
     pairs = Pairs(search)
     explained = pairs.at_once(weighed)
@@ -263,7 +280,8 @@ def _with_a_second(search: Search, start: Fit, ahead: list[Fit], weighed: Weighe
         return weighed_against(law, search, pairs.decision(start))
     if explained:
         return pairs.decision(start)
-    beside.run()
+    if len(beside.steps) == 1:
+        beside.run()
     decision = beside.decision()
     if decision.outcome != "explained" and pairs.by_exchange():
         return pairs.decision(start)
@@ -275,12 +293,3 @@ def _beside_nominal_errors(search: Search) -> Decision:
     beside = Stepwise(search)
     beside.run()
     return beside.decision()
-
-
-def _telling(data: FitData, start: Fit) -> tuple[str, ...]:
-    """The names of the two records that say most: the largest residual against the noise, and against the signal."""
-    by_record = start.cost_by_channel.mean(axis=1)
-    scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.counted])
-    order = [int(np.argmax(by_record)), *np.argsort(-(by_record - 1.0) / scale)]
-    chosen = list(dict.fromkeys(int(i) for i in order))[:2]
-    return tuple(data.records[i].name for i in chosen)

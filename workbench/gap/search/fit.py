@@ -74,14 +74,16 @@ class _Problem:
         data: FitData,
         held: Sequence[Effect] = (),
         workers: Workers = ALONE,
+        known: np.ndarray | None = None,
+        chord: bool = False,
     ):
-        self.workers = workers
+        self.workers, self.known, self.chord = workers, known, chord
         self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
         self.coarse = data.stepped(min(SLOPE_SUBSTEPS, data.substeps))
         self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
         floor = [
-            1e-2 if p.logarithmic or p.name in COORDINATES else 1e-3 * abs(z) + 1e-9
+            1e-2 if p.logarithmic or p.name in COORDINATES or p.prior_std else 1e-3 * abs(z) + 1e-9
             for (_, p), z in zip(self.parameters, self.start, strict=True)
         ]
         self.steps = np.array(floor)
@@ -133,8 +135,17 @@ class _Problem:
                 beside = self.residual(moved, coarsely=coarsely)
             return np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j])
 
-        columns = self.workers.map(column, range(len(self.parameters)))
-        return np.array(columns).reshape(-1, residual.size).T
+        fresh = [j for j in range(len(self.parameters)) if self.known is None or j not in self.believed]
+        jacobian = np.zeros((residual.size, len(self.parameters)))
+        for j, found in zip(fresh, self.workers.map(column, fresh), strict=True):
+            jacobian[:, j] = found
+        n_values = residual.size - len(self.believed)
+        if self.known is not None:
+            jacobian[:n_values, self.believed] = self.known
+            jacobian[n_values:, self.believed] = np.diag(1.0 / self.prior_std)
+        elif self.chord:
+            self.known = jacobian[:n_values, self.believed]
+        return jacobian
 
 
 def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parameter]]:
@@ -172,6 +183,8 @@ def fit(
     iterations: int = 25,
     tolerance: float = 1e-5,
     workers: Workers = ALONE,
+    known: np.ndarray | None = None,
+    chord: bool = False,
 ) -> Fit:
     """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
 
@@ -183,8 +196,10 @@ def fit(
         iterations: at most.
         tolerance: relative decrease of the cost at which to stop.
         workers: processes that share the sensitivities, where they are many.
+        known: (n_values, n_believed) sensitivities to parameters with priors, where they are at hand.
+        chord: keep those of the first iteration; small errors move the residual all but linearly.
     """
-    problem = _Problem(rig, effects, data, held, workers)
+    problem = _Problem(rig, effects, data, held, workers, known, chord)
     free = problem.start.copy()
     residual = problem.residual(free)
     if residual is None:

@@ -4,16 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.fit import Fit, parameters_of, slopes
 from workbench.rig.rig import Rig
 
 BLOCKS = 12  # a record: long beside the correlation of what is left, many enough to scatter
-NEUTRAL = {"factor": 1.0, "gain": 1.0}  # what changes nothing; 0 for all others
-NO_STRENGTH = ("at", "x", "y", "phase", "width", "frequency", "exponent", "smoothing_speed", "yield_displacement")
-STANDS_OUT = 2.0  # deviations
 
 
 def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE) -> Fit:
@@ -62,13 +58,3 @@ def _scores(residual: np.ndarray, jacobian: np.ndarray, data: FitData) -> np.nda
         rows += [block.sum(axis=0) for block in np.array_split(products, min(BLOCKS, n_samples))]
         start = part.stop
     return np.array(rows)
-
-
-def is_significant(effect: Effect) -> bool:
-    """Whether any parameter beside the place stands out of its standard deviation; true where none was fitted."""
-    fitted = [
-        (value - NEUTRAL.get(name, 0.0), effect.deviations[name])
-        for name, value in effect.values.items()
-        if name not in NO_STRENGTH and effect.deviations.get(name, 0.0) > 0
-    ]
-    return not fitted or any(abs(strength) > STANDS_OUT * deviation for strength, deviation in fitted)

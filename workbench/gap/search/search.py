@@ -144,6 +144,19 @@ class Search:
         return self.workers.map(lambda candidate: function(self, candidate), candidates)
 
 
+def most_telling(data: FitData, by_channel: np.ndarray) -> tuple[FitData, FitData]:
+    """The two records that say most, and the first of them: largest against the noise, and against the signal.
+
+    Args:
+        by_channel: (n_records, n_outputs) mean squares of what is left, in units of the noise.
+    """
+    by_record = by_channel.mean(axis=1)
+    scale = np.array([np.mean((r.outputs.std(axis=1) / data.noise) ** 2) for r in data.counted])
+    order = [int(np.argmax(by_record)), *np.argsort(-(by_record - 1.0) / scale)]
+    names = [data.records[i].name for i in list(dict.fromkeys(int(i) for i in order))[:2]]
+    return data.only(tuple(names)).stepped(2), data.only((names[0],)).stepped(2)
+
+
 def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
     """The fits in their order, at most so many whose last effect is of one kind, none twice."""
     chosen: list[Fit] = []

@@ -7,15 +7,14 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import simpler_sets
-from workbench.gap.effects.nominal import NominalPrior, group_of, nominal_errors
+from workbench.gap.effects.nominal import NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import logging_noise, noise_found
-from workbench.gap.search.fit import Fit, fit
+from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pursuit import FINE, one_more
-from workbench.gap.search.search import Search, spread_over_kinds
-from workbench.rig.simulate import is_stepped
+from workbench.gap.search.search import Search, most_telling, spread_over_kinds
 from workbench.structure.member import Structure
 
 
@@ -26,41 +25,71 @@ class StepwiseSettings:
     Attributes:
         widest: largest standard deviation that is believed of each group of nominal errors; relative, but for damping
             (of its logarithm) and delay (of a sample). Laboratories keep within them; larger ones are effects.
+        plausible: share of the widest that errors of a careful laboratory keep within; where they are larger, an effect
+            that makes them smaller is named although they leave little.
+        shorter: description length, nats, that such an effect must save.
+        small: standard deviations below which smaller ones save nothing.
+        decisive: description length, nats, of a factor e in the power that is left above the noise.
+        last_waves: cosines of a variation in the last fit, so that intervals allow for what fewer cannot follow.
         narrowest: smallest, as a share of the widest: what is learnt to be none stays differentiable.
         rounds: of learning the sizes, at most.
         settled: share of what is left that the next round must be likely to take away.
-        iterations: of the fit in each round.
-        candidates: effects fitted on whole records at each step.
+        iterations, tolerance: of the fit in each round.
+        last_iterations, last_tolerance: of the last fit, which intervals are taken from.
+        candidates: sets fitted on whole records at each step.
+        finalists, near: how many of them are fitted to all records, and times the least cost of what may come first.
         most: effects of a set; no case of the format hides more than three.
-        excess: share of what the last step leaves above the noise that a further effect must take away. On practice
-            cases the right one takes over 0.9, the best wrong one under 0.1.
+        excess: share of what errors of the nominal model leave above the noise that the first effect must take away. On
+            practice cases the right one takes over 0.9, the best wrong one under 0.1.
+        further_excess: likewise of what other effects leave, for one more beside them: of three, two leave much.
+        promising: share of what the best candidate takes away one sample ahead that another must take away to be tried.
         ahead: share of the cost one sample ahead that the best candidate must take away to be tried at all.
         simpler: share by which a set may leave more above the noise and still be taken for being simpler.
         needless: likewise, for a set with one effect less.
         explained: share of the nominal gap's power above the noise that an explanation may leave.
+        further: likewise, that a further effect is looked for to explain.
         in_part: likewise, for effects that are named although something else is there.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         damping, stiffness: common to all modes or all along, logarithm, from which on it is an effect of its own.
     """
 
     widest: tuple[tuple[str, float], ...] = (
-        ("stiffness", 0.03),
-        ("mass", 0.03),
+        ("stiffness", 0.015),
+        ("mass", 0.015),
         ("frequency", 0.01),
-        ("damping", 0.4),
-        ("delay", 0.5),
+        ("damping", 0.25),
+        ("delay", 0.3),
     )
+    plausible: float = 0.95
+    shorter: float = 30.0
+    small: tuple[tuple[str, float], ...] = (
+        ("stiffness", 0.004),
+        ("mass", 0.004),
+        ("frequency", 0.001),
+        ("damping", 0.1),
+        ("delay", 0.1),
+    )
+    decisive: float = 300.0
+    last_waves: int = 13
     narrowest: float = 1e-3
-    rounds: int = 6
+    rounds: int = 4
     settled: float = 0.02
-    iterations: int = 3
+    iterations: int = 4
+    tolerance: float = 1e-4
+    last_iterations: int = 6
+    last_tolerance: float = 1e-7
     candidates: int = 4
+    finalists: int = 2
+    near: float = 2.0
     most: int = 4
     excess: float = 0.5
+    further_excess: float = 0.25
+    promising: float = 0.2
     ahead: float = 0.005
     simpler: float = 0.05
     needless: float = 0.3
     explained: float = 0.01
+    further: float = 1e-3
     in_part: float = 0.2
     no_gap: float = 0.15
     damping: float = 0.5
@@ -96,13 +125,35 @@ class Step:
         """Of the nominal model."""
         return self.fit.effects[-1]
 
+    @property
+    def is_plausible(self) -> bool:
+        """Whether a careful laboratory could have a nominal model with these errors."""
+        return all(
+            getattr(self.errors.target, group) < SETTINGS.plausible * widest for group, widest in SETTINGS.widest
+        )
+
+    def description(self, noise_power: np.ndarray) -> float:
+        """Description length, nats, of what is left above that noise and of the errors."""
+        left = SETTINGS.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
+        for group, small in SETTINGS.small:
+            size = getattr(self.errors.target, group)
+            count = sum(group_of(name) == group for name in self.errors.values)
+            left += count * np.log(max(size, small) / small)
+        return float(left)
+
     def excess(self, noise_power: np.ndarray) -> float:
         """Mean square left above that noise, in units of the stated one."""
         return float(np.maximum(self.fit.cost_by_channel - noise_power, 0.0).mean())
 
 
 def fit_jointly(
-    search: Search, effects: Sequence[Effect], errors: Effect, *, rounds: int = SETTINGS.rounds, finely: bool = False
+    search: Search,
+    effects: Sequence[Effect],
+    errors: Effect,
+    *,
+    rounds: int = SETTINGS.rounds,
+    known: np.ndarray | None = None,
+    to_the_end: bool = False,
 ) -> Step:
     """Effects and nominal errors fitted together, the sizes of the errors learnt from the records.
 
@@ -115,36 +166,45 @@ def fit_jointly(
         effects: with values to start from.
         errors: of the nominal model, likewise.
         rounds: of sizes.
-        finely: by fine steps of time, where a law needs them.
+        known: (n_values, n_errors) sensitivities to the errors on the two most telling records, in units of the stated
+            noise, where they are at hand: then the fit is of these records alone.
+        to_the_end: until no step lowers the cost, by fine steps of time where a law needs them.
     """
-    data = search.data.stepped(FINE if finely else 4)
-    before = np.inf
-    for _ in range(rounds):
+    substeps = FINE if to_the_end else 4
+    if to_the_end and errors.target.waves < SETTINGS.last_waves:
+        errors = nominal_errors(search.rig, replace(errors.target, waves=SETTINGS.last_waves), errors.values)
+    whole, before = search.data.stepped(substeps), np.inf
+    for i in range(rounds):
+        # the two most telling records lead the way
+        quickly = known is not None or (i == 0 and not to_the_end)
+        data = search.quick.stepped(substeps) if quickly else whole
         left = data.residual(apply_all(search.rig, (*effects, errors)))
         level = max(float(left @ left) / left.size, 1.0)
-        if level > (1.0 - SETTINGS.settled) * before:
+        if level > (1.0 - SETTINGS.settled) * before and not to_the_end:
             break
-        before = level
+        before = level if known is not None or not quickly else np.inf
         tempered = data.with_noise(data.noise * np.sqrt(level))
         found = fit(
             search.rig,
             (*effects, errors),
             tempered,
-            iterations=SETTINGS.iterations,
-            tolerance=1e-4,
+            iterations=SETTINGS.last_iterations if to_the_end else SETTINGS.iterations,
+            tolerance=SETTINGS.last_tolerance if to_the_end else SETTINGS.tolerance,
             workers=search.workers,
+            known=None if known is None else known / np.sqrt(level),
+            chord=not to_the_end,
         )
         *effects, errors = found.effects
         errors = _resized(errors)
     residuals = [
         record.outputs - predicted
         for record, predicted in zip(
-            data.counted, data.predictions(apply_all(search.rig, (*effects, errors))), strict=True
+            whole.counted, whole.predictions(apply_all(search.rig, (*effects, errors))), strict=True
         )
     ]
-    by_channel = np.array([((r / data.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+    by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
     step = replace(found, effects=(*effects, errors), cost=float(by_channel.mean()), cost_by_channel=by_channel)
-    sensor_noise = (noise_found(residuals) / data.noise) ** 2
+    sensor_noise = (noise_found(residuals) / whole.noise) ** 2
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
     return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
@@ -159,8 +219,9 @@ def _resized(errors: Effect) -> Effect:
         if group not in prior.groups:
             continue
         names = [name for name in errors.values if group_of(name) == group]
-        values = np.array([errors.values[name] for name in names])
-        spread = np.array([errors.deviations[name] for name in names])
+        weights = np.array([weight_of(name, prior) for name in names])
+        values = np.array([errors.values[name] for name in names]) / weights
+        spread = np.array([errors.deviations[name] for name in names]) / weights
         known = np.clip(1.0 - (spread / getattr(prior, group)) ** 2, 0.0, 1.0).sum()
         size = np.sqrt((values**2).sum() / max(known, 1e-3))
         sizes[group] = float(np.clip(size, SETTINGS.narrowest * widest, widest))
@@ -199,24 +260,29 @@ class Stepwise:
 
     def run(self) -> None:
         """Add effects as long as each takes most of what is left above the noise."""
-        while len(self.last.effects) < SETTINGS.most and not self.explains(self.last):
+        while len(self.last.effects) < SETTINGS.most and not self.is_enough:
             step = self._with_one_more(self.last)
             if step is None:
                 break
             self.steps.append(step)
             self.steps.append(self._without_needless(step))
         self.steps.append(self._promoted(self.last))
-        if any(is_stepped(apply_all(self.search.rig, (e,))) for e in self.last.effects):
-            self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=1, finely=True))
+        if self.last.effects:
+            self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether the last set leaves nothing that is worth another effect."""
+        left = self.explains(self.last) or (self.last.effects and self.unexplained < SETTINGS.further)
+        return bool(left and self.last.is_plausible)
 
     def explains(self, step: Step) -> bool:
-        """Whether next to nothing is left but noise."""
-        excess = step.excess(step.noise_power)
-        return excess < SETTINGS.no_gap * step.noise_power.mean()
+        """Whether next to nothing is left but noise of the sensors."""
+        return step.excess(step.sensor_noise) < SETTINGS.no_gap * float(step.sensor_noise.mean())
 
     @property
     def unexplained(self) -> float:
-        """Share of the nominal gap's power above the noise that the last set leaves."""
+        """Share of the nominal gap's power that the last set leaves above noise of sensors and logged inputs."""
         return self.last.excess(self.last.noise_power) / self._gap
 
     @property
@@ -227,41 +293,74 @@ class Stepwise:
         """What the effects of the last set explain."""
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
-        enough = self.explains(self.last) or left < SETTINGS.explained
-        if enough or (len(effects) > 1 and left < SETTINGS.in_part):
-            return Decision("explained" if effects else "none", self.last.fit, noise=noise)
+        quiet = self.last.excess(self.last.noise_power) < SETTINGS.no_gap * float(self.last.noise_power.mean())
+        enough = quiet or left < SETTINGS.explained
+        if effects and (enough or (len(effects) > 1 and left < SETTINGS.in_part)):
+            return Decision("explained", self.last.fit, noise=noise)
+        if enough:
+            return Decision("none", self.last.fit, noise=noise)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise)
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
-        search = self.search
+        quick, first = most_telling(self.search.data, step.fit.cost_by_channel)
+        self.search = search = replace(self.search, quick=quick, first=first)
         search.report("another effect beside small errors of the model", 0.5 + 0.1 * len(step.effects))
+        # errors fitted to whole records have taken what they can: what they leave tells of an effect that is missing
         beside = search.beside(step.errors)
-        rig = apply_all(search.rig, (*step.effects, step.errors))
-        left = beside.ahead.residual(rig)
-        ahead = one_more(beside, step.effects, Evidence.of(rig, search.data, workers=search.workers))
-        if not ahead or ahead[0].cost > (1.0 - SETTINGS.ahead) * (left @ left) / left.size:
+        rig = apply_all(search.rig, step.fit.effects)
+        residual = beside.ahead.residual(rig)
+        left = float(residual @ residual) / residual.size
+        evidence = Evidence.of(rig, search.data, workers=search.workers)
+        ahead = one_more(beside, step.effects, evidence)
+        if not ahead or ahead[0].cost > (1.0 - SETTINGS.ahead) * left:
             return None
-        chosen = spread_over_kinds(ahead, 1)[: SETTINGS.candidates]
-        tried = self._fitted([candidate.effects for candidate in chosen], step)
-        best = self._simplest(min(tried, key=lambda s: s.fit.cost), tried)
-        noise = np.minimum(best.noise_power, step.noise_power)
-        return best if best.excess(noise) < (1.0 - SETTINGS.excess) * step.excess(noise) else None
+        best = self._best_of(spread_over_kinds(ahead, 1), step, left)
+        return best if self._is_worth(best, step) else None
 
-    def _fitted(self, sets: Sequence[tuple[Effect, ...]], step: Step) -> list[Step]:
+    def _best_of(self, ahead: Sequence[Fit], step: Step, left: float) -> Step:
+        """The best on whole records of sets that are the likeliest one sample ahead, best first."""
+        enough = left - SETTINGS.promising * (left - ahead[0].cost)
+        chosen = [f for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
+        tried = self._fitted([candidate.effects for candidate in chosen], step, self._slopes(step))
+        tried.sort(key=lambda s: s.fit.cost)
+        near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
+        whole = sorted((self._whole(s) for s in near), key=lambda s: s.fit.cost)
+        return self._simplest(whole[0], whole[1:])
+
+    def _is_worth(self, best: Step, step: Step) -> bool:
+        """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
+        noise = np.minimum(best.sensor_noise, step.sensor_noise)
+        worth = SETTINGS.further_excess if step.effects else SETTINGS.excess
+        if not self.explains(step) and best.excess(noise) < (1.0 - worth) * step.excess(noise):
+            return True
+        saved = step.description(noise) - best.description(noise)
+        return not step.is_plausible and saved > SETTINGS.shorter
+
+    def _slopes(self, step: Step) -> np.ndarray:
+        """Sensitivities (n_values, n_errors) to errors beside the effects of a step, on the most telling records."""
+        search = self.search
+        return slopes(search.rig, (step.errors,), search.quick, step.effects, search.workers)[1]
+
+    def _fitted(self, sets: Sequence[tuple[Effect, ...]], step: Step, known: np.ndarray) -> list[Step]:
+        """Sets beside errors that start as those of a step, fitted to the most telling records."""
         return self.search.workers.map(
-            lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2), list(sets)
+            lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2, known=known), list(sets)
         )
+
+    def _whole(self, step: Step) -> Step:
+        """The step fitted to all records."""
+        return fit_jointly(self.search, step.effects, step.errors, rounds=2)
 
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best, or a set that it comes to at bounds of its parameters, where that leaves hardly more."""
         keys = {step.fit.key for step in tried}
         fresh = [e for e in simpler_sets(best.effects, self.search.rig) if _key(e, best) not in keys]
-        enough = (1.0 + SETTINGS.simpler) * max(best.excess(best.noise_power), SETTINGS.simpler)
+        enough = (1.0 + SETTINGS.simpler) * max(best.excess(best.sensor_noise), SETTINGS.simpler)
         fewer = [
             step
-            for step in (*tried, *self._fitted(fresh, best))
-            if step.fit.n_parameters < best.fit.n_parameters and step.excess(best.noise_power) < enough
+            for step in (*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0))))
+            if step.fit.n_parameters < best.fit.n_parameters and step.excess(best.sensor_noise) < enough
         ]
         return min(fewer, key=lambda s: (s.fit.n_parameters, s.fit.cost)) if fewer else best
 
@@ -269,10 +368,10 @@ class Stepwise:
         """The set without effects that a later one has made needless."""
         if len(step.effects) < 2:
             return step
-        fewer = self._fitted(list(_each_left_out(step.effects)), step)
+        fewer = self._fitted(list(_each_left_out(step.effects)), step, self._slopes(step))
         best = min(fewer, key=lambda s: s.fit.cost)
-        enough = (1.0 + SETTINGS.needless) * max(step.excess(step.noise_power), SETTINGS.simpler)
-        return self._without_needless(best) if best.excess(step.noise_power) < enough else step
+        enough = (1.0 + SETTINGS.needless) * max(step.excess(step.sensor_noise), SETTINGS.simpler)
+        return self._without_needless(best) if best.excess(step.sensor_noise) < enough else step
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small, and common to all, as effects of their own."""
