@@ -199,7 +199,7 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
         (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
-        (("place", "{rig}", "--control", 4, "--forbid", "0.5:10"), "find room for 3 on the stretches left"),
+        (("place", "{rig}", "--control", 4, "--forbid", "0.5:10"), "find room for 3 on the intervals left"),
         (("place", "{rig}", "--control", 9), "residual"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ class StepwiseSettings:
         ("mass", 0.015),
         ("frequency", 0.01),
         ("damping", 0.25),
-        ("delay", 0.3),
+        ("delay", 0.5),
     )
     plausible: float = 0.95
     shorter: float = 30.0
@@ -214,7 +215,7 @@ def _resized(errors: Effect) -> Effect:
     """The errors with prior deviations as large as the records make them."""
     prior = errors.target
     assert isinstance(prior, NominalPrior)
-    sizes = {}
+    sizes: dict[str, Any] = {}
     for group, widest in SETTINGS.widest:
         if group not in prior.groups:
             continue
