@@ -9,7 +9,7 @@ from workbench.cases.case import Case
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
+from workbench.structure.member import Beam, Structure
 from workbench.structure.profile import Profile
 from workbench.structure.supports import NAMED_ENDS, End
 
@@ -45,6 +45,8 @@ def _structure(rig: Rig) -> str:
     member = rig.structure
     if member is None:
         raise ValueError("a rig without its structure cannot be written; a case folder tells a beam or a rod")
+    if not isinstance(member, Structure):
+        raise ValueError("a plate or a finite-element model cannot be written yet; a case folder tells a beam or a rod")
     if member.attachments:
         raise ValueError(f"the case format knows no attachments; take {member.attachments[0]} out of the nominal model")
     damping = np.unique(np.asarray(getattr(member.damping, "zeta", np.nan)))

@@ -7,6 +7,8 @@ from rich.table import Table
 
 from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, read_structure_rig
 from workbench.cli.terminal import JsonPath, console, guarded, say, write_json
+from workbench.structure.domain import position
+from workbench.structure.member import Structure
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
@@ -67,8 +69,8 @@ def design(
     for why in refused:
         say(f"  {why}")
     console.print(table)
-    mass = None if found.structure is None else found.structure.mass_per_length
-    tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
+    mass = found.structure.mass_per_length if isinstance(found.structure, Structure) else None
+    tried = through_sensors(modes, laws, [position(s.at) for s in found.sensors], mass)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
     sensed = Table(

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval
+from workbench.structure.domain import Interval, position
 
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
@@ -38,4 +38,4 @@ def impulse_place(rig: Rig, at: float | None) -> float:
     hammers = [actuator.at for actuator in rig.actuators if actuator.direct]
     if at is None and not hammers:
         raise ValueError("the place of the impulse is missing: give --impulse-at, or an [[input]] of kind hammer")
-    return hammers[0] if at is None else at
+    return position(hammers[0]) if at is None else at

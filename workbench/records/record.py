@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from workbench.structure.domain import Place
+from workbench.structure.domain import Where
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted, place_text
 
@@ -41,7 +41,7 @@ class Channel:
     name: str
     quantity: str = ""
     unit: str = ""
-    at: Place | None = None
+    at: Where | None = None
     noise_std: float | None = None
 
     def __post_init__(self) -> None:

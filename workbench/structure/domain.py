@@ -32,6 +32,17 @@ class PlaceError(ValueError):
     """A place that a structure does not have, or a direction that it does not have there."""
 
 
+def position(place: Where) -> float:
+    """A place as a position along an interval, m.
+
+    Raises:
+        PlaceError: a pair, a name, or two places.
+    """
+    if isinstance(place, tuple | str):
+        raise PlaceError(f"a place along an interval is a position x in m; got {place!r}")
+    return float(place)
+
+
 @dataclass(frozen=True)
 class Interval:
     """Places along a bar or beam: x from 0 to `length`, m.
@@ -193,7 +204,7 @@ class Rectangle:
         """How a place is written: (x, y) = (0.63, 0.72)."""
         if isinstance(place, Between):
             return f"between {self.text(place.first)} and {self.text(place.second)}"
-        x, y = place  # type: ignore[misc]
+        (x, y), *_ = self.locate(place)
         return f"(x, y) = ({x:.3g}, {y:.3g})"
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
-from workbench.structure.domain import Interval
+from workbench.structure.domain import Interval, position
 from workbench.structure.modes import Modes
 from workbench.structure.polynomials import Segments
 from workbench.structure.printed import Printed
@@ -91,7 +91,7 @@ class _Member(Printed):
         for part in self.attachments:
             # a node at an attachment keeps its kink out of the polynomials
             if np.abs(nodes - part.at).min() >= self._thinnest(continuity):
-                nodes = np.sort(np.r_[nodes, part.at, self._graded(part.at, stiffness)])
+                nodes = np.sort(np.r_[nodes, part.at, self._graded(position(part.at), stiffness)])
         if nodes.size > MOST_SEGMENTS:
             raise ValueError(
                 f"the profiles and attachments of the structure make {nodes.size - 1} segments; at most"
@@ -186,11 +186,11 @@ class _Member(Printed):
         for part in self.attachments:
             if isinstance(part, PointMass):
                 for derivative, value in enumerate((part.mass, part.rotary_inertia)):
-                    row = self._seen_at(segments, part.at, derivative)
+                    row = self._seen_at(segments, position(part.at), derivative)
                     mass += value * row.T @ row
             elif isinstance(part, PointSpring):
                 for derivative, value in enumerate((part.stiffness, part.rotational_stiffness)):
-                    springs.append((value, self._seen_at(segments, part.at, derivative)))
+                    springs.append((value, self._seen_at(segments, position(part.at), derivative)))
         for spring, row in springs:
             rigidity += spring * row.T @ row
         free = np.setdiff1d(np.arange(segments.n_functions), held)
@@ -251,7 +251,7 @@ class _Member(Printed):
             if isinstance(part, PointDamper):
                 for derivative, value in enumerate((part.coefficient, part.rotational_coefficient)):
                     if value:
-                        row = self._seen_at(segments, part.at, derivative) @ coefficients
+                        row = self._seen_at(segments, position(part.at), derivative) @ coefficients
                         matrix = matrix + value * row.T @ row
         return matrix
 
@@ -310,8 +310,9 @@ class Bar(_Member):
     def __post_init__(self) -> None:
         self._prepare(("fixed", "free"), "axial_stiffness")
         for part in self.attachments:
-            end = 0.0 if part.at < 0.5 * self.length else self.length
-            on_end = abs(part.at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)
+            at = position(part.at)
+            end = 0.0 if at < 0.5 * self.length else self.length
+            on_end = abs(at - end) < NO_SLIVER * self.length and isinstance(part, PointSpring | PointMass)
             if on_end and self._is_tip(end, self.axial_stiffness):
                 raise ValueError(
                     f"{part} stands on a tip: axial_stiffness vanishes at x = {end:g}, where a point force moves the"

@@ -11,6 +11,7 @@ from scipy.sparse.linalg import eigsh
 from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functional, MeshLine
 from skfem.helpers import d, dd
 
+from workbench.structure.domain import position
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.supports import HELD
@@ -202,7 +203,7 @@ def _hold_ends(stiffness, basis: Basis, member: Structure, altered: Alterations)
 
 
 def _attached(member: Structure, name: str) -> list[tuple[float, float]]:
-    return [(part.at, getattr(part, name)) for part in member.attachments if hasattr(part, name)]
+    return [(position(part.at), getattr(part, name)) for part in member.attachments if hasattr(part, name)]
 
 
 def _typical(member: Structure) -> float:

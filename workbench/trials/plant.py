@@ -9,6 +9,7 @@ from scipy.special import ndtr
 
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.member import Structure
 from workbench.trials import motion
 from workbench.trials.finite_elements import Alterations, ElementModes, element_modes, modal_modes
 
@@ -79,6 +80,7 @@ class Plant:
         if self.nominal.structure is None:
             modes = modal_modes(self.nominal.modes, places, altered=self.altered)
         else:
+            assert isinstance(self.nominal.structure, Structure), "trials are made on bars, beams and named points"
             modes = element_modes(self.nominal.structure, np.array(places, float), self.n_modes, altered=self.altered)
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
         inputs, sensors, laws, tones, noises, field = shapes
@@ -175,7 +177,7 @@ class SolvedPlant:
             edges,
             steps,
         )
-        return ModalMotion(*pieces[:, 0], np.r_[0.0, edges[:-1]], pieces), sent
+        return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """What perfect sensors would read, each after its delay, (n_outputs, n_samples)."""

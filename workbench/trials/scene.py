@@ -56,11 +56,17 @@ class Scene:
         domain = self.bench.rig.modes.domain
         if isinstance(domain, Rectangle):
             raise Unsuitable("trials are made on bars, beams and named points")
-        named = isinstance(domain, NamedPoints)
-        grid = np.array(domain.names) if named else np.linspace(0.05, 1.0, 96) * domain.size
+        if isinstance(domain, NamedPoints):
+            grid = np.array(domain.names)
+        else:
+            grid = np.linspace(0.05, 1.0, 96) * domain.size
         rms = np.sqrt(np.mean((self.bench.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
         at = rng.choice(grid[rms > rms.max() / 3])
-        return str(at) if named else round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
+        return (
+            str(at)
+            if isinstance(domain, NamedPoints)
+            else round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
+        )
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
         """Noise-free gap between a plant and the nominal one, or another, at the middle level."""

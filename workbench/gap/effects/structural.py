@@ -1,6 +1,6 @@
 """Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
@@ -40,7 +40,8 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
     """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many."""
     facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
     facts["edges"] = tuple(surface.edges.items())
-    return attach(_bare_modes(type(surface), tuple(facts.items()), n_modes), _attachments(surface), kept=n_modes)
+    kind: Hashable = type(surface)
+    return attach(_bare_modes(kind, tuple(facts.items()), n_modes), _attachments(surface), kept=n_modes)
 
 
 def _attachments(structure: object) -> tuple[Attachment, ...]:
@@ -48,7 +49,7 @@ def _attachments(structure: object) -> tuple[Attachment, ...]:
 
 
 @lru_cache(maxsize=16)
-def _bare_modes(kind: type, facts: tuple, n_modes: int) -> Modes:
+def _bare_modes(kind: Any, facts: tuple, n_modes: int) -> Modes:
     """Modes of a plate or membrane without attachments, as many as tell what one does to the lowest `n_modes`."""
     surface = kind(**{**dict(facts), "edges": dict(dict(facts)["edges"])})
     in_closed_form = getattr(surface, "is_navier", False)
@@ -70,7 +71,7 @@ def solved_once(change: Callable[[Rig, Any, dict[str, float]], Rig]) -> Callable
 
 
 def _member(rig: Rig) -> Structure:
-    if rig.structure is None:
+    if not isinstance(rig.structure, Structure):
         raise ValueError("plain modal data have no structure to change; describe it as a beam or a rod")
     return rig.structure
 

@@ -116,12 +116,12 @@ class Evidence:
         return wandering_force_filter(modes, self.model, modes.phi_at(where), rms, memory * sample_time, sample_time)
 
     @cached_property
-    def places(self) -> Sequence[Any]:
+    def places(self) -> Any:
         """Where an unmodelled force is looked for: all over the structure, or at named points and between them."""
         if isinstance(self.domain, Interval):
             return self.domain.length * np.arange(1, self.n_places) / self.n_places
         if isinstance(self.domain, NamedPoints):
-            places = (*self.domain.grid(), *self.domain.pairs())
+            places: tuple[Any, ...] = (*self.domain.grid(), *self.domain.pairs())
             moved = [float(np.abs(self.rig.modes.phi_at(where)).max()) for where in places]
             return tuple(where for where, size in zip(places, moved, strict=True) if size > STILL * max(moved))
         return self.domain.grid(self._along)
@@ -172,7 +172,7 @@ class Evidence:
     def _misfits(self, places: Sequence[Any]) -> np.ndarray:
         """What one force of any law at each of the places leaves, in units of the noise."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        return sum(screened(lines, shapes) for lines in self._lines)
+        return np.sum([screened(lines, shapes) for lines in self._lines], axis=0)
 
     @cached_property
     def _lines(self):
@@ -226,7 +226,7 @@ class Evidence:
             return self.told
         if not isinstance(self.domain, Interval):
             return self._screened
-        profile, places = self.profile, self.places
+        profile, places = self.profile, np.asarray(self.places, float)
         padded = np.r_[-np.inf, profile, -np.inf]
         tops = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
         refined = self.workers.map(self._refined, places[tops[np.argsort(-profile[tops])][:MOST_PEAKS]])

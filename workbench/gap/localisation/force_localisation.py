@@ -58,13 +58,14 @@ def placed(evidence: Evidence) -> Placed:
     lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
     search = _Search(evidence, lines)
     telling = search.telling(guess)
+    at: Any
     if isinstance(domain, Interval):
         profile = search.along(telling, places)
-        at = min(evidence.workers.map(search.refined, _valleys(places, profile)), key=search.judged)
+        at = min(evidence.workers.map(search.refined, _valleys(np.asarray(places, float), profile)), key=search.judged)
         telling = search.telling(at)
         profile, std = search.along(telling, places), search.deviation(telling, at)
     elif isinstance(domain, Rectangle):
-        at, std = min(map(search.refined_over, evidence.peaks), key=lambda found: search.judged(found[0]))
+        at, std = min(map(search.refined_over, evidence.peaks), key=lambda each: search.judged(each[0]))
         telling = search.telling(at)
         profile = search.screened(telling, places)
     else:
@@ -131,11 +132,12 @@ class _Search:
     def screened(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:
         """About the misfit at each of many places: the ends of the records are left out."""
         shapes = np.array([self.shape(where) for where in places])
-        return sum(screened(each, shapes) for each in lines)
+        return np.sum([screened(each, shapes) for each in lines], axis=0)
 
     def refined_over(self, top: tuple[float, float]) -> tuple[tuple[float, float], float]:
         """The bottom of a valley over a rectangle, and one standard deviation along its longer axis, m."""
         rectangle, telling = self.evidence.domain, self.telling(top)
+        assert isinstance(rectangle, Rectangle)
         extent = np.array(rectangle.length)
 
         def misfit(xy: np.ndarray) -> float:

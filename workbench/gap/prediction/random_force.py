@@ -109,7 +109,7 @@ def fit_random_force(
         for share in (3e-3, 3e-2, 3e-1)
         for memory, stages in COLOURS
     ]
-    start, beside, stages = min(grid, key=lambda candidate: loss(*candidate, quick))
+    start, beside, stages = min(grid, key=lambda each: loss(each[0], each[1], each[2], quick))
     simplex = start + np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, 0.03), 0.5, 0.7])])
     options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 160}
     found = minimize(loss, start, args=(beside, stages, residuals), method="Nelder-Mead", options=options)

@@ -105,9 +105,9 @@ def budget_of(
     weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
     total = weights.sum(axis=0)
     taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
-    order = sorted(range(len(effects)), key=lambda i: -taken[i].sum())
-    rows = [*taken[order], taken[-1] if errors is not None else np.zeros_like(left)]
-    order = [effects[i] for i in order]
+    by_size = sorted(range(len(effects)), key=lambda i: -taken[i].sum())
+    rows = [*taken[by_size], taken[-1] if errors is not None else np.zeros_like(left)]
+    order = [effects[i] for i in by_size]
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     for i, effect in enumerate(order):  # what no model can predict is theirs

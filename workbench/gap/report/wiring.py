@@ -139,7 +139,8 @@ def _repeated(records: Sequence[Record]) -> list[WiringFault]:
 
 def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
     """Outputs with the same samples: noise differs from sensor to sensor, so one is a copy."""
-    faults, gone = [], set()
+    faults: list[WiringFault] = []
+    gone: set[int] = set()
     for i, j in combinations(range(len(rig.sensors)), 2):
         one, other = rig.sensors[i], rig.sensors[j]
         alike = (one.at, one.quantity) == (other.at, other.quantity) and not one.noise_std + other.noise_std
@@ -150,7 +151,8 @@ def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
         for record in records:
             predicted = _predict(rig, record)
             errors.append(np.array([((record.outputs[k] - predicted[k]) ** 2).mean() for k in (i, j)]))
-        copy = j if sum(errors)[0] <= sum(errors)[1] else i
+        of_one, of_other = np.sum(errors, axis=0)
+        copy = j if of_one <= of_other else i
         gone.add(copy)
         kept = i + j - copy
         faults.append(
@@ -324,8 +326,8 @@ def _quantities(rig, records, gap, predicted, before, wide) -> list[WiringFault]
         here = [j for j in np.flatnonzero(wide) if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
         if not here:
             continue
-        names = {rig.sensors[j].name for j in here}
-        closed = gap.closed(before, gap.power([_predict(_relabelled(rig, names, quantity), r) for r in records]))
+        every = {rig.sensors[j].name for j in here}
+        closed = gap.closed(before, gap.power([_predict(_relabelled(rig, every, quantity), r) for r in records]))
         for j in here:
             if closed[j] >= CLOSED:
                 meant.setdefault((rig.sensors[j].quantity, quantity), []).append(int(j))
