@@ -1,6 +1,6 @@
 """Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
@@ -40,7 +40,7 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
     """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many."""
     facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
     facts["edges"] = tuple(surface.edges.items())
-    kind: Hashable = type(surface)
+    kind: Any = type(surface)
     return attach(_bare_modes(kind, tuple(facts.items()), n_modes), _attachments(surface), kept=n_modes)
 
 
