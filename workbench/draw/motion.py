@@ -1,6 +1,7 @@
 """Motion as plain numbers, for a page to move: shapes along the structure and modal coordinates over time."""
 
 from collections.abc import Mapping, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -91,8 +92,8 @@ def mode_motion(
 
 def _places(actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict:
     return {
-        "actuators": [{"name": a.name, "at": float(a.at)} for a in actuators],
-        "sensors": [{"name": s.name, "at": float(s.at)} for s in sensors],
+        "actuators": [{"name": a.name, "at": float(cast(float, a.at))} for a in actuators],
+        "sensors": [{"name": s.name, "at": float(cast(float, s.at))} for s in sensors],
     }
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from workbench.design.loop.closed_loop import Response
@@ -130,7 +131,7 @@ def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np
     return x, y, fields
 
 
-def _coloured(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, limit: float):  # type: ignore[no-untyped-def]
+def _coloured(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, limit: float) -> QuadContourSet:
     levels = limit * np.linspace(-1.0, 1.0, 2 * LEVELS + 1)
     return ax.contourf(x, y, field.T, levels=levels, cmap="RdBu_r", extend="both")
 

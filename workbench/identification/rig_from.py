@@ -128,9 +128,9 @@ def _of_residues(
         j, i = pair
         ratio = at_in[i] / np.where(at_out[j] == 0, np.nan, at_out[j])
         if not (ratio > 0).all():
-            r = int(np.argmin(np.where(np.isnan(ratio), -np.inf, ratio)))
+            worst = int(np.argmin(np.where(np.isnan(ratio), -np.inf, ratio)))
             raise ValueError(
-                f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz has a negative mass at the driving point"
+                f"mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz has a negative mass at the driving point"
                 f" ({into[i].name}, {out[j].name}): is a sensor turned round, or is the mode noise?"
             )
     elif modal_masses is not None:
@@ -164,7 +164,7 @@ def _of_shapes(
 def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:
     masses = np.broadcast_to(np.asarray(modal_masses, float), (n_modes,))
     if not (np.isfinite(masses).all() and (masses > 0).all()):
-        raise ValueError(f"modal_masses must be positive, kg, one a mode; got {modal_masses}")
+        raise ValueError(f"modal_masses must be positive, kg, one a mode; got {modal_masses!s}")
     return masses
 
 
@@ -173,11 +173,11 @@ def _pair(
 ) -> tuple[int, int] | None:
     """Indices of an output and the input at its place."""
     if driving_point is not None:
-        i = [channel.name for channel in into]
-        j = [channel.name for channel in out]
-        if driving_point[0] not in i or driving_point[1] not in j:
-            raise ValueError(f"driving_point is (input, output), of {', '.join(i)} and {', '.join(j)}")
-        return j.index(driving_point[1]), i.index(driving_point[0])
+        acts = [channel.name for channel in into]
+        reads = [channel.name for channel in out]
+        if driving_point[0] not in acts or driving_point[1] not in reads:
+            raise ValueError(f"driving_point is (input, output), of {', '.join(acts)} and {', '.join(reads)}")
+        return reads.index(driving_point[1]), acts.index(driving_point[0])
     for j, measured in enumerate(out):
         for i, acting in enumerate(into):
             same_place = measured.at is not None and measured.at == acting.at

@@ -141,7 +141,7 @@ def _verdict(content: dict) -> dict:
     return {
         "title": f"Diagnosis of {content['case']}",
         "lead": _words([content["sentence"]])[0],
-        "standing": STANDING_OF.get(content.get("outcome"), ""),
+        "standing": STANDING_OF.get(content.get("outcome", ""), ""),
         "lines": _words([*content.get("notes", []), *filter(None, [content.get("next_experiment")])]),
         "blocks": [block(plot_gaps(gap), "The gap before and after, over the noise floor.")] if gaps else [],
         "tables": [table for table in tables if table[2]],

@@ -63,7 +63,7 @@ def run(
         if key not in records
     }
     _report(report, len(records), len(set(keys)))
-    unkept = []
+    unkept: list[str] = []
     for key, record in _computed(function, list(jobs.values()), workers, scheduler):
         records[key] = record
         if folder is not None and scheduler:

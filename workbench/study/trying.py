@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from scipy.integrate import simpson
@@ -18,6 +19,7 @@ from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval
+from workbench.structure.member import Bar, Beam
 from workbench.study.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -115,8 +117,8 @@ def start(rig: Rig) -> Design:
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size == 0:
         raise StudyError("the structure has no elastic mode; ask for more modes")
-    places = sorted({a.at for a in rig.actuators if not a.direct}) or [0.37 * rig.modes.length]
-    struck = next((a.at for a in rig.actuators if a.direct), 0.63 * rig.modes.length)
+    places = sorted({cast(float, a.at) for a in rig.actuators if not a.direct}) or [0.37 * rig.modes.length]
+    struck = next((cast(float, a.at) for a in rig.actuators if a.direct), 0.63 * rig.modes.length)
     count = min(len(places), rig.modes.n_modes)
     return Design(tuple(places), (), count, (20.0,) * count, LAWS[0], struck, float(2.0 * np.pi / elastic[0]))
 
@@ -145,7 +147,8 @@ def try_out(rig: Rig, design: Design) -> Tried:
     through = None
     if design.sensors and rig.structure is not None:
         kept = modes.select(range(design.controlled))
-        through = displacement_filter(kept, sorted(design.sensors), rig.structure.mass_per_length)
+        member = cast(Bar | Beam, rig.structure)
+        through = displacement_filter(kept, sorted(design.sensors), member.mass_per_length)
     loop = close_loop(modes, law, through)
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:

@@ -12,6 +12,7 @@ an impulse before it. Noise that is not white is weighted line by line of the co
 
 from collections.abc import Sequence
 from math import factorial
+from typing import Any
 
 import numpy as np
 from scipy.fft import next_fast_len
@@ -244,7 +245,8 @@ def _sources(pole: complex, dt: float, straight: bool) -> tuple[tuple[complex, c
     """c_0, c_1 and their derivatives by λ."""
     x = pole * dt
     powers = x ** np.arange(TERMS)
-    (phi1, phi1_slope), (phi2, phi2_slope) = ((s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES)
+    sums: list[Any] = [(s @ powers, s[1:] * np.arange(1, TERMS) @ powers[:-1]) for s in SERIES]
+    (phi1, phi1_slope), (phi2, phi2_slope) = sums
     if not straight:
         return (dt * phi1, 0.0), (dt**2 * phi1_slope, 0.0)
     return (dt * (phi1 - phi2), dt * phi2), (dt**2 * (phi1_slope - phi2_slope), dt**2 * phi2_slope)

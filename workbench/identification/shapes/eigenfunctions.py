@@ -7,7 +7,7 @@ go by leaving out the knots nearest that end ("not a knot"), which assumes nothi
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -269,7 +269,7 @@ def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[Point
     if mass_per_length is None and len(point_masses):
         raise ValueError("point masses count beside a mass distribution; give mass_per_length too")
     for point in point_masses:
-        if not 0.0 <= point.at <= length:
+        if not 0.0 <= cast(float, point.at) <= length:
             raise ValueError(f"the point mass at x = {point.at:g} lies outside the structure, 0 to {length:g}")
     return Inertia(as_profile(1.0 / length if mass_per_length is None else mass_per_length), tuple(point_masses))
 

@@ -13,6 +13,7 @@ the nodes next to it has a kink that travels, which the sum follows to a few par
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import cast
 
 import numpy as np
 from scipy.linalg import eigh
@@ -217,7 +218,7 @@ class _Mesh:
         nominal, order = series.nominal, series.order
         m, k = nominal.mass_per_length, series.nominal_stiffness
         places = [*m.breaks, *k.breaks, *series.mass.breaks, *series.stiffness.breaks]
-        nodes = _nodes([*places, *edges, *(part.at for part in nominal.attachments)], nominal.length)
+        nodes = _nodes([*places, *edges, *(cast(float, part.at) for part in nominal.attachments)], nominal.length)
         degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / nominal.length)) + 12 + EXTRA_DEGREES
         segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
         x, weights, (values, slopes, strains) = _tables(segments, order)
@@ -268,7 +269,7 @@ def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndar
         add(stiffness, at, [0.0 if spring == HELD else spring for spring in springs])
     for part in nominal.attachments:
         if isinstance(part, PointMass):
-            add(mass, part.at, (part.mass, part.rotary_inertia))
+            add(mass, cast(float, part.at), (part.mass, part.rotary_inertia))
         elif isinstance(part, PointSpring):
-            add(stiffness, part.at, (part.stiffness, part.rotational_stiffness))
+            add(stiffness, cast(float, part.at), (part.stiffness, part.rotational_stiffness))
     return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), held)
