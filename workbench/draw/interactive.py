@@ -86,7 +86,7 @@ def _axis(ax: Axes, axis, limits, scale: str, shared, axes: list[Axes]) -> dict:
 
 
 def _artists(ax: Axes) -> list:
-    bars = [c for c in ax.containers if isinstance(c, BarContainer)]
+    bars = [c for c in ax.containers if isinstance(c, BarContainer) and c.patches]
     of_bars = {id(patch) for c in bars for patch in c.patches}
     alone = [a for a in (*ax.collections, *ax.images, *ax.patches, *ax.lines, *ax.texts) if a.get_visible()]
     return sorted([*bars, *(a for a in alone if id(a) not in of_bars)], key=_height)

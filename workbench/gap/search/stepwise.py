@@ -50,6 +50,7 @@ class StepwiseSettings:
         explained: share of the nominal gap's power above the noise that an explanation may leave.
         further: likewise, that a further effect is looked for to explain.
         in_part: likewise, for effects that are named although something else is there.
+        credible: times the stated noise that noise found may be; more is a gap.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         damping, stiffness: common to all modes or all along, logarithm, from which on it is an effect of its own.
     """
@@ -92,6 +93,7 @@ class StepwiseSettings:
     explained: float = 0.01
     further: float = 1e-3
     in_part: float = 0.2
+    credible: float = 3.0
     no_gap: float = 0.15
     damping: float = 0.5
     stiffness: float = 0.05
@@ -205,7 +207,7 @@ def fit_jointly(
     ]
     by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
     step = replace(found, effects=(*effects, errors), cost=float(by_channel.mean()), cost_by_channel=by_channel)
-    sensor_noise = (noise_found(residuals) / whole.noise) ** 2
+    sensor_noise = np.minimum(noise_found(residuals) / whole.noise, SETTINGS.credible) ** 2
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
     return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
