@@ -254,7 +254,9 @@ def _of_times(path: Path, time: np.ndarray, *, mend: bool) -> Sampling:
         if SHORTEST * median <= shortest and longest <= LONGEST * median and shortest > 0:
             remark = f"unequal time steps, {shortest:g} to {longest:g} s: resampled every {mean:g} s by cubic splines"
             return Sampling(start, mean, time, (remark,))
-    row = int(np.argmax(np.abs(np.nan_to_num(steps / median if median else steps, posinf=1e300, neginf=-1e300) - 1.0)))
+    with np.errstate(over="ignore", invalid="ignore"):  # times near the largest number, whose differences are infinite
+        relative = np.nan_to_num(steps / median if median else steps, posinf=1e300, neginf=-1e300)
+    row = int(np.argmax(np.abs(relative - 1.0)))
     raise RecordFileError(
         f"{path} is not uniformly sampled: row {row + 2} comes {steps[row]:g} s after the one before, the others"
         f" {median:g} s; fill the gap, or cut the record there"
