@@ -6,7 +6,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
-from workbench.draw.gap import plot_missing_force, plot_rivals
+from workbench.draw.gap import plot_budget, plot_missing_force
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -92,4 +92,4 @@ def study(outcome, data: Path) -> None:
     outcome.check("held-out multisines: RMSE after, V", errors["multisines"]["after"], 0.5e-3)
     outcome.check("arrow: RMSE after, V", errors["arrow"]["after"], 0.8e-3)
     outcome.figure("force", plot_missing_force(verdict), "The force that the linear model lacks, against the motion.")
-    outcome.figure("rivals", plot_rivals(verdict), "Each effect alone on the multisines.")
+    outcome.figure("budget", plot_budget(verdict.budget), "What causes the gap of the linear model, held out.")

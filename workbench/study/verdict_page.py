@@ -62,11 +62,10 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
                 plot_missing_force(verdict),
                 "The unmodelled force reconstructed from the records, over the motion at its place.",
             ),
-            (
-                plot_rivals(verdict),
-                "What each effect alone leaves of the gap: at the noise floor, it explains all of it.",
-            ),
         ]
+        if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
+            each = "What each effect alone leaves of the gap: at the noise floor, it explains all of it."
+            figures.append((plot_rivals(verdict), each))
     gaps = [
         (name, before, shown["gap"]["after"][name], shown["gap"]["floor"][name], shown["shrinkage"].get(name))
         for name, before in shown["gap"]["before"].items()
