@@ -15,10 +15,11 @@ FLOORS = {
     "design": 3,
     "cases": 3,
     "gap": 4,
-    "trials": 5,
-    "draw": 6,
-    "study": 7,
-    "cli": 8,
+    "robust": 5,
+    "trials": 6,
+    "draw": 7,
+    "study": 8,
+    "cli": 9,
 }
 # Rooms inside a room, ground floor first; the room's own files stand above them all.
 INSIDE = {

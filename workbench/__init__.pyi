@@ -54,6 +54,7 @@ from .rig.rig import Rig as Rig
 from .rig.sensors import Sensor as Sensor
 from .rig.simulate import simulate as simulate
 from .rig.statespace import state_space as state_space
+from .robust.posterior import UncertainRig as UncertainRig
 from .structure.damping import ModalDamping as ModalDamping
 from .structure.damping import ProportionalDamping as ProportionalDamping
 from .structure.damping import ViscousDamping as ViscousDamping

@@ -194,7 +194,7 @@ def attribute(
         best = with_intervals(search.rig, best, search.data, workers)
         if outcome == "explained":
             standing = tuple(e for e in best.effects if e in seen or _stands_out(e, search.rig))
-            best = replace(best, effects=standing)
+            best = best.only(search.rig, standing)
             outcome = outcome if any(not e.kind.first for e in standing) else "none"
     report("done", 1.0)
     return Attribution(

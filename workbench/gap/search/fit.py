@@ -29,6 +29,8 @@ class Fit:
         n_parameters: numbers fitted.
         status: why the fit stopped.
         falling: share of the cost that the last iteration took away; 0 where the fit came to rest.
+        covariance: (n, n) of the free coordinates of all parameters, in the order of `parameters_of`; None before
+            `with_intervals`.
     """
 
     effects: tuple[Effect, ...]
@@ -37,6 +39,15 @@ class Fit:
     n_parameters: int
     status: str
     falling: float = 0.0
+    covariance: np.ndarray | None = None
+
+    def only(self, rig: Rig, kept: Sequence[Effect]) -> "Fit":
+        """The fit with some of its effects left out, and the covariance of the others."""
+        there = [e in kept for e in self.effects]  # effects are equal by identity
+        if self.covariance is None:
+            return replace(self, effects=tuple(kept))
+        rows = [j for j, (i, _) in enumerate(parameters_of(rig, self.effects)) if there[i]]
+        return replace(self, effects=tuple(kept), covariance=self.covariance[np.ix_(rows, rows)])
 
     @property
     def labels(self) -> tuple[str, ...]:

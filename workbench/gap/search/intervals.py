@@ -20,7 +20,7 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
         cov = A⁻¹ (Σ_b J_bᵀ r_b r_bᵀ J_b + s² P) A⁻¹,    A = Jᵀ J + s² P,    s² = max(|r|² / n, 1)
 
     over blocks b of each record (White, Econometrica 48 (1980) 817; blocks after Liang & Zeger, Biometrika 73 (1986)
-    13), or s² A⁻¹ where that is larger.
+    13), or s² A⁻¹ where that is larger. The joint covariance is no smaller than either in any direction.
 
     Args:
         rig: nominal.
@@ -38,14 +38,32 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
     jacobian, priors = jacobian / scale, priors / scale**2
     inverse = np.linalg.pinv(jacobian.T @ jacobian + level * np.diag(priors), rcond=1e-12, hermitian=True)
     scores = _scores(residual, jacobian, data)
-    spread = inverse @ (scores.T @ scores + level * np.diag(priors)) @ inverse
+    scatter = scores.T @ scores + level * np.diag(priors)
+    spread = inverse @ scatter @ inverse
     variances = np.maximum(np.diag(spread), level * np.diag(inverse)).clip(0.0)
     deviations: list[dict[str, float]] = [{} for _ in found.effects]
     for (i, parameter), deviation in zip(parameters, np.sqrt(variances) / scale, strict=True):
         value = found.effects[i].values[parameter.name]
         deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
     effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
-    return replace(found, effects=tuple(effects))
+    joint = _joint(jacobian.T @ jacobian + level * np.diag(priors), scatter, level, len(scores))
+    return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale))
+
+
+def _joint(information: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
+    """The least covariance no smaller than A⁻¹ S A⁻¹ or s² A⁻¹ in any direction, with A `information`, S `scatter`.
+
+    Few blocks tell little of many parameters, so S is drawn towards a multiple of s² A, the more the fewer they are.
+    """
+    values, vectors = np.linalg.eigh(information)
+    there = values > 1e-12 * values[-1]
+    root = vectors[:, there] / np.sqrt(values[there])
+    relative = root.T @ scatter @ root / level
+    own = n_blocks / (n_blocks + len(relative))
+    relative = own * relative + (1.0 - own) * np.trace(relative) / len(relative) * np.eye(len(relative))
+    larger, axes = np.linalg.eigh(relative)
+    half = root @ (axes * np.sqrt(level * np.maximum(larger, 1.0)))
+    return np.asarray(half @ half.T)
 
 
 def _scores(residual: np.ndarray, jacobian: np.ndarray, data: FitData) -> np.ndarray:

@@ -1,0 +1,90 @@
+"""Draws of rigs from a diagnosis, against closed forms of what the records tell."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.search.fit import Fit
+from workbench.gap.search.intervals import with_intervals
+from workbench.rig.simulate import simulate
+from workbench.robust.posterior import UncertainRig
+
+GAINS = (
+    Effect(kind_named("actuator_gain"), "F1", {"gain": 0.8}),
+    Effect(kind_named("sensor_gain"), "d1", {"gain": 1.25}),
+)
+
+
+@pytest.fixture(scope="module")
+def told(rig):
+    """Two gains in series, read by one good sensor behind both and one poor sensor behind the first alone."""
+    rig = replace(rig, actuators=rig.actuators[:1], sensors=rig.sensors[:2])
+    record = simulate(apply_all(rig, GAINS), np.random.default_rng(0).normal(size=(1, 600)), sample_time=0.01)
+    noise = np.array([1e-3, 3e-2]) * record.outputs.std(axis=1)
+    found = with_intervals(rig, Fit(GAINS, 1.0, np.ones((1, 2)), 2, "given"), FitData((record,), noise))
+    return rig, record, noise, found
+
+
+def test_the_joint_covariance_is_that_of_the_closed_form(told):
+    """y1 = a g s1 and y2 = a s2, so var ln a = 1 / I2, var ln g = 1 / I1 + 1 / I2, and their covariance - 1 / I2."""
+    _, record, noise, found = told
+    one, two = (record.outputs**2).sum(axis=1) / noise**2
+    expected = np.array([[1 / two, -1 / two], [-1 / two, 1 / one + 1 / two]])
+    slopes = np.array([p.slope(e.values["gain"]) / e.values["gain"] for e in GAINS for p in e.parameters(told[0])])
+    assert found.covariance * np.outer(slopes, slopes) == pytest.approx(expected, rel=1e-4)
+
+
+def test_draws_keep_what_the_records_tell_of_the_product_of_two_numbers(told):
+    rig, record, noise, found = told
+    rigs = UncertainRig(rig, found.effects, found.covariance).draws(4000, seed=1)
+    gains = np.log([(r.actuators[0].gain, r.sensors[0].gain) for r in rigs])
+    one, two = (record.outputs**2).sum(axis=1) / noise**2
+    assert gains.mean(axis=0) == pytest.approx(np.log([0.8, 1.25]), abs=4 * two**-0.5 / 4000**0.5)
+    assert gains[:, 0].std() == pytest.approx(two**-0.5, rel=0.05)
+    assert gains.sum(axis=1).std() == pytest.approx(one**-0.5, rel=0.05)
+
+
+def test_rivals_are_drawn_in_proportion_to_their_probability(told):
+    rig, _, _, found = told
+    rival = UncertainRig(rig, (Effect(kind_named("modal_damping"), None, {"factor": 2.0}),), np.zeros((1, 1)))
+    possible = UncertainRig(rig, found.effects, found.covariance, rivals=((rival, 0.25),))
+    damped = [r.modes.zeta[0] > 1.5 * rig.modes.zeta[0] for r in possible.draws(2000, seed=2)]
+    assert np.mean(damped) == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / 2000))
+
+
+def test_a_number_that_the_records_hardly_tell_is_drawn_within_a_factor(told):
+    rig = told[0]
+    lag = Effect(kind_named("actuator_lag"), "all", {"time_constant": 0.02})
+    drawn = UncertainRig(rig, (lag,), np.array([[400.0]])).draws(2000)
+    spread = np.log([r.actuators[0].time_constant for r in drawn]).std()
+    assert spread == pytest.approx(1.0, rel=0.1)
+
+
+def test_errors_of_the_nominal_model_and_places_go_through_json(told):
+    rig = told[0]
+    errors = nominal_errors(rig, NominalPrior(frequency=0.01, damping=0.1), {"frequency_2": 0.5})
+    spring = Effect(kind_named("ground_spring"), None, {"at": 0.6, "stiffness": 3.0}, {"at": 0.01, "stiffness": 0.1})
+    n = len(errors.values) + 2
+    possible = UncertainRig(rig, (errors, spring), 1e-4 * np.eye(n), 0.02, "explained")
+    again = UncertainRig.from_json(rig, json.loads(json.dumps(possible.to_json())))
+    assert again.unexplained == 0.02 and again.outcome == "explained"
+    for one, other in zip(possible.draws(3, seed=5), again.draws(3, seed=5), strict=True):
+        assert np.array_equal(one.modes.omega, other.modes.omega)
+    assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
+
+
+def test_what_cannot_be_is_named(told):
+    rig = told[0]
+    with pytest.raises(ValueError, match=r"one row a parameter of the effects, shape \(2, 2\)"):
+        UncertainRig(rig, GAINS, np.eye(3))
+    with pytest.raises(ValueError, match="no effect is called 'gremlin'"):
+        UncertainRig.from_json(rig, {"effects": [{"kind": "gremlin"}], "covariance": [], "rivals": []})
+    buckled = Effect(kind_named("axial_load"), None, {"tension": -1e6})
+    with pytest.raises(ValueError, match="measure more of them"):
+        UncertainRig(rig, (buckled,), np.array([[1e-6]])).draws(1)

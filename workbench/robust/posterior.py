@@ -1,0 +1,230 @@
+"""A corrected rig with its uncertainty: rigs drawn from what a diagnosis leaves possible."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior
+from workbench.gap.report.verdict import Verdict
+from workbench.gap.search.fit import Fit, parameters_of
+from workbench.rig.rig import Rig
+from workbench.structure.domain import Between
+from workbench.structure.modes import frozen
+from workbench.threads import one_blas_thread
+
+# Free coordinates within which a fit is taken for linear: a factor e, a tenth of the extent. A number that the records
+# hardly tell has a wider deviation, which says no more than that.
+WIDEST, WIDEST_PLACE = 1.0, 10.0
+LIKELY = 0.01  # probability from which on a rival set is drawn too
+MOST_TRIES = 20  # draws for each rig that can be
+SAYABLE = ("none", "explained")
+
+
+@dataclass(frozen=True, eq=False)
+class UncertainRig:
+    """What a diagnosis leaves possible: a set of effects with the joint covariance of their parameters.
+
+    Attributes:
+        nominal: the rig without any effect.
+        effects: the central estimate.
+        covariance: (n_parameters, n_parameters) of the free coordinates of all parameters, effect by effect.
+        unexplained: root mean square of what the effects leave unexplained, noise apart, over that of the readings: a
+            relative error |Δ| of the model's output, y_real = (1 + Δ) y.
+        outcome: of the diagnosis.
+        rivals: other sets that the records do not exclude, each with its probability.
+    """
+
+    nominal: Rig
+    effects: tuple[Effect, ...]
+    covariance: np.ndarray
+    unexplained: float = 0.0
+    outcome: str = "explained"
+    rivals: tuple[tuple["UncertainRig", float], ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "effects", tuple(self.effects))
+        object.__setattr__(self, "covariance", frozen(self.covariance))
+        n = len(self._parameters)
+        if self.covariance.shape != (n, n):
+            raise ValueError(
+                f"UncertainRig.covariance must have one row a parameter of the effects, shape ({n}, {n}); got"
+                f" {self.covariance.shape}"
+            )
+        if not (np.isfinite(self.unexplained) and self.unexplained >= 0):
+            raise ValueError(f"UncertainRig.unexplained must be 0 or more; got {self.unexplained}")
+
+    @classmethod
+    def of(cls, verdict: Verdict) -> "UncertainRig":
+        """The corrected rig of a verdict, with the covariance of its effects and rivals that are not excluded."""
+        nominal, best = verdict.nominal, verdict.attribution.best
+        likely = [(fit, p) for fit, p in verdict.attribution.rivals if p > LIKELY]
+        rivals = [(cls(nominal, fit.effects, _covariance(nominal, fit)), p) for fit, p in likely]
+        return cls(
+            nominal, best.effects, _covariance(nominal, best), _unexplained(verdict), verdict.outcome, tuple(rivals)
+        )
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The corrected rig: the central estimate."""
+        return apply_all(self.nominal, self.effects)
+
+    @property
+    def explained(self) -> bool:
+        """Whether the effects account for the gap, so that draws of them hold the real structure."""
+        return self.outcome in SAYABLE
+
+    @cached_property
+    def _parameters(self) -> list[tuple[int, Parameter]]:
+        return parameters_of(self.nominal, self.effects)
+
+    def draws(self, n: int, seed: int | np.random.Generator = 0) -> tuple[Rig, ...]:
+        """Rigs (n,) that the diagnosis leaves possible, rivals in proportion to their probability.
+
+        Normal in the free coordinates of the fit, inside the bounds of each parameter; a rig that cannot be, such as a
+        buckled beam, is drawn again.
+
+        Args:
+            n: how many.
+            seed: of the draws, or a generator.
+
+        Raises:
+            ValueError: hardly any draw is a rig that can be.
+        """
+        return tuple(rig for rig, _ in self.draws_with_effects(n, seed))
+
+    @one_blas_thread
+    def draws_with_effects(
+        self, n: int, seed: int | np.random.Generator = 0
+    ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
+        """The same, each with the effects that make it."""
+        rng = np.random.default_rng(seed)
+        sets = [self, *(rival for rival, _ in self.rivals)]
+        shares = np.array([p for _, p in self.rivals])
+        shares = np.r_[max(1.0 - shares.sum(), 0.0), shares]
+        chosen = rng.choice(len(sets), n, p=shares / shares.sum())
+        return tuple(sets[i]._drawn(rng) for i in chosen)
+
+    def _drawn(self, rng: np.random.Generator) -> tuple[Rig, tuple[Effect, ...]]:
+        for _ in range(MOST_TRIES):
+            effects = self._at(self._root @ rng.standard_normal(self._root.shape[1]))
+            try:
+                return apply_all(self.nominal, effects), effects
+            except (ValueError, np.linalg.LinAlgError):
+                continue
+        raise ValueError(
+            f"of {MOST_TRIES} draws of {' and '.join(e.label for e in self.effects)} none is a rig that can be: the"
+            " records hardly tell their sizes; measure more of them before a redesign"
+        )
+
+    @cached_property
+    def _root(self) -> np.ndarray:
+        """R with R Rᵀ the covariance, no deviation wider than a fit tells."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        deviations = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        widest = np.array([_widest(p) for _, p in self._parameters])
+        return np.asarray(root * np.minimum(1.0, widest / deviations)[:, None])
+
+    def _at(self, offsets: np.ndarray) -> tuple[Effect, ...]:
+        """The effects with their free coordinates moved by (n_parameters,) offsets."""
+        values = [dict(effect.values) for effect in self.effects]
+        for (i, parameter), offset in zip(self._parameters, offsets, strict=True):
+            free = parameter.to_free(values[i][parameter.name]) + offset
+            values[i][parameter.name] = parameter.from_free(float(free))
+        return tuple(replace(effect, values=v) for effect, v in zip(self.effects, values, strict=True))
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers, from which `from_json` makes the same beside the same nominal rig."""
+        return {
+            "effects": [_effect_json(effect) for effect in self.effects],
+            "covariance": self.covariance.tolist(),
+            "unexplained": self.unexplained,
+            "outcome": self.outcome,
+            "rivals": [[rival.to_json(), probability] for rival, probability in self.rivals],
+        }
+
+    @classmethod
+    def from_json(
+        cls, nominal: Rig, told: Mapping[str, Any], *, catalogue: Sequence[Kind] = CATALOGUE
+    ) -> "UncertainRig":
+        """What `to_json` wrote, beside the nominal rig that it was told of.
+
+        Args:
+            nominal: of the case.
+            told: as written.
+            catalogue: kinds by which effects are known, where kinds of your own are among them.
+
+        Raises:
+            ValueError: an effect of a kind that the catalogue does not hold, or a covariance of another size.
+        """
+        kinds = {kind.name: kind for kind in (*catalogue, *BEYOND, NOMINAL_ERRORS)}
+        unknown = [entry["kind"] for entry in told["effects"] if entry["kind"] not in kinds]
+        if unknown:
+            raise ValueError(f"no effect is called {unknown[0]!r}; hand a catalogue that holds it")
+        effects = tuple(_effect(kinds[entry["kind"]], entry) for entry in told["effects"])
+        n = len(parameters_of(nominal, effects))
+        covariance = np.array(told["covariance"], float) if n else np.zeros((0, 0))
+        rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in told["rivals"])
+        return cls(nominal, effects, covariance, told["unexplained"], told["outcome"], rivals)
+
+
+def _widest(parameter: Parameter) -> float:
+    if parameter.name in COORDINATES:
+        return WIDEST_PLACE
+    return WIDEST if parameter.logarithmic else np.inf
+
+
+def _covariance(nominal: Rig, fit: Fit) -> np.ndarray:
+    """The joint covariance of a fit's free coordinates; of each alone where only deviations are known."""
+    parameters = parameters_of(nominal, fit.effects)
+    if fit.covariance is not None and fit.covariance.shape == (len(parameters),) * 2:
+        return fit.covariance
+    return np.diag(list(_variances(fit.effects, parameters))) if parameters else np.zeros((0, 0))
+
+
+def _variances(effects: Sequence[Effect], parameters: Sequence[tuple[int, Parameter]]) -> Iterator[float]:
+    for i, parameter in parameters:
+        effect = effects[i]
+        slope = parameter.slope(effect.values[parameter.name])
+        deviation = effect.deviations.get(parameter.name, 0.0)
+        yield (deviation / slope) ** 2 if slope and np.isfinite(deviation) else 0.0
+
+
+def _unexplained(verdict: Verdict) -> float:
+    """What is left and is not noise, relative to the readings; see `UncertainRig`."""
+    shrinkage, budget = verdict.shrinkage, verdict.budget
+    if verdict.outcome in SAYABLE:
+        gaps = verdict.where.record_gaps if shrinkage is None else list(shrinkage.before.values())
+        return float(np.sqrt(budget.unexplained * np.mean(np.square(gaps))))
+    if shrinkage is not None:
+        noise = max(budget.noise_ratio, 1.0)
+        left = [shrinkage.after[name] ** 2 - (noise * floor) ** 2 for name, floor in shrinkage.floor.items()]
+        return float(np.sqrt(max(float(np.mean(left)), 0.0)))
+    data, best = verdict.attribution.search.data, verdict.attribution.best
+    scales = np.array([record.outputs.std(axis=1) for record in data.counted])
+    beyond = np.maximum(best.cost_by_channel - (verdict.attribution.noise / data.noise) ** 2, 0.0)
+    return float(np.sqrt(np.mean(beyond * (data.noise / scales) ** 2)))
+
+
+def _effect_json(effect: Effect) -> dict[str, Any]:
+    target = effect.target
+    if isinstance(target, NominalPrior):
+        target = {"prior": asdict(target)}
+    values = {n: {"between": list(v)} if isinstance(v, Between) else v for n, v in effect.values.items()}
+    return {"kind": effect.kind.name, "target": target, "values": values, "deviations": dict(effect.deviations)}
+
+
+def _effect(kind: Kind, told: Mapping[str, Any]) -> Effect:
+    target = told["target"]
+    if isinstance(target, Mapping):
+        target = NominalPrior(**target["prior"])
+    elif isinstance(target, list):
+        target = tuple(target)
+    values = {n: Between(*v["between"]) if isinstance(v, Mapping) else v for n, v in told["values"].items()}
+    return Effect(kind, target, values, dict(told["deviations"]))
