@@ -1,12 +1,23 @@
 """Cases on plates and at named points: what is read is what stands there, and what is wrong is refused by name."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from workbench.cases.case import read_case
+from workbench.cases.case import Case, read_case
 from workbench.cases.points import read_points, write_points
 from workbench.cases.tables import CaseError
-from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.cases.writing import write_case
+from workbench.records.record import Channel, Record
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import LinearSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between, NamedPoints, Rectangle
+from workbench.structure.modes import Modes, PointShapes
+from workbench.structure.plate import Plate
 
 PORTS = """
 [[input]]
@@ -71,6 +82,78 @@ def test_named_points_are_read_with_their_shapes(tmp_path):
     np.testing.assert_array_equal(rig.modes.phi(rig.sensors[0].at), [[1.5, -1.0]])
     points = rig.modes.domain
     assert points.distance("a.x", "b.y") == 5.0 and points.translations("a.x") == ("a.x", "a.y")
+
+
+def again(rig, folder):
+    """The rig after it was written and read: one record of noise beside it."""
+    channels = tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors)
+    into = tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators)
+    noise = np.random.default_rng(2).standard_normal((len(channels) + len(into), 400))
+    record = Record(
+        0.01, noise[: len(channels)], channels, inputs=noise[len(channels) :], input_channels=into, name="r"
+    )
+    return read_case(write_case(Case("c", rig, (record,), ()), folder).parent).rig
+
+
+def test_a_written_plate_is_read_as_it_was(tmp_path):
+    edges = {"left": "clamped", "right": "free", "bottom": "simply supported", "top": "free"}
+    plate = Plate(
+        length=(0.6, 0.4),
+        mass_per_area=8.1,
+        bending_stiffness=170.0,
+        poisson_ratio=0.31,
+        edges=edges,
+        damping=ModalDamping(0.01),
+    )
+    rig = Rig(
+        plate.modes(3),
+        (Actuator("F", (0.5, 0.1)), Actuator("tap", (0.2, 0.3), direct=True)),
+        (Sensor("a", (0.3, 0.2), "acceleration", noise_std=0.01),),
+        structure=plate,
+    )
+    read = again(rig, tmp_path)
+    np.testing.assert_allclose(read.modes.omega, rig.modes.omega, rtol=1e-12)
+    np.testing.assert_allclose(read.modes.damping, rig.modes.damping, rtol=1e-12)
+    assert read.actuators == rig.actuators and read.sensors == rig.sensors
+    assert read.structure.edges == plate.edges and read.structure.poisson_ratio == 0.31
+    for change, words in (
+        ({"bending_stiffness": lambda x, y: 170.0 + x}, "varies over the plate"),
+        ({"tension": 5.0}, "no tension of a plate"),
+        ({"edges": {**edges, "left": "guided"}}, "no name for"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            again(replace(rig, structure=replace(plate, **change)), tmp_path / "no")
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["positions known", "not known"])
+def test_a_written_frame_is_read_as_it_was(tmp_path, known):
+    rng = np.random.default_rng(3)
+    positions = rng.normal(size=(2, 3)) if known else None
+    points = NamedPoints(("p", "q"), positions, ("x", "") if known else ())
+    shapes = PointShapes(rng.normal(size=(2, 3)))
+    modes = Modes([0.0, 20.0, 31.0], np.diag([0.3, 0.4, 0.5]), shapes, points)
+    rig = Rig(modes, (Actuator("F", "p"),), (Sensor("v", "q", "velocity", noise_std=0.01),))
+    read = again(rig, tmp_path)
+    np.testing.assert_allclose(read.modes.omega, modes.omega, rtol=1e-14)
+    np.testing.assert_allclose(read.modes.damping, modes.damping, rtol=1e-14)
+    np.testing.assert_array_equal(read.modes.phi(read.sensors[0].at), modes.phi("q"))
+    np.testing.assert_array_equal(read.modes.phi(read.actuators[0].at), modes.phi("p"))
+    assert not known or (read.sensors == rig.sensors and read.modes.domain.directions == ("x", ""))
+
+
+def test_what_a_case_of_points_cannot_say_is_refused(tmp_path):
+    points = NamedPoints(("p", "q"))
+    modes = Modes([20.0, 31.0], [0.01, 0.01], PointShapes([[1.0, 2.0], [3.0, 4.0]]), points)
+    rig = Rig(modes, (Actuator("F", "p"),), (Sensor("v", "q", noise_std=0.01),))
+    for wrong, words in (
+        (replace(rig, sensors=(Sensor("v", "p", noise_std=0.01),)), "'q' has no position"),
+        (replace(rig, modes=replace(modes, damping=[[1.0, 0.5], [0.5, 1.0]])), "couples modes"),
+        (replace(rig, actuators=(Actuator("F", Between("p", "q")),)), "two places"),
+        (replace(rig, actuators=(Actuator("F", "p", delay=0.1),)), "'F' has delay"),
+        (replace(rig, elements=(LinearSpring("p", 1.0),)), "no elements"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            again(wrong, tmp_path)
 
 
 def test_points_go_through_a_file_unchanged(tmp_path):

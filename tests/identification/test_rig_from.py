@@ -1,6 +1,7 @@
 """From a bench to a rig in one line: what was identified simulates, and answers to an added mass, as the structure."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,6 +69,29 @@ def test_a_driving_point_scales_the_shapes_so_that_a_mass_changes_the_modes_as_i
     expected = attach(bench.modes, (PointMass(2.6, 0.8),))
     assert abs(expected.omega / bench.modes.omega - 1).max() > 0.05
     np.testing.assert_allclose(changed.omega, expected.omega, rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_the_spread_of_shapes_over_many_records_is_what_their_covariance_says(bench):
+    rng = np.random.default_rng(10)
+    inputs = rng.normal(size=(1, 400))
+    quiet = simulate(bench, inputs, sample_time=0.05)
+    loud = [replace(quiet, outputs=quiet.outputs + 0.01 * rng.normal(size=quiet.outputs.shape)) for _ in range(200)]
+    rigs = [rig_from(identify_driven(record, at_rest=True, feedthrough=False, most_modes=3)) for record in loud]
+    points = rigs[0].modes.domain.names
+    exact = np.array([bench.modes.phi(0.9)[0], *bench.modes.phi(PLACES)])
+    assert points == ("F", "d1", "d2", "d3", "d4")
+    off = np.array(
+        [rig.modes.phi(points) * np.sign((rig.modes.phi(points) * exact).sum(axis=0)) - exact for rig in rigs]
+    )
+    assert np.abs(off / exact).max() > 0.01
+    for r in range(3):
+        by_record = [
+            errors[:, r] @ np.linalg.solve(rig.modes.shape_covariance[r][1:, 1:], errors[:, r])
+            for errors, rig in zip(off[:, 1:], rigs)
+        ]
+        # of χ² with 4 degrees of freedom, the mean of 200 of them: 4 ± 3 of its standard errors
+        assert np.mean(by_record) == pytest.approx(4.0, abs=3.0 * np.sqrt(8.0 / 200))
 
 
 def test_modes_that_nothing_scales_are_said_so(found):

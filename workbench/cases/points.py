@@ -16,7 +16,8 @@ COLUMNS = ("name", "node", "x", "y", "z", "direction")
 def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
     """Named points, and mode shapes (n_points, n_modes) there, from a CSV table.
 
-    Its columns are name, node, x, y, z (m), direction (x, y, z, rx, ry or rz) and mode_1 to mode_n, mass-normalised.
+    Its columns are name, node, x, y, z (m), direction (x, y, z, rx, ry or rz; empty where not
+    known) and mode_1 to mode_n, mass-normalised.
 
     Raises:
         CaseError: naming the file, the line and the column, and what would be right.
@@ -42,7 +43,7 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
         points = NamedPoints(
             names=tuple(_text(path, i, row, "name") for i, row in rows),
             positions=values[:, :3],
-            directions=tuple(_text(path, i, row, "direction") for i, row in rows),
+            directions=tuple(_text(path, i, row, "direction", may_be_empty=True) for i, row in rows),
             nodes=tuple(_text(path, i, row, "node") for i, row in rows),
         )
     except ValueError as error:
@@ -51,7 +52,7 @@ def read_points(path: Path, n_modes: int) -> tuple[NamedPoints, np.ndarray]:
 
 
 def write_points(path: Path, points: NamedPoints, values: np.ndarray) -> None:
-    """The table that `read_points` reads; 0 for positions that are not known would be wrong, so there must be some.
+    """Write the table that `read_points` reads.
 
     Raises:
         ValueError: points without positions.
@@ -78,8 +79,10 @@ def _number(path: Path, line: int, row: dict, column: str) -> float:
     return value
 
 
-def _text(path: Path, line: int, row: dict, column: str) -> str:
+def _text(path: Path, line: int, row: dict, column: str, *, may_be_empty: bool = False) -> str:
     value = row[column]
+    if value == "" and may_be_empty:
+        return ""
     if not value or not value.isprintable() or len(value) > 255:
         raise CaseError(
             f"{path}, line {line + 2}, column {column!r}: expected up to 255 printable characters; got {shown(value)}"

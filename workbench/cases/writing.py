@@ -1,29 +1,44 @@
 """Writing a case folder."""
 
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from workbench.cases.case import Case
+from workbench.cases.points import write_points
 from workbench.records.record import Record
+from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Beam, Structure
+from workbench.structure.modes import Modes
+from workbench.structure.plate import Plate
 from workbench.structure.profile import Profile
-from workbench.structure.supports import NAMED_ENDS, End
+from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
+
+POINTS = "points.csv"
+Support = TypeVar("Support", End, Edge)
 
 
 def write_case(case: Case, folder: str | Path) -> Path:
     """Write a case as a folder, case.toml and records/NAME.npz, that `read_case` reads back.
 
+    A rig at named points is written with the table points.csv beside; where their positions are not known, with the
+    shapes at its inputs and outputs.
+
     Raises:
-        ValueError: what the format cannot say: a rig without its structure, profiles that are not linear between
-            their breaks, attachments, ends without a name, damping that differs from mode to mode.
+        ValueError: what the format cannot say: profiles that are not linear between their breaks, a plate that varies,
+            attachments, ends or edges without a name, damping that differs from mode to mode of a structure or couples
+            modes, an input that is no ideal point force, elements.
     """
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
-    blocks = [f"title = {_text(case.name)}", _structure(case.rig), *_ports(case.rig)]
+    blocks = [f"title = {_text(case.name)}", *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         file = f"records/{record.name}.npz"
         arrays: dict[str, Any] = {"t": record.time, **_arrays(record)}
@@ -41,17 +56,32 @@ def _arrays(record: Record) -> dict[str, np.ndarray]:
     }
 
 
-def _structure(rig: Rig) -> str:
-    member = rig.structure
-    if member is None:
-        raise ValueError("a rig without its structure cannot be written; a case folder tells a beam or a rod")
-    if not isinstance(member, Structure):
-        raise ValueError("a plate or a finite-element model cannot be written yet; a case folder tells a beam or a rod")
-    if member.attachments:
-        raise ValueError(f"the case format knows no attachments; take {member.attachments[0]} out of the nominal model")
-    damping = np.unique(np.asarray(getattr(member.damping, "zeta", np.nan)))
-    if not isinstance(member.damping, ModalDamping) or damping.size != 1:
-        raise ValueError("the case format knows one damping ratio for all modes; use ModalDamping(ratio)")
+def _rig(rig: Rig, folder: Path) -> list[str]:
+    """The tables [structure], [[input]] and [[output]]; a table of named points goes into the folder."""
+    _check_ports(rig)
+    structure, points = rig.structure, rig.modes.domain
+    if isinstance(structure, Structure):
+        return [_member(structure, rig.modes.n_modes), *_ports(rig, at=lambda where: {"at": where})]
+    if isinstance(structure, Plate):
+        return [_plate(structure, rig.modes.n_modes), *_ports(rig, at=lambda where: {"at": list(where)})]
+    if not isinstance(points, NamedPoints):
+        raise ValueError(
+            "a case folder tells a beam, a rod, a plate, or modes at named points; this is a membrane, or a rig"
+            " without its structure"
+        )
+    if points.positions is not None:
+        write_points(folder / POINTS, points, rig.modes.phi(points.names))
+        return [_modal(rig.modes, points=POINTS), *_ports(rig, at=lambda where: {"point": where})]
+    unused = set(points.names) - {a.at for a in rig.actuators} - {s.at for s in rig.sensors}
+    if unused:
+        raise ValueError(
+            f"point {sorted(unused)[0]!r} has no position and is neither input nor output, so the format has no place"
+            " for it; give the points positions"
+        )
+    return [_modal(rig.modes), *_ports(rig, at=lambda where: {"shape": rig.modes.phi(where)[0].tolist()})]
+
+
+def _member(member: Structure, n_modes: int) -> str:
     beam = isinstance(member, Beam)
     stiffness = "bending_stiffness" if beam else "axial_stiffness"
     profiles = {"mass_per_length": member.mass_per_length, stiffness: getattr(member, stiffness)}
@@ -62,10 +92,57 @@ def _structure(rig: Rig) -> str:
         **{name: _profile(profile, member.length, name) for name, profile in profiles.items()},
         left=_end(member.left, beam),
         right=_end(member.right, beam),
-        damping_ratio=float(damping[0]),
+        damping_ratio=_damping_ratio(member),
         **({"tension": member.tension} if isinstance(member, Beam) and member.tension else {}),
-        modes=rig.modes.n_modes,
+        modes=n_modes,
     )
+
+
+def _plate(plate: Plate, n_modes: int) -> str:
+    constants = {"mass_per_area": plate.mass_per_area, "bending_stiffness": plate.bending_stiffness}
+    for name, quantity in constants.items():
+        if not quantity.is_constant:
+            raise ValueError(f"{name} varies over the plate; the case format holds one number")
+    if any(plate.tension):
+        raise ValueError(f"the case format knows no tension of a plate; got {plate.tension} N/m")
+    return _table(
+        "[structure]",
+        kind="plate",
+        length=list(plate.length),
+        **{name: float(quantity(0.0, 0.0)) for name, quantity in constants.items()},
+        poisson_ratio=plate.poisson_ratio,
+        edges={
+            side: _named(edge, ("simply supported", "clamped", "free"), NAMED_EDGES)
+            for side, edge in plate.edges.items()
+        },
+        damping_ratio=_damping_ratio(plate),
+        modes=n_modes,
+    )
+
+
+def _modal(modes: Modes, **more: str) -> str:
+    if not modes.proportional:
+        raise ValueError("the case format knows no damping that couples modes; keep the diagonal of Modes.damping")
+    rigid = modes.omega == 0
+    rates = np.diag(modes.damping)[rigid].tolist()
+    return _table(
+        "[structure]",
+        kind="modal",
+        natural_frequencies_hz=modes.frequencies_hz.tolist(),
+        damping_ratios=modes.zeta.tolist(),
+        **({"rigid_damping": rates} if any(rates) else {}),
+        **more,
+    )
+
+
+def _damping_ratio(structure: Structure | Plate) -> float:
+    if structure.attachments:
+        part = structure.attachments[0]
+        raise ValueError(f"the case format knows no attachments; take {part} out of the nominal model")
+    ratio = np.unique(np.asarray(getattr(structure.damping, "zeta", np.nan)))
+    if not isinstance(structure.damping, ModalDamping) or ratio.size != 1:
+        raise ValueError("the case format knows one damping ratio for all modes; use ModalDamping(ratio)")
+    return float(ratio[0])
 
 
 def _profile(profile: Profile, length: float, name: str) -> float | dict[str, list[float]]:
@@ -78,18 +155,45 @@ def _profile(profile: Profile, length: float, name: str) -> float | dict[str, li
 
 
 def _end(end: End, beam: bool) -> str:
-    for name in ("hinged", "clamped", "free", "sliding") if beam else ("fixed", "free"):
-        if NAMED_ENDS[name] == end:
+    return _named(end, ("hinged", "clamped", "free", "sliding") if beam else ("fixed", "free"), NAMED_ENDS)
+
+
+def _named(support: Support, names: tuple[str, ...], known: Mapping[str, Support]) -> str:
+    for name in names:
+        if known[name] == support:
             return name
-    raise ValueError(f"the case format has no name for {end}; use hinged, clamped, free, sliding or fixed")
+    raise ValueError(f"the case format has no name for {support}; use {', '.join(names)}")
 
 
-def _ports(rig: Rig) -> list[str]:
+def _check_ports(rig: Rig) -> None:
+    """Refuse what a case file would be silent about.
+
+    Raises:
+        ValueError: naming the part, and what the format has for it.
+    """
+    if rig.elements:
+        raise ValueError(
+            f"the case format knows no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
+        )
+    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+    for port in ports:
+        plain = type(port)(port.name, port.at)  # type: ignore[arg-type]
+        kept = ("direct",) if isinstance(port, Actuator) else ("quantity", "noise_std")
+        other = [f.name for f in fields(port) if f.name not in kept and getattr(port, f.name) != getattr(plain, f.name)]
+        if other or isinstance(port.at, Between):
+            raise ValueError(
+                f"{port.name!r} has {other[0] if other else 'two places'} beside what the case format holds: a point"
+                " force or a reading at one place, with nothing lost on the way"
+            )
+
+
+def _ports(rig: Rig, *, at: Callable[[Any], dict[str, object]]) -> list[str]:
+    """Inputs and outputs; `at` gives the key of a place and its value."""
     inputs = [
-        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", at=a.at) for a in rig.actuators
+        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", **at(a.at)) for a in rig.actuators
     ]
     outputs = [
-        _table("[[output]]", name=s.name, quantity=s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors
+        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s.at), noise_std=s.noise_std) for s in rig.sensors
     ]
     return [*inputs, *outputs]
 

@@ -12,7 +12,7 @@ from typing import Any
 import control
 import numpy as np
 
-from workbench.identification.input_output.fit_errors import errors, fixed_std, pole_covariance
+from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.mode_clusters import overlap_remarks
@@ -40,10 +40,10 @@ class Driven(ModalEstimates):
     Attributes:
         modes: shapes of displacement, largest entry 1.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ); in white noise the Cramér-Rao bound at the estimate.
-        shape_std: (n_outputs, n_modes) standard error of the real part of each shape.
+        vector_covariance: (n_modes, k, k) of each mode's shape over its largest entry, real part, then of its
+            participation factors, real and imaginary parts; k = n_outputs + 2 n_inputs.
         participation: (n_modes, n_inputs) complex l_r, for c_r the shape as the outputs measure it, ψ_r λ_r^k with
             k = 0, 1, 2 for displacement, velocity, acceleration.
-        participation_std: (n_modes, n_inputs) its standard error, root mean square of real and imaginary part.
         feedthrough: (n_outputs, n_inputs) D: of accelerations, and of the modes above those identified.
         feedthrough_std: (n_outputs, n_inputs).
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
@@ -57,9 +57,8 @@ class Driven(ModalEstimates):
 
     modes: SampledModes
     covariance: np.ndarray
-    shape_std: np.ndarray
+    vector_covariance: np.ndarray
     participation: np.ndarray
-    participation_std: np.ndarray
     feedthrough: np.ndarray
     feedthrough_std: np.ndarray
     initial: tuple[np.ndarray, ...]
@@ -70,6 +69,21 @@ class Driven(ModalEstimates):
     remarks: tuple[str, ...]
     output_channels: tuple[Channel, ...]
     input_channels: tuple[Channel, ...]
+
+    @property
+    def shape_std(self) -> np.ndarray:
+        """Standard error of the real part of each shape (n_outputs, n_modes)."""
+        return self._vector_std[:, : self.modes.positions.size].T
+
+    @property
+    def participation_std(self) -> np.ndarray:
+        """Standard error of participation factors (n_modes, n_inputs), rms of real and imaginary part."""
+        real, imaginary = np.split(self._vector_std[:, self.modes.positions.size :], 2, axis=1)
+        return np.asarray(np.sqrt(0.5 * (real**2 + imaginary**2)))
+
+    @property
+    def _vector_std(self) -> np.ndarray:
+        return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)))
 
     @property
     def noise_std(self) -> np.ndarray:
@@ -279,29 +293,18 @@ def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, re
     scale = 0.5 * seen[largest, each] / shapes[largest, each]
     participation = fit.participation * scale[:, None]
 
-    def figures(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
-        seen = amplitudes / poles**derivative
-        relative = seen / seen[largest, each]
-        driven = (participation * (0.5 * seen[largest, each] / shapes[largest, each])[:, None])[:, :n_inputs]
-        return np.concatenate([relative.real.ravel(), driven.real.ravel(), driven.imag.ravel()])
-
     noise_ratio, beside = data.noise_ratios(fit)
-    std = np.sqrt(np.diag(errors(fit, figures, noise_ratio)))
-    m = len(channels)
-    shape_std = std[: m * n].reshape(m, n)
-    shape_std[largest, each] = 0.0
-    real, imaginary = std[m * n :].reshape(2, n, n_inputs)
-    direct = np.zeros((m, n_inputs))
-    direct_std = np.zeros((m, n_inputs))
+    vectors = vector_covariance(fit, noise_ratio, derivative, each, shapes[largest, each], n_inputs)
+    direct = np.zeros((len(channels), n_inputs))
+    direct_std = np.zeros_like(direct)
     if data.feedthrough:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
         direct_std = fixed_std(fit, noise_ratio, beside)[:n_inputs].T
     return Driven(
         modes=SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, records[0].positions),
         covariance=frozen(pole_covariance(fit, noise_ratio)),
-        shape_std=frozen(shape_std),
+        vector_covariance=frozen(vectors),
         participation=frozen(participation[:, :n_inputs], complex),
-        participation_std=frozen(np.sqrt(0.5 * (real**2 + imaginary**2))),
         feedthrough=frozen(direct),
         feedthrough_std=frozen(direct_std),
         initial=tuple(

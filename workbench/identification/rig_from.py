@@ -1,7 +1,8 @@
 """A rig from the modes that were identified on a bench: known at its inputs and outputs, and nowhere else."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes, PointShapes, SampledModes
 
 COMPLEX = 0.1  # share of a mode's residues that the nearest real mode may leave without a warning
+STEP = 1e-3  # of a standard error: of the differences that its propagation takes
 
 
 def rig_from(
@@ -43,7 +45,8 @@ def rig_from(
         modal_masses: (n_modes,) kg, for shapes whose largest entry is 1; where there is no driving point.
 
     Returns:
-        A rig at named points: each input and output is one, by its name.
+        A rig at named points: each input and output is one, by its name. Its modes carry the covariance of frequencies,
+        damping and shapes (of output-only modes the standard errors of shapes, where they are known).
 
     Raises:
         ValueError: channels that are missing, shapes that nothing scales, a driving point where a mode would have a
@@ -65,12 +68,12 @@ def rig_from(
             )
     if isinstance(identified, Driven | TransferModes):
         into = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
-        shapes, points = _of_residues(identified, modes, out, into, driving_point, modal_masses)
+        shapes = _of_residues(identified, out, into, driving_point, modal_masses)
         actuators = tuple(Actuator(c.name, c.name, kind="moment" if c.quantity == "moment" else "force") for c in into)
     else:
-        shapes, points = _of_shapes(modes, out, modal_masses)
+        shapes = _of_shapes(identified, out, modal_masses)
         names = [channel if isinstance(channel, str) else channel.name for channel in inputs or ()]
-        points.locate(names)
+        shapes.points.locate(names)
         actuators = tuple(Actuator(f"force at {name}", name) for name in names)
     noise = getattr(identified, "noise_std", [channel.noise_std or 0.0 for channel in out])
     sensors = tuple(
@@ -82,9 +85,10 @@ def rig_from(
     found = Modes(
         omega=modes.omega[order],
         damping=modes.zeta[order],
-        shapes=PointShapes(shapes[:, order]),
-        domain=points,
+        shapes=PointShapes(shapes.values[:, order]),
+        domain=shapes.points,
         covariance=np.asarray(identified.covariance)[np.ix_(both, both)],
+        shape_covariance=None if shapes.covariance is None else shapes.covariance[order],
     )
     return Rig(found, actuators, sensors)
 
@@ -101,64 +105,115 @@ def _channels(identified: Any, name: str, given: Sequence[Channel | str] | None,
     return channels
 
 
+@dataclass(frozen=True, eq=False)
+class _Shapes:
+    """Mass-normalised shapes (n_points, n_modes) and their covariance (n_modes, n_points, n_points), if it is known."""
+
+    values: np.ndarray
+    points: NamedPoints
+    covariance: np.ndarray | None
+
+
 def _of_residues(
-    identified: Any,
-    modes: SampledModes,
+    identified: Driven | TransferModes,
     out: tuple[Channel, ...],
     into: tuple[Channel, ...],
     driving_point: tuple[str, str] | None,
     modal_masses: ArrayLike | None,
-) -> tuple[np.ndarray, NamedPoints]:
-    """Shapes (n_points, n_modes) at inputs and outputs, and these as named points."""
-    turned = 2j * modes.poles.imag
-    # of displacement, whatever the outputs measure
-    residues = np.einsum("jr,ri,r->rji", modes.shapes, identified.participation, turned)
-    left, sizes, right = np.linalg.svd(residues.real)
+) -> _Shapes:
+    """Shapes at inputs and outputs, an input of the name of an output being the same point."""
+    modes = identified.modes
+    residues = _residues(modes, modes.shapes, identified.participation)
+    sizes = np.linalg.svd(residues.real, compute_uv=False)
     cost = np.sqrt(np.maximum(1.0 - sizes[:, 0] ** 2 / np.sum(np.abs(residues) ** 2, axis=(1, 2)), 0.0))
     for r in np.flatnonzero(cost > COMPLEX):
         warnings.warn(
             f"mode {r + 1} at {modes.frequencies_hz[r]:.4g} Hz is complex: the nearest real mode leaves"
             f" {100 * cost[r]:.0f} % of its residues",
-            stacklevel=3,
+            stacklevel=4,
         )
-    root = np.sqrt(sizes[:, 0])
-    at_out, at_in = left[:, :, 0].T * root, right[:, 0].T * root
     pair = _pair(out, into, driving_point)
-    if pair is not None:
-        j, i = pair
-        ratio = at_in[i] / np.where(at_out[j] == 0, np.nan, at_out[j])
-        if not (ratio > 0).all():
-            worst = int(np.argmin(np.where(np.isnan(ratio), -np.inf, ratio)))
-            raise ValueError(
-                f"mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz has a negative mass at the driving point"
-                f" ({into[i].name}, {out[j].name}): is a sensor turned round, or is the mode noise?"
-            )
-    elif modal_masses is not None:
-        largest = np.abs(at_out).max(axis=0)
-        ratio = (1.0 / np.sqrt(_masses(modal_masses, modes.n_modes)) / largest) ** 2
-    else:
-        ratio = np.ones(modes.n_modes)
+    masses = None if modal_masses is None else _masses(modal_masses, modes.n_modes)
+    at_out, at_in = np.split(_scaled(residues.real, pair, masses), [len(out)], axis=1)
+    if pair is not None and not (at_out[:, pair[0]] * at_in[:, pair[1]] > 0).all():
+        worst = int(np.argmin(at_out[:, pair[0]] * at_in[:, pair[1]]))
+        raise ValueError(
+            f"mode {worst + 1} at {modes.frequencies_hz[worst]:.4g} Hz has a negative mass at the driving point"
+            f" ({into[pair[1]].name}, {out[pair[0]].name}): is a sensor turned round, or is the mode noise?"
+        )
+    if pair is None and masses is None:
         warnings.warn(
             "no output stands where an input acts, so the shapes have no scale: responses to these inputs are right,"
             " those to masses, springs or forces elsewhere are not; give driving_point= or modal_masses=",
-            stacklevel=3,
+            stacklevel=4,
         )
-    at_out, at_in = at_out * np.sqrt(ratio), at_in / np.sqrt(ratio)
-    names = {channel.name: (channel, row) for channel, row in zip(into, at_in, strict=True)}
-    names |= {channel.name: (channel, row) for channel, row in zip(out, at_out, strict=True)}
-    return np.array([row for _, row in names.values()]), _points([channel for channel, _ in names.values()])
+    rows = {channel.name: (channel, i) for i, channel in enumerate((*into, *out), start=-len(into))}
+    kept = [i % (len(out) + len(into)) for _, i in rows.values()]
+    spread = _spread(identified, lambda residues: _scaled(residues.real, pair, masses)[:, kept])
+    values = np.hstack([at_out, at_in])[:, kept].T
+    return _Shapes(values, _points([channel for channel, _ in rows.values()]), spread)
 
 
-def _of_shapes(
-    modes: SampledModes, out: tuple[Channel, ...], modal_masses: ArrayLike | None
-) -> tuple[np.ndarray, NamedPoints]:
+def _residues(modes: SampledModes, shapes: np.ndarray, participation: np.ndarray) -> np.ndarray:
+    """A_ji (n_modes, n_outputs, n_inputs) complex, of displacement, whatever the outputs measure."""
+    return np.asarray(np.einsum("jr,ri,r->rji", shapes, participation, 2j * modes.poles.imag))
+
+
+def _scaled(residues: np.ndarray, pair: tuple[int, int] | None, masses: np.ndarray | None) -> np.ndarray:
+    """Shapes (n_modes, n_outputs + n_inputs) of the nearest real modes, mass-normalised where the scale is known.
+
+    Args:
+        residues: (n_modes, n_outputs, n_inputs) real.
+        pair: indices of an output and the input at its place.
+        masses: (n_modes,) kg, for shapes whose largest entry is 1.
+    """
+    left, sizes, right = np.linalg.svd(residues)
+    root = np.sqrt(sizes[:, :1])
+    at_out, at_in = left[:, :, 0] * root, right[:, 0] * root
+    if pair is not None:
+        ratio = np.abs(at_in[:, pair[1]] / np.where(at_out[:, pair[0]] == 0, np.nan, at_out[:, pair[0]]))
+    elif masses is not None:
+        ratio = 1.0 / (masses * np.abs(at_out).max(axis=1) ** 2)
+    else:
+        ratio = np.ones(len(residues))
+    return np.hstack([at_out * np.sqrt(ratio)[:, None], at_in / np.sqrt(ratio)[:, None]])
+
+
+def _spread(identified: Driven | TransferModes, figures: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """Covariance (n_modes, n_figures, n_figures) of what `figures` makes of residues, to first order.
+
+    Errors of ω_d are left out: against those of shapes they are nothing.
+    """
+    modes, errors = identified.modes, identified.vector_covariance
+    m, q = modes.shapes.shape[0], identified.participation.shape[1]
+    values, vectors = np.linalg.eigh(errors)
+    steps = STEP * vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    largest = modes.shapes[np.abs(modes.shapes).argmax(axis=0), np.arange(modes.n_modes)]
+    middle = figures(_residues(modes, modes.shapes, identified.participation))
+    slopes = []
+    for step in np.moveaxis(steps, 2, 0):
+        shape, turn = step[:, :m].T * largest, step[:, m : m + q] + 1j * step[:, m + q :]
+        both = [
+            figures(_residues(modes, modes.shapes + sign * shape, identified.participation + sign * turn))
+            for sign in (1.0, -1.0)
+        ]
+        # a singular vector has no sign of its own
+        above, below = (f * np.where(np.sum(f * middle, axis=1, keepdims=True) < 0, -1.0, 1.0) for f in both)
+        slopes.append((above - below) / (2.0 * STEP))
+    return np.asarray(np.einsum("kri,krj->rij", slopes, slopes))
+
+
+def _of_shapes(identified: Any, out: tuple[Channel, ...], modal_masses: ArrayLike | None) -> _Shapes:
+    modes = identified.modes
     if modal_masses is None:
         raise ValueError(
             "no input was measured, so the shapes have no scale; give modal_masses= for shapes whose largest entry is 1"
         )
     largest = modes.shapes[np.argmax(np.abs(modes.shapes), axis=0), np.arange(modes.n_modes)]
-    shapes = (modes.shapes / largest).real / np.sqrt(_masses(modal_masses, modes.n_modes))
-    return shapes, _points(out)
+    root = np.sqrt(_masses(modal_masses, modes.n_modes))
+    std = getattr(identified, "shape_std", None)
+    covariance = None if std is None else np.array([np.diag(row**2) for row in (std / np.abs(largest) / root).T])
+    return _Shapes((modes.shapes / largest).real / root, _points(out), covariance)
 
 
 def _masses(modal_masses: ArrayLike, n_modes: int) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
-from workbench.identification.input_output.fit_errors import errors, pole_covariance
+from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.mode_clusters import NARROW, overlap_remarks, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
@@ -43,7 +43,8 @@ class TransferModes(ModalEstimates):
     Attributes:
         modes: shapes of displacement, largest entry 1.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
-        shape_std: (n_outputs, n_modes) standard error of the real part of each shape.
+        vector_covariance: (n_modes, k, k) of each mode's shape over its largest entry, real part, then of its
+            participation factors, real and imaginary parts; k = n_outputs + 2 n_references.
         participation: (n_modes, n_references) complex l_r, for c_r the shape as the outputs measure it.
         misfit: (n_outputs,) rms of the residual: in units of the stated noise (1 where it is noise alone), or, where
             none was stated, of real and imaginary part each, in the unit of the output.
@@ -60,7 +61,7 @@ class TransferModes(ModalEstimates):
 
     modes: SampledModes
     covariance: np.ndarray
-    shape_std: np.ndarray
+    vector_covariance: np.ndarray
     participation: np.ndarray
     misfit: np.ndarray
     evidence: np.ndarray
@@ -70,6 +71,12 @@ class TransferModes(ModalEstimates):
     fitted: np.ndarray
     frequencies_hz: np.ndarray
     remarks: tuple[str, ...] = ()
+
+    @property
+    def shape_std(self) -> np.ndarray:
+        """Standard error of the real part of each shape (n_outputs, n_modes)."""
+        n_outputs = self.modes.positions.size
+        return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)[:, :n_outputs].T))
 
 
 def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:
@@ -206,21 +213,15 @@ def _modes_of(
     seen = fit.amplitudes[:, inside] / poles**derivative
     largest, each = np.abs(seen).argmax(axis=0), np.arange(n)
 
-    def relative(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
-        seen = amplitudes[:, inside] / poles[inside] ** derivative
-        return (seen / seen[largest, each]).real.ravel()
-
-    std = np.zeros((len(channels), n))
-    if n:
-        std = np.sqrt(np.diag(errors(fit, relative, noise_ratio))).reshape(len(channels), n)
-        std[largest, each] = 0.0
     both = np.r_[inside, fit.poles.size + inside]
     shapes = normalised_shapes(seen) if n else seen
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     return TransferModes(
         modes=SampledModes(np.abs(poles), -poles.real / np.abs(poles), shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(both, both)]),
-        shape_std=frozen(std),
+        vector_covariance=frozen(
+            vector_covariance(fit, noise_ratio, derivative, inside, shapes[largest, each], participation.shape[1])
+        ),
         participation=frozen(participation * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
         misfit=frozen(lines.misfit(fit)),
         evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
@@ -262,7 +263,7 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
     return TransferModes(
         modes=SampledModes(omega, zeta, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(both, both)]),
-        shape_std=frozen(np.hstack([band.shape_std for band in found])),
+        vector_covariance=frozen(np.concatenate([band.vector_covariance for band in found])),
         participation=frozen(np.vstack([band.participation for band in found]), complex),
         misfit=frozen(np.sqrt(share @ np.array([band.misfit for band in found]) ** 2)),
         evidence=frozen(np.concatenate([band.evidence for band in found])),

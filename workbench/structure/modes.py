@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.structure.domain import Between, Derivative, Domain, Interval, Where, as_domain
+from workbench.structure.domain import Between, Derivative, Domain, Interval, NamedPoints, Where, as_domain
 from workbench.structure.printed import Printed, counted
 
 Shapes = Callable[[np.ndarray, Any], np.ndarray]
@@ -52,6 +52,8 @@ class Modes(Printed):
         domain: which places there are; a number is the length, m, of an interval.
         essential: ((x, derivative), ...) where the supports of an interval hold the shape or its slope at zero.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), where the modes were identified; None where computed.
+        shape_covariance: (n_modes, n_points, n_points) of each mode's shape at named points, where identified, each
+            mode by itself; None where computed, or where the identification tells none.
 
     Raises:
         ValueError: negative or non-finite frequencies, mismatched shapes.
@@ -63,6 +65,7 @@ class Modes(Printed):
     domain: Domain
     essential: tuple[tuple[float, int], ...] = ()
     covariance: np.ndarray | None = None
+    shape_covariance: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "domain", as_domain(self.domain))
@@ -83,6 +86,14 @@ class Modes(Printed):
         object.__setattr__(self, "damping", frozen(damping))
         if self.covariance is not None:
             object.__setattr__(self, "covariance", frozen(self.covariance))
+        if self.shape_covariance is not None:
+            object.__setattr__(self, "shape_covariance", frozen(self.shape_covariance))
+            n_points = len(self.domain.names) if isinstance(self.domain, NamedPoints) else 0
+            if self.shape_covariance.shape != (omega.size, n_points, n_points):
+                raise ValueError(
+                    f"Modes.shape_covariance is of shapes at named points, {(omega.size, n_points, n_points)}; got"
+                    f" {self.shape_covariance.shape} on {self.domain}"
+                )
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         rows = [
@@ -184,6 +195,7 @@ class Modes(Printed):
             domain=self.domain,
             essential=self.essential,
             covariance=covariance,
+            shape_covariance=None if self.shape_covariance is None else self.shape_covariance[index],
         )
 
 

@@ -76,6 +76,38 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
     return jacobian.T @ jacobian
 
 
+def vector_covariance(
+    fit: Fit, noise_ratio: np.ndarray, derivative: np.ndarray, kept: np.ndarray, scale: np.ndarray, n_inputs: int
+) -> np.ndarray:
+    """Of each mode's shape over its largest entry, real part, then of its participation factors, real and imaginary.
+
+    Args:
+        noise_ratio: κ, (n_outputs, n_modes).
+        derivative: (n_outputs, 1) in time, of what each output measures.
+        kept: (n_kept,) the modes that are reported.
+        scale: (n_kept,) their largest entries, as they are reported.
+        n_inputs: how many excitations, the first ones, are inputs.
+
+    Returns:
+        (n_kept, k, k), k = n_outputs + 2 n_inputs.
+    """
+    k = len(fit.amplitudes) + 2 * n_inputs
+    if not kept.size:
+        return np.zeros((0, k, k))
+    largest = np.abs(fit.amplitudes[:, kept] / fit.poles[kept] ** derivative).argmax(axis=0)
+    each = np.arange(kept.size)
+
+    def figures(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
+        seen = amplitudes[:, kept] / poles[kept] ** derivative
+        relative = seen / seen[largest, each]
+        driven = participation[kept, :n_inputs] * (0.5 * seen[largest, each] / scale)[:, None]
+        return np.concatenate([relative.real.T, driven.real, driven.imag], axis=1).ravel()
+
+    found = errors(fit, figures, noise_ratio).reshape(kept.size, k, kept.size, k)[each, :, each]
+    found[each, largest], found[each, :, largest] = 0.0, 0.0  # one by definition
+    return found
+
+
 def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Standard errors of the coefficients of the fixed columns, (n_fixed, n_outputs).
 
