@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.how_many import HowMany
-from workbench.design.placement.placement import Placement
+from workbench.design.placement.task import Placement, listed
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.accuracy import plot_bands
@@ -24,6 +24,7 @@ from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
 from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.modes import Modes, SampledModes
+from workbench.structure.printed import place_text
 
 MOST_PANELS = 12
 
@@ -121,9 +122,9 @@ def _(result: Spillover) -> Figure:
 @plot.register
 def _(result: Placement) -> Figure:
     figure, ax = new_figure(width=9, height=3.5)
-    numbers = result.positions.size + 1 + np.arange(result.by_mode.size)
+    numbers = len(result.positions) + 1 + np.arange(result.by_mode.size)
     ax.bar(numbers, result.by_mode)
-    where = ", ".join(f"{x:.3g}" for x in result.positions)
+    where = "; ".join(place_text(place) for place in listed(result.positions))
     ax.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers)
     ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
     return figure

@@ -9,6 +9,8 @@ from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
 
 from workbench.design.loop.closed_loop import Response
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.task import Placement, PlacementTask
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.structure.domain import TRANSLATIONS, NamedPoints, Rectangle
 from workbench.structure.modes import Modes
@@ -82,6 +84,43 @@ def plot_surface_motion(
     for ax in grid.flat:
         _bare(ax, first.modes)
     figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8)
+    return figure
+
+
+def plot_surface_placement(
+    task: PlacementTask,
+    placements: Mapping[str, Placement],
+    *,
+    limits: Limits | None = None,
+    struck: tuple[float, float] | None = None,
+) -> Figure:
+    """Actuators on a plate over mode n + 1, whose nodal lines are black, and the work in each residual mode beside.
+
+    Args:
+        placements: by name, drawn in its colour.
+        limits: of which the forbidden zones are hatched.
+        struck: where the impulse acts, marked by a star.
+    """
+    n, modes = task.n_controlled, task.modes
+    assert isinstance(modes.domain, Rectangle)
+    x, y, fields = _over(modes, np.eye(modes.n_modes)[:, n : n + 1])
+    figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
+    left.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
+    left.contour(x, y, fields[0].T, levels=[0.0], colors="black", linewidths=1.4)
+    for (x0, y0), (x1, y1) in limits.forbidden if limits is not None else ():  # type: ignore[misc]
+        left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2)
+    numbers = n + 1 + np.arange(modes.n_modes - n)
+    width = 0.8 / len(placements)
+    for i, (name, placement) in enumerate(placements.items()):
+        label = f"{name}: W_R = {placement.residual_work:.2g}"
+        left.plot(*placement.positions.T, "o", color=COLOURS[i], markersize=10, label=label, zorder=3)
+        right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
+    if struck is not None:
+        left.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
+    _bare(left, modes)
+    left.set_title(f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, and its nodal lines", fontsize=10)
+    left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
+    right.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers, yscale="log")
     return figure
 
 

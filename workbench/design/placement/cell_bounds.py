@@ -77,9 +77,9 @@ class CellBounds:
         intervals: the halved length.
     """
 
-    def __init__(self, task: PlacementTask, limits: Limits) -> None:
+    def __init__(self, task: PlacementTask, limits: Limits, intervals: Intervals | None = None) -> None:
         n = task.n_controlled
-        self.intervals = Intervals.of(task)
+        self.intervals = Intervals.of(task) if intervals is None else intervals
         forces = task.forces[:, :: max(1, task.forces.shape[1] // INSTANTS)]
         # what is limited, as tr(B⁻¹ S B⁻ᵀ) <= L²: the effort; n times the square of the peak, above any mean of the
         # forces' squares; and the condition, L = limit / ‖B‖

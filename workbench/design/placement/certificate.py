@@ -1,25 +1,28 @@
 """How far an optimum of placement can be from the best there is: branch and bound over all places.
 
-Cells of places are halved, the least bounded first, until none that a limit leaves open could hold a placement that
-beats the optimum by more than the gap; `workbench.design.placement.cell_bounds` has their bounds.
+Cells of places, or of candidates, are halved, the least bounded first, until none that a limit leaves open could hold a
+placement that beats the optimum by more than the gap; `workbench.design.placement.cell_bounds` has their bounds.
 """
 
 import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
+from math import comb
 
 import numpy as np
 
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.cell_bounds import LEVELS, CellBounds
+from workbench.design.placement.cell_bounds import CellBounds
+from workbench.design.placement.cell_tree import CellTree
 from workbench.design.placement.limits import Limits, takes_former_limits
 from workbench.design.placement.placement import place
-from workbench.design.placement.scan import scan
-from workbench.design.placement.task import Placement, PlacementTask
-from workbench.structure.modes import frozen
+from workbench.design.placement.scan import MOST_TRIED, allowed_places, scan
+from workbench.design.placement.task import Placement, PlacementTask, listed
+from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.structure.printed import place_text
 from workbench.threads import one_blas_thread
 
 START_LEVEL = 3  # halvings of the length before the first bound
@@ -40,9 +43,9 @@ class Certificate:
         lower_bound: no placement under the limits has a smaller W_R.
         cells: examined.
         complete: whether the gap asked for is proven; if not, the bound holds none the less.
-        better: (n_actuators,) places met on the way that beat the placement by more than the gap; None where none do.
+        better: places met on the way that beat the placement by more than the gap; None where none do.
         cell: (n_actuators, 2) the intervals of places (from, to), m, that hold the bound; None where the proof is
-            complete.
+            complete, and among candidates.
         seconds: taken.
     """
 
@@ -62,7 +65,8 @@ class Certificate:
     def __str__(self) -> str:
         count = f"{self.cells:,} cells, {self.seconds:.0f} s"
         if self.better is not None:
-            return f"not the optimum: actuators at {_listed(self.better)} m spill less ({count})"
+            unit = "" if self.better.dtype == object else " m"
+            return f"not the optimum: actuators at {_listed(self.better)}{unit} spill less ({count})"
         text = f"no placement under the limits spills less than {1.0 - self.gap:.1%} of this one ({count})"
         if self.cell is None:
             return text
@@ -71,7 +75,8 @@ class Certificate:
 
 
 def _listed(places: np.ndarray) -> str:
-    return ", ".join(f"{x:.4g}" for x in places)
+    each = [place_text(place) for place in listed(places)]
+    return "; ".join(each) if places.ndim > 1 else ", ".join(each)
 
 
 @takes_former_limits
@@ -106,9 +111,14 @@ def certify(
         raise DesignError(
             "without a limit B may come as near to singular as it likes; give one of effort, peak force or condition"
         )
+    domain = task.modes.domain
+    if isinstance(domain, Rectangle) and limits.candidates is None:
+        raise DesignError("a proof on a rectangle is among candidate places; give limits candidates, on a grid say")
+    if isinstance(domain, NamedPoints) and limits.candidates is None:
+        limits = replace(limits, candidates=tuple(listed(allowed_places(task, limits, 0))))
     began = time.monotonic()
     best = place(task, limits) if placement is None else placement
-    if limits.candidates is not None:
+    if limits.candidates is not None and comb(len(limits.candidates), task.n_controlled) <= MOST_TRIED:
         least, tried = scan(task, limits)
         found = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None
         bound = min(least.residual_work, best.residual_work)
@@ -122,13 +132,8 @@ class _Search:
     def __init__(self, task: PlacementTask, limits: Limits, best: Placement, gap: float) -> None:
         self._task, self._limits, self._best = task, limits, best
         self._wanted = np.sqrt(best.residual_work * (1.0 - gap))
-        self._bounds = CellBounds(task, limits)
-        table = self._bounds.intervals
-        stretches = np.array(limits.intervals(task.n_controlled, task.modes.length, task.reach[0]))
-        low, high = table.centre - table.half, table.centre + table.half
-        self._low, self._high = low, high
-        self._stands = ((high[:, None] >= stretches[:, 0]) & (low[:, None] <= stretches[:, 1])).any(axis=1)
-        self._stretches = stretches
+        self._tree = CellTree.of(task, limits)
+        self._bounds = CellBounds(task, limits, self._tree.table)
         self._shelves: list[list[np.ndarray]] = [[] for _ in range(SHELVES)]
         self._stuck = np.inf  # least bound of a cell that is as small as the table has them
         self._stuck_cell: np.ndarray | None = None
@@ -144,7 +149,7 @@ class _Search:
                 better = self._shelve(self._kept(cells), pool, workers)
                 spent = time.monotonic() - began
                 if better is not None:
-                    return Certificate(self._best, 0.0, self.cells, False, frozen(better), seconds=spent)
+                    return Certificate(self._best, 0.0, self.cells, False, better, seconds=spent)
                 if progress is not None:
                     progress(self._lowest()[0] ** 2, self._best.residual_work, self.cells)
                 if spent > seconds or self.cells > most_cells:
@@ -159,8 +164,9 @@ class _Search:
 
     def _kept(self, cells: np.ndarray) -> np.ndarray:
         """Cells in order, no closer than the spacing everywhere, and each interval with a place to stand."""
-        apart = self._high[cells[:, 1:]] - self._low[cells[:, :-1]] >= self._limits.spacing
-        return cells[apart.all(axis=1) & self._stands[cells].all(axis=1)]
+        tree = self._tree
+        apart = tree.high[cells[:, 1:]] - tree.low[cells[:, :-1]] >= tree.apart
+        return cells[apart.all(axis=1) & tree.stands[cells].all(axis=1)]
 
     def _halved(self, rows: np.ndarray) -> np.ndarray:
         """Both halves of each cell along its axis, the last column; (n_cells, n_actuators + 2) with the bound."""
@@ -184,11 +190,16 @@ class _Search:
         open_ = lower < self._wanted
         cells, lower, axis = cells[open_], lower[open_], axis[open_]
         # an axis that cannot be halved further gives way to the widest
-        smallest = 2**LEVELS - 1
+        smallest = 2**self._tree.levels - 1
         at_end = cells[np.arange(len(cells)), axis] >= smallest
         axis[at_end] = cells[at_end].argmin(axis=1)
         stuck = cells.min(axis=1, initial=smallest) >= smallest if len(cells) else np.zeros(0, bool)
-        if stuck.any():
+        if stuck.any() and self._tree.kept is not None:  # single candidates, whose W_R is known
+            known = self._tree.kept(cells[stuck])
+            better = self._better(cells[stuck], np.sqrt(known))
+            if better is not None:
+                return better
+        elif stuck.any():
             i = int(np.argmin(np.where(stuck, lower, np.inf)))
             if lower[i] < self._stuck:
                 self._stuck, self._stuck_cell = float(lower[i]), cells[i]
@@ -202,10 +213,12 @@ class _Search:
         for i in np.argsort(work)[:TRIED]:
             if not work[i] < self._wanted:
                 break
-            places = self._bounds.intervals.centre[cells[i]]
-            stands = ((places[:, None] >= self._stretches[:, 0]) & (places[:, None] <= self._stretches[:, 1])).any(1)
-            if stands.all() and self._limits.satisfied_by(self._task.placed(places, "")):
-                return places
+            places = self._tree.places(cells[i])
+            if places is None:
+                continue
+            placement = self._task.placed(places, "")
+            if placement.residual_work < self._wanted**2 and self._limits.satisfied_by(placement):
+                return placement.positions
         return None
 
     def _lowest(self) -> tuple[float, np.ndarray | None]:
@@ -216,7 +229,9 @@ class _Search:
             i = int(np.argmin(rows[:, -2]))
             if rows[i, -2] < bound:
                 bound, cell = float(rows[i, -2]), rows[i, :-2].astype(np.int64)
-        return bound, None if cell is None else np.column_stack([self._low[cell], self._high[cell]])
+        if cell is None or self._tree.kept is not None:
+            return bound, None
+        return bound, np.column_stack([self._tree.low[cell], self._tree.high[cell]])
 
 
 def _taken(shelf: list[np.ndarray]) -> np.ndarray:

@@ -11,11 +11,16 @@ from warnings import warn
 import numpy as np
 
 from workbench.design.laws.law import DesignError
+from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
+from workbench.structure.domain import Interval, NamedPoints, Place, position, same_place
 
 TOLERANCE = 2e-6
 APART = 1e-6  # of the length: actuators closer than this stand at one place
 DRAWS = 20_000
+SAMPLES = 40  # of every box
+
+Zone = tuple[Place, Place]
 
 
 @dataclass(frozen=True)
@@ -27,9 +32,11 @@ class Limits:
         peak_force: largest force of any actuator.
         condition: of B, largest ‖B‖‖B⁻¹‖ in the Frobenius norm (n where B is orthogonal).
         spacing: least distance between neighbours, m.
-        margin: least distance from the ends, m.
-        forbidden: intervals (from, to) where no actuator can stand, m.
-        candidates: the only places there are, m; None where an actuator may stand anywhere else.
+        margin: least distance from the ends or edges, m.
+        forbidden: zones where no actuator can stand, m: intervals (from, to), or on a rectangle boxes between two
+            corners ((x, y), (x, y)).
+        candidates: the only places there are; None where an actuator may stand anywhere else. Of named points all that
+            are displacements (for moments, rotations), unless given.
     """
 
     effort: float = np.inf
@@ -37,8 +44,8 @@ class Limits:
     condition: float = np.inf
     spacing: float = 0.0
     margin: float = 0.0
-    forbidden: tuple[tuple[float, float], ...] = ()
-    candidates: tuple[float, ...] | None = None
+    forbidden: tuple[Zone, ...] = ()
+    candidates: tuple[Place, ...] | None = None
 
     def __post_init__(self) -> None:
         for name in ("effort", "peak_force", "condition"):
@@ -48,11 +55,13 @@ class Limits:
         if not (0 <= self.spacing < np.inf and 0 <= self.margin < np.inf):
             raise DesignError(f"spacing and margin must be 0 or more; got {self.spacing:g} and {self.margin:g}")
         for low, high in self.forbidden:
-            if not low < high:
-                raise DesignError(f"forbidden interval ({low:g}, {high:g}) must run from less to more")
-        object.__setattr__(self, "forbidden", tuple((float(low), float(high)) for low, high in self.forbidden))
+            if not np.less(low, high).all():
+                raise DesignError(f"forbidden zone ({low}, {high}) must run from less to more")
+        zones = tuple((same_place(low), same_place(high)) for low, high in self.forbidden)
+        object.__setattr__(self, "forbidden", zones)
         if self.candidates is not None:
-            object.__setattr__(self, "candidates", tuple(sorted(float(x) for x in self.candidates)))
+            candidates = [same_place(place) for place in self.candidates]
+            object.__setattr__(self, "candidates", tuple(sorted(dict.fromkeys(candidates))))
 
     @property
     def regular(self) -> bool:
@@ -71,7 +80,7 @@ class Limits:
         """
         margin = max(self.margin, clear)
         at, intervals = margin, []
-        for low, high in sorted(self.forbidden):
+        for low, high in sorted((position(low), position(high)) for low, high in self.forbidden):
             if low > at:
                 intervals.append((at, min(low, length - margin)))
             at = max(at, high)
@@ -80,6 +89,27 @@ class Limits:
         if not intervals:
             raise DesignError(f"margin {margin:g} and the forbidden intervals leave no place of {length:g} m")
         return intervals
+
+    def boxes(self, task: PlacementTask) -> list[Box]:
+        """Where actuators may stand, as boxes (low, high) of coordinates, m; none for named points.
+
+        Raises:
+            DesignError: no room for all of them, or zones of another domain.
+        """
+        domain = task.modes.domain
+        if isinstance(domain, Interval):
+            stretches = self.intervals(task.n_controlled, domain.length, task.reach[0])
+            return [(np.array([low]), np.array([high])) for low, high in stretches]
+        if isinstance(domain, NamedPoints):
+            if self.forbidden or self.margin:
+                raise DesignError("named points have no zones or margins; give the candidates that are allowed")
+            if self.spacing and domain.positions is None:
+                raise DesignError("the positions of the points are not known, so no spacing can be kept; give them")
+            return []
+        zones = tuple((np.atleast_1d(low), np.atleast_1d(high)) for low, high in self.forbidden)
+        if any(part.shape != (2,) for zone in zones for part in zone):
+            raise DesignError(f"a forbidden zone of a rectangle is ((x, y), (x, y)), m; got {self.forbidden}")
+        return free_boxes(domain, self.margin, zones)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """The same, where n actuators find room at all.
@@ -108,20 +138,26 @@ class Limits:
             )
         return intervals
 
-    def violations(self, positions: np.ndarray, costs: Any) -> dict[str, np.ndarray]:
-        """By name, by how much each of many placements (n_placements, n) exceeds a limit, relative; <= 0 if kept."""
-        gaps = np.diff(positions, axis=1).min(axis=1, initial=np.inf)
+    def violations(self, at: np.ndarray, costs: Any) -> dict[str, np.ndarray]:
+        """By name, by how much each of many placements exceeds a limit, relative; <= 0 if kept.
+
+        Args:
+            at: coordinates of the actuators, (n_placements, n) or (n_placements, n, n_coordinates), m.
+        """
+        return self._exceeded(least_distances(at), costs)
+
+    def _exceeded(self, gaps: np.ndarray, costs: Any) -> dict[str, np.ndarray]:
         return {
             "effort": _excess(costs.effort, self.effort),
             "peak force": _excess(costs.peak_force, self.peak_force),
             "condition": _excess(costs.condition, self.condition),
-            "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(len(positions)),
+            "spacing": (self.spacing - gaps) / self.spacing if self.spacing > 0 else np.zeros(len(gaps)),
         }
 
     def satisfied_by(self, placement: Placement) -> bool:
         """Whether a placement keeps all of them, its peak force that of all time; its places are taken as allowed."""
         costs = {name: np.array([getattr(placement, name)]) for name in ("effort", "peak_force", "condition")}
-        violations = self.violations(placement.positions[None], SimpleNamespace(**costs))
+        violations = self._exceeded(np.array([placement.spacing]), SimpleNamespace(**costs))
         return all(excess[0] <= TOLERANCE for excess in violations.values())
 
 
@@ -154,15 +190,19 @@ def _excess(values: np.ndarray, limit: float) -> np.ndarray:
 
 
 def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None) -> str:
-    """Which limit cannot be met, or which two not together, and what could be: the words of a refusal."""
-    n, length = task.n_controlled, task.modes.length
+    """Which limit cannot be met, or which two not together, and what could be: the words of a refusal.
+
+    Args:
+        grid: places to draw from; such as the limits allow unless given.
+    """
+    n, domain = task.n_controlled, task.modes.domain
     if grid is None:
-        grid = np.concatenate([np.linspace(*stretch, 40) for stretch in limits.allowed(length, task.reach[0])])
+        per_side = SAMPLES if isinstance(domain, Interval) else round(np.sqrt(SAMPLES))
+        grid = np.concatenate([_samples(low, high, per_side) for low, high in limits.boxes(task)])
     rng = np.random.default_rng(0)
-    draws = rng.random((DRAWS, grid.size)).argsort(axis=1)[:, :n]
-    positions = np.sort(grid[draws], axis=1)
-    costs = batch_costs(task, task.shapes(positions))
-    violations = limits.violations(positions, costs)
+    draws = np.sort(rng.random((DRAWS, len(grid))).argsort(axis=1)[:, :n], axis=1)
+    costs = batch_costs(task, task.shapes(grid)[draws])
+    violations = limits.violations(coordinates(domain, grid)[draws], costs)
     within = {name: excess <= TOLERANCE for name, excess in violations.items()}
     measured = {"effort": costs.effort, "peak force": costs.peak_force, "condition": costs.condition}
     asked = {"effort": limits.effort, "peak force": limits.peak_force, "condition": limits.condition}
@@ -185,3 +225,9 @@ def conflict(task: PlacementTask, limits: Limits, grid: np.ndarray | None = None
                 f" {other} met was {least:.4g}: raise one of them"
             )
     return f"{head} together, though any two can be met; raise one of them"
+
+
+def _samples(low: np.ndarray, high: np.ndarray, per_side: int) -> np.ndarray:
+    """Even places over a box: (n_samples,) along an interval, (n_samples, 2) on a rectangle."""
+    along = np.meshgrid(*(np.linspace(*ends, per_side) for ends in zip(low, high, strict=True)), indexing="ij")
+    return np.squeeze(np.stack(along, axis=-1).reshape(-1, low.size), axis=1 if low.size == 1 else ())

@@ -7,11 +7,14 @@ import numpy as np
 
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.limits import TOLERANCE, Limits, conflict, takes_former_limits
+from workbench.design.placement.places import as_places, coordinates, free_places, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
+from workbench.structure.domain import Interval, NamedPoints
 from workbench.threads import one_blas_thread
 
 BATCH = 20_000
 MOST_TRIED = 5_000_000
+DRAWN = 2000  # choices of which the best are exchanged
 
 
 @takes_former_limits
@@ -20,38 +23,30 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
     """The best of all placements on the limits' candidate places, or on a grid, and how many were tried.
 
     Args:
-        n_places: of the grid, where the limits name no candidates.
+        n_places: of the grid, along the longer side, where the limits name no candidates.
 
     Raises:
         DesignError: fewer places than actuators, more choices of them than can be tried, or limits that none meets,
             with the one that conflicts.
     """
-    n, length = task.n_controlled, task.modes.length
-    intervals = limits.intervals(n, length, task.reach[0])
-    if limits.candidates is None:
-        edge = max(limits.margin, task.reach[0], length / n_places / 2)
-        grid = np.linspace(edge, length - edge, n_places)
-    else:
-        grid = np.array(limits.candidates)
-    grid = grid[np.any([(grid >= low - 1e-12) & (grid <= high + 1e-12) for low, high in intervals], axis=0)]
-    if grid.size < n:
-        raise DesignError(f"{n} actuators need as many places; the limits leave {grid.size}: allow more")
-    if comb(grid.size, n) > MOST_TRIED:
+    n, domain = task.n_controlled, task.modes.domain
+    grid = allowed_places(task, limits, n_places)
+    if comb(len(grid), n) > MOST_TRIED:
         raise DesignError(
-            f"{n} actuators at {grid.size} places make {comb(grid.size, n):.2g} choices; at most {MOST_TRIED:.0e} are"
+            f"{n} actuators at {len(grid)} places make {comb(len(grid), n):.2g} choices; at most {MOST_TRIED:.0e} are"
             " tried: name fewer places, or let the actuators stand anywhere"
         )
-    shapes = task.shapes(grid)
+    shapes, at = task.shapes(grid), coordinates(domain, grid)
     best, best_at, tried = np.inf, None, 0
-    every = combinations(range(grid.size), n)
+    every = combinations(range(len(grid)), n)
     while batch := list(islice(every, BATCH)):
         index = np.array(batch)
-        index = index[(np.diff(grid[index], axis=1) >= limits.spacing - 1e-12).all(axis=1)]
+        index = index[least_distances(at[index]) >= limits.spacing - 1e-12]
         if not index.size:
             continue
         tried += len(index)
         costs = batch_costs(task, shapes[index])
-        violations = limits.violations(grid[index], costs)
+        violations = limits.violations(at[index], costs)
         work = np.where(np.all([v <= TOLERANCE for v in violations.values()], axis=0), costs.work, np.inf)
         # the forces of many are sampled in time; what would win must keep its peak between the samples too
         while work[i := int(np.argmin(work))] < best:
@@ -61,3 +56,75 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
     if best_at is None:
         raise DesignError(conflict(task, limits, grid))
     return task.placed(best_at, f"best of {tried} placements"), tried
+
+
+def best_of_candidates(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
+    """The best of all choices of candidate places; where they are too many, the best that exchanges come to.
+
+    Args:
+        starts: random choices that exchanges start from.
+
+    Raises:
+        DesignError: limits that no choice met keeps, with the one that conflicts.
+    """
+    grid = allowed_places(task, limits, 0)
+    n = task.n_controlled
+    if comb(len(grid), n) <= MOST_TRIED:
+        return scan(task, limits)[0]
+    shapes, at = task.shapes(grid), coordinates(task.modes.domain, grid)
+    rng = np.random.default_rng(seed)
+    drawn = np.sort(rng.random((DRAWN, len(grid))).argpartition(n, axis=1)[:, :n], axis=1)
+    first = drawn[np.argsort(rated(task, limits, shapes, at, drawn), kind="stable")[:starts]]
+    found = [_exchanged(task, limits, shapes, at, choice) for choice in first]
+    for rating, choice in sorted(found, key=lambda pair: pair[0]):
+        placement = task.placed(grid[choice], f"best of exchanges from {starts} choices")
+        if np.isfinite(rating) and limits.satisfied_by(placement):
+            return placement
+    raise DesignError(conflict(task, limits, grid))
+
+
+def rated(task: PlacementTask, limits: Limits, shapes: np.ndarray, at: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """W_R of choices (n_choices, n) of places; inf where a limit is exceeded or B singular."""
+    costs = batch_costs(task, shapes[index])
+    kept = np.all([excess <= TOLERANCE for excess in limits.violations(at[index], costs).values()], axis=0)
+    return np.asarray(np.where(kept, costs.work, np.inf))
+
+
+def _exchanged(
+    task: PlacementTask, limits: Limits, shapes: np.ndarray, at: np.ndarray, choice: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """W_R and the choice after every exchange of one place for another that helps."""
+    best = float(rated(task, limits, shapes, at, choice[None])[0])
+    while True:
+        others = np.setdiff1d(np.arange(len(shapes)), choice)
+        tried = np.repeat(choice[None], choice.size * others.size, axis=0)
+        for i in range(choice.size):
+            tried[i * others.size : (i + 1) * others.size, i] = others
+        rating = rated(task, limits, shapes, at, tried)
+        i = int(np.argmin(rating))
+        if not rating[i] < best:
+            return best, np.sort(choice)
+        best, choice = float(rating[i]), tried[i]
+
+
+def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.ndarray:
+    """The limits' candidate places, or a grid, without those in forbidden zones: (n_places,) or (n_places, 2).
+
+    Raises:
+        DesignError: fewer than actuators.
+    """
+    n, domain = task.n_controlled, task.modes.domain
+    boxes = limits.boxes(task)
+    if limits.candidates is not None:
+        grid = as_places(domain, list(limits.candidates))
+    elif isinstance(domain, Interval):
+        edge = max(limits.margin, task.reach[0], domain.length / n_places / 2)
+        grid = np.linspace(edge, domain.length - edge, n_places)
+    elif isinstance(domain, NamedPoints):
+        grid = as_places(domain, domain.rotations() if task.actuator.kind == "moment" else domain.grid())
+    else:
+        grid = as_places(domain, domain.grid(n_places))
+    grid = grid[free_places(domain, grid, boxes)]
+    if len(grid) < n:
+        raise DesignError(f"{n} actuators need as many places; the limits leave {len(grid)}: allow more")
+    return grid

@@ -7,6 +7,7 @@ transforms f̂_r = f̂(iω_r) known once and for all, in the mean over the distu
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,9 +17,11 @@ from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.printed import Printed
 from workbench.design.placement.peak import largest
+from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.rig.actuators import Actuator
-from workbench.structure.domain import Between
+from workbench.structure.domain import Between, Interval, Place, Rectangle, position
 from workbench.structure.modes import Modes, frozen, modal_state_matrix
+from workbench.structure.printed import place_text
 
 SINGULAR_SHARE = 1e-14
 SHOWN_INSTANTS = 240
@@ -32,7 +35,8 @@ class Placement(Printed):
     """A control law with its actuators placed, and what it costs.
 
     Attributes:
-        positions: (n_actuators,) m, increasing; the middles of actuators that act between two places.
+        positions: of the actuators: along an interval (n_actuators,) m, increasing, the middles of those that act
+            between two places; over a rectangle (n_actuators, 2) m; names of points (n_actuators,).
         law: with the actuators there; None where B is singular.
         residual_work: W_R.
         by_mode: (n_residual,) W_r.
@@ -41,6 +45,7 @@ class Placement(Printed):
         condition: of B, in the Frobenius norm ‖B‖‖B⁻¹‖, which bounds the spectral one.
         status: why the search stopped.
         local_optima: distinct local optima met from all starts, (positions, W_R), best first.
+        spacing: least distance between two actuators, m; 0 where positions of named points are not known.
     """
 
     positions: np.ndarray
@@ -52,26 +57,29 @@ class Placement(Printed):
     condition: float
     status: str
     local_optima: tuple[tuple[np.ndarray, float], ...] = ()
+    spacing: float = np.inf
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "positions", frozen(self.positions))
+        dtype = object if np.asarray(self.positions).dtype.kind in "OU" else float
+        object.__setattr__(self, "positions", frozen(self.positions, dtype))
         object.__setattr__(self, "by_mode", frozen(self.by_mode))
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        names = [f"F{i + 1}" for i in range(self.positions.size)]
+        count = len(self.positions)
+        names = [f"F{i + 1}" for i in range(count)]
         if self.law is not None:
             names = [actuator.name for actuator in self.law.actuators]
-        count = self.positions.size
         n_controlled = count if self.law is None else self.law.n_controlled
         line = f"{count} actuator{'s' * (count > 1)} placed: W_R = {self.residual_work:.4g}, effort {self.effort:.4g}"
-        rows = [(name, f"{x:.4g}") for name, x in zip(names, self.positions, strict=True)]
+        rows = [(name, place_text(x)) for name, x in zip(names, listed(self.positions), strict=True)]
         most = int(np.argmax(self.by_mode))
         remarks = (
             f"largest W_r = {self.by_mode[most]:.4g}, in mode {n_controlled + most + 1}; peak force"
             f" {self.peak_force:.4g}; condition of B {self.condition:.3g}",
             *((f"search: {self.status}",) if self.status else ()),
         )
-        return line, ("actuator", "x [m]"), rows, remarks
+        named = self.positions.dtype == object
+        return line, ("actuator", "at" if named else "x [m]" if self.positions.ndim == 1 else "x, y [m]"), rows, remarks
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,31 +112,45 @@ class PlacementTask:
     weight: np.ndarray
     actuator: Actuator
 
-    def shapes(self, positions: ArrayLike, derivative: int = 0) -> np.ndarray:
-        """Participation (..., n_modes) of an actuator at places (...), or its derivatives with the place."""
-        positions = np.asarray(positions, float)
-        found = participation_along(self.modes, self.actuator, positions.ravel(), derivative)
-        return found.reshape(*positions.shape, self.modes.n_modes)
+    def shapes(self, positions: Any, derivative: int = 0) -> np.ndarray:
+        """Participation (..., n_modes) of an actuator at places: (...) m, (..., 2) m or (...) names.
+
+        Along an interval, its derivatives with the place too.
+        """
+        domain, actuator = self.modes.domain, self.actuator
+        if isinstance(domain, Interval):
+            positions = np.asarray(positions, float)
+            found = participation_along(self.modes, actuator, positions.ravel(), derivative)
+            return found.reshape(*positions.shape, self.modes.n_modes)
+        places = as_places(domain, positions)
+        shape = places.shape[:-1] if isinstance(domain, Rectangle) else places.shape
+        flat = places.reshape(-1, *places.shape[len(shape) :])
+        order = int(actuator.kind == "moment")
+        found = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
+        return found.reshape(*shape, self.modes.n_modes)
 
     @property
     def reach(self) -> tuple[float, float]:
-        """Where the middle of an actuator can stand at most, (from, to) m."""
+        """Where the middle of an actuator can stand at most along an interval, (from, to) m."""
         half = 0.5 * extent(self.actuator)
         return half, self.modes.length - half
 
-    def law(self, positions: ArrayLike) -> Law:
-        """The IMSC law with actuators at the places (n_actuators,), m.
+    def law(self, positions: Any) -> Law:
+        """The IMSC law with actuators at the places, one each.
 
         Raises:
             DesignError: places from which the modes cannot be controlled one by one.
         """
-        places = np.asarray(positions, float)
-        actuators = [placed_at(self.actuator, f"F{i + 1}", float(x)) for i, x in enumerate(places)]
+        places = listed(as_places(self.modes.domain, positions))
+        actuators = [placed_at(self.actuator, f"F{i + 1}", place) for i, place in enumerate(places)]
         return imsc(self.modes, self.n_controlled, actuators, weight=self.weight)
 
-    def placed(self, positions: ArrayLike, status: str, optima=()) -> Placement:
+    def placed(self, positions: Any, status: str, optima: Sequence[tuple[np.ndarray, float]] = ()) -> Placement:
         """A `Placement` of given positions; infinite work where B is singular."""
-        positions = np.sort(np.asarray(positions, float))
+        domain = self.modes.domain
+        positions = as_places(domain, positions)
+        if isinstance(domain, Interval):
+            positions = np.sort(positions)
         shapes = self.shapes(positions)
         costs = batch_costs(self, shapes[None])
         peak, law = np.inf, None
@@ -147,6 +169,7 @@ class PlacementTask:
             condition=float(costs.condition[0]),
             status=status,
             local_optima=tuple(optima),
+            spacing=float(least_distances(coordinates(domain, positions)[None])[0]),
         )
 
     def tail_bound(self, positions: ArrayLike, *, growth: float) -> float:
@@ -173,7 +196,7 @@ def placement_task(
     modes: Modes,
     n_controlled: int,
     *,
-    impulse_at: ArrayLike,
+    impulse_at: Any,
     weight: ArrayLike,
     impulse: float = 1.0,
     chances: ArrayLike | None = None,
@@ -186,7 +209,7 @@ def placement_task(
     and effort are then powers.
 
     Args:
-        impulse_at: a place, or (n_places,), m.
+        impulse_at: a place of the domain, or several: x or (n_places,) m, (x, y) or (n_places, 2) m, names.
         weight: R, scalar or one a controlled mode.
         impulse: N s.
         chances: (n_places,) of each place; even unless given.
@@ -200,10 +223,15 @@ def placement_task(
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
     if not final_time > 0:
         raise DesignError(f"the final time must be positive; got {final_time}")
-    places = np.atleast_1d(np.asarray(impulse_at, float))
-    shares = np.full(places.size, 1.0 / places.size) if chances is None else np.asarray(chances, float)
-    if shares.shape != places.shape or not (shares >= 0).all() or not shares.sum() > 0:
-        raise DesignError(f"{places.size} places need as many chances, none negative; got {shares}")
+    places = listed(as_places(modes.domain, impulse_at))
+    shares = np.full(len(places), 1.0 / len(places)) if chances is None else np.asarray(chances, float)
+    if shares.shape != (len(places),) or not (shares >= 0).all() or not shares.sum() > 0:
+        raise DesignError(f"{len(places)} places need as many chances, none negative; got {shares}")
+    if actuator is not None and isinstance(actuator.at, Between) and not isinstance(modes.domain, Interval):
+        raise DesignError(
+            f"actuator {actuator.name} acts between two places; such are placed along an interval only: place forces or"
+            " moments, or compare pairs of points one by one"
+        )
     n = n_controlled
     omega = modes.omega[:n]
     g1, g2 = riccati_gains(omega, weight)
@@ -232,7 +260,7 @@ def placement_task(
     span = min(final_time, -np.log(SETTLED) / slowest)
     # the rate jumps at the impulse and the forces with it: instants lie close at first
     instants = span * np.linspace(0.0, 1.0, SHOWN_INSTANTS) ** 2
-    starts = np.vstack([np.zeros((n, places.size)), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
+    starts = np.vstack([np.zeros((n, len(places))), (rates / np.sqrt(np.maximum(shares, 1e-300))[:, None]).T])
     values, vectors = np.linalg.eig(a)
     held = np.linalg.solve(vectors, starts[:, shares > 0].astype(complex))
     motion = np.einsum("ik,kt,kp->ipt", vectors, np.exp(np.outer(values, instants)), held).real
@@ -251,7 +279,7 @@ def placement_task(
         span=final_time,
         envelope=frozen(envelope),
         weight=frozen(np.broadcast_to(np.asarray(weight, float), n)),
-        actuator=Actuator("F", 0.5 * modes.length) if actuator is None else actuator,
+        actuator=Actuator("F", modes.domain.grid(2)[0]) if actuator is None else actuator,
     )
 
 
@@ -260,10 +288,18 @@ def extent(actuator: Actuator) -> float:
     return float(actuator.at.first - actuator.at.second) if isinstance(actuator.at, Between) else 0.0  # type: ignore
 
 
-def placed_at(actuator: Actuator, name: str, at: float) -> Actuator:
-    """The actuator, renamed, with its middle at x (m)."""
+def placed_at(actuator: Actuator, name: str, at: Place) -> Actuator:
+    """The actuator, renamed, with its middle at a place."""
     half = 0.5 * extent(actuator)
-    return replace(actuator, name=name, at=Between(at + half, at - half) if half else at)
+    if not half:
+        return replace(actuator, name=name, at=at)
+    x = position(at)
+    return replace(actuator, name=name, at=Between(x + half, x - half))
+
+
+def listed(places: np.ndarray) -> list[Place]:
+    """An array of places as a list: floats, pairs of floats, or names."""
+    return [tuple(place) if isinstance(place, list) else place for place in places.tolist()]
 
 
 def participation_along(modes: Modes, actuator: Actuator, x: np.ndarray, derivative: int = 0) -> np.ndarray:

@@ -1,0 +1,94 @@
+"""Where actuators may stand, on any domain: places as arrays, how far apart, and boxes free of forbidden zones."""
+
+from typing import Any
+
+import numpy as np
+
+from workbench.design.laws.law import DesignError
+from workbench.structure.domain import Domain, Interval, NamedPoints, Rectangle
+
+Box = tuple[np.ndarray, np.ndarray]
+
+
+def as_places(domain: Domain, places: Any) -> np.ndarray:
+    """Places as an array: (...,) positions in m, (..., 2) pairs in m, or (...,) names.
+
+    Raises:
+        PlaceError: names that no point has, pairs that are none.
+    """
+    if isinstance(domain, NamedPoints):
+        names = np.atleast_1d(np.asarray(places, object))
+        domain.locate(names.ravel())
+        return names
+    if isinstance(domain, Rectangle):
+        pairs = np.atleast_2d(np.asarray(places, float))
+        domain.locate(pairs.reshape(-1, pairs.shape[-1]))
+        return pairs
+    return np.atleast_1d(np.asarray(places, float))
+
+
+def coordinates(domain: Domain, places: np.ndarray) -> np.ndarray:
+    """Of an array of places: the positions or pairs themselves, or (..., 3) of named points; zeros where not known."""
+    if not isinstance(domain, NamedPoints):
+        return places
+    if domain.positions is None:
+        return np.zeros((*places.shape, 3))
+    return np.asarray(domain.positions[domain.locate(places.ravel())].reshape(*places.shape, 3))
+
+
+def least_distances(at: np.ndarray) -> np.ndarray:
+    """Between any two of the places of each placement, m: inf where there is one alone.
+
+    Args:
+        at: (n_placements, n), increasing, or (n_placements, n, n_coordinates), m.
+
+    Returns:
+        (n_placements,)
+    """
+    if at.ndim == 2:
+        return np.asarray(np.diff(at, axis=1).min(axis=1, initial=np.inf))
+    first, second = np.triu_indices(at.shape[1], 1)
+    return np.asarray(np.linalg.norm(at[:, first] - at[:, second], axis=2).min(axis=1, initial=np.inf))
+
+
+def free_boxes(domain: Rectangle, margin: float, zones: tuple[Box, ...]) -> list[Box]:
+    """The largest boxes (low, high), m, within the margin of a rectangle, that overlap no forbidden zone.
+
+    Together they hold every place that is left; they overlap one another.
+
+    Raises:
+        DesignError: none is left.
+    """
+    free: list[Box] = [(np.full(2, margin), np.array(domain.length) - margin)]
+    for zone_low, zone_high in zones:
+        parts: list[Box] = []
+        for low, high in free:
+            if (zone_low >= high).any() or (zone_high <= low).any():
+                parts.append((low, high))
+                continue
+            for axis in range(2):  # left and right of the zone, below and above it
+                before, after = high.copy(), low.copy()
+                before[axis], after[axis] = zone_low[axis], zone_high[axis]
+                parts += [(low, before), (after, high)]
+        parts = [part for part in parts if (part[0] <= part[1]).all()]
+        free = [part for i, part in enumerate(parts) if not any(_inside(part, other) for other in parts[:i])]
+        free = [part for i, part in enumerate(free) if not any(_inside(part, other) for other in free[i + 1 :])]
+    if not free or not all((low <= high).all() for low, high in free):
+        raise DesignError(
+            f"margin {margin:g} and the forbidden zones leave no place of {domain}; lower the margin or forbid less"
+        )
+    return free
+
+
+def _inside(one: Box, other: Box) -> bool:
+    return bool((one[0] >= other[0]).all() and (one[1] <= other[1]).all())
+
+
+def free_places(domain: Domain, places: np.ndarray, boxes: list[Box]) -> np.ndarray:
+    """Which of an array of places (n_places,) lie in one of the boxes; of named points all."""
+    if isinstance(domain, NamedPoints):
+        return np.ones(len(places), bool)
+    at = places.reshape(len(places), -1)
+    slack = 1e-12 * (domain.length if isinstance(domain, Interval) else max(domain.length))
+    inside = [((at >= low - slack) & (at <= high + slack)).all(axis=1) for low, high in boxes]
+    return np.asarray(np.any(inside, axis=0))
