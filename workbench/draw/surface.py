@@ -107,7 +107,7 @@ def plot_surface_placement(
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
     left.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
     left.contour(x, y, fields[0].T, levels=[0.0], colors="black", linewidths=1.4)
-    for (x0, y0), (x1, y1) in limits.forbidden if limits is not None else ():  # type: ignore[misc]
+    for (x0, y0), (x1, y1) in limits.forbidden if limits is not None else ():  # type: ignore[misc, str-unpack]
         left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2)
     numbers = n + 1 + np.arange(modes.n_modes - n)
     width = 0.8 / len(placements)
