@@ -344,7 +344,7 @@ def _step(
         row[: len(values)] = values
     stretch = sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching))
     drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
-    drag_shapes, drag_weights = _along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
+    drag_shapes, drag_weights = along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
     known, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
@@ -359,7 +359,7 @@ def _step(
         forces[driven],
         participation[:, driven],
         stretch,
-        _stretching(rig) if stretch else np.zeros((0, 0)),
+        stretching_of(rig) if stretch else np.zeros((0, 0)),
         np.ascontiguousarray(drag_shapes.T),
         drag * drag_weights,
         np.array([LAWS[type(e)][0] for e in points], dtype=np.int64),
@@ -396,15 +396,15 @@ def _stepper(laws: tuple[Callable, ...]):
     return make_stepper(laws[0])
 
 
-def _along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
+def along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
     """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
     points, weights = rig.modes.domain.quadrature(max(3 * rig.modes.n_modes + 12, 30))
     return rig.modes.phi(points, derivative), weights
 
 
-def _stretching(rig: Rig) -> np.ndarray:
+def stretching_of(rig: Rig) -> np.ndarray:
     """∫ φ_r' φ_s' dx, (n_modes, n_modes)."""
-    slopes, weights = _along(rig, 1)
+    slopes, weights = along(rig, 1)
     return slopes.T @ (weights[:, None] * slopes)
 
 

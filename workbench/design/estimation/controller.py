@@ -5,8 +5,9 @@
 A law through a modal filter has no state z; an observer has one. Both close the same loop.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -30,6 +31,8 @@ class Controller:
         commands: (n_actuators, n_states) C_z.
         direct: (n_actuators, n_channels) D_z.
         name: for tables and plots.
+        estimator: (2 n_controlled, n_channels) L of an observer; of a filter, x̂ = estimator y; None where not known.
+        designed_by: designs it anew with the settings that it has, from modes, a law and sensors; None where not known.
     """
 
     law: Law
@@ -39,11 +42,15 @@ class Controller:
     commands: np.ndarray
     direct: np.ndarray
     name: str
+    estimator: np.ndarray | None = None
+    designed_by: Callable[[Modes, Law, Sequence[Sensor]], "Controller"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
         for name in ("state", "reads", "commands", "direct"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+        if self.estimator is not None:
+            object.__setattr__(self, "estimator", frozen(self.estimator))
 
     @property
     def places(self) -> tuple[Place, ...]:
@@ -71,16 +78,25 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     if filter_.slope.size:
         weights.append(filter_.slope)
         kinds.append(("slope", "angular velocity", "s"))
-    n = law.n_controlled
     columns, sensors = [], []
     for order in (0, 1):
         for weight, kind in zip(weights, kinds, strict=True):
-            columns.append(-law.gain[:, order * n : (order + 1) * n] @ weight)
+            columns.append(
+                np.vstack([np.zeros_like(weight)] * order + [weight] + [np.zeros_like(weight)] * (1 - order))
+            )
             sensors += [
                 Sensor(f"{'v' if order else 'y'}{kind[2]}{i + 1}", float(x), kind[order])
                 for i, x in enumerate(filter_.positions)
             ]
-    m = len(law.actuators)
-    direct = np.hstack(columns)
-    empty = np.zeros((0, 0)), np.zeros((0, direct.shape[1])), np.zeros((m, 0))
-    return Controller(law, tuple(sensors), *empty, direct, f"{law.name} through a modal filter")
+    estimator = np.hstack(columns)
+    empty = np.zeros((0, 0)), np.zeros((0, estimator.shape[1])), np.zeros((len(law.actuators), 0))
+    again = None if filter_.designed_by is None else partial(_filtered_anew, filter_.designed_by)
+    name = f"{law.name} through a modal filter"
+    return Controller(law, tuple(sensors), *empty, -law.gain @ estimator, name, estimator, again)
+
+
+def _filtered_anew(
+    design: Callable[[Modes], ModalFilter], modes: Modes, law: Law, sensors: Sequence[Sensor]
+) -> Controller:
+    """The law through the same filter of other modes; its sensors stand where the filter has them."""
+    return filtered(law, design(modes.select(law.controlled)))

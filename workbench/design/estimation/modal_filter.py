@@ -3,7 +3,9 @@
 Dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,11 +25,13 @@ class ModalFilter:
         positions: (n_sensors,) m, increasing.
         displacement: (n_modes, n_sensors) weights of the displacements (or velocities).
         slope: (n_modes, n_sensors) weights of the slopes (or angular velocities); no columns where none are read.
+        designed_by: designs it anew, with the settings that it has, for other modes.
     """
 
     positions: np.ndarray
     displacement: np.ndarray
     slope: np.ndarray
+    designed_by: Callable[[Modes], "ModalFilter"] | None = None
 
     def __post_init__(self) -> None:
         for name in ("positions", "displacement", "slope"):
@@ -74,7 +78,8 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         displacement[:, i + 1] += right
         slope[:, i] += left_slope
         slope[:, i + 1] += right_slope
-    return ModalFilter(x, displacement, slope)
+    again = partial(hermite_filter, positions=x, mass_per_length=mass_per_length)
+    return ModalFilter(x, displacement, slope, again)
 
 
 def displacement_filter(
@@ -99,7 +104,8 @@ def displacement_filter(
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
     weights = _spline_weights(modes, splines, as_profile(mass_per_length))
-    return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)))
+    again = partial(displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
+    return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
 
 def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:

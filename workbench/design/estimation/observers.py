@@ -6,6 +6,7 @@ What the residual modes add to y is observation spillover (Balas, IEEE Trans. Au
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import control
 import numpy as np
@@ -39,7 +40,7 @@ def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: Arra
     # along (q_r, q_r' = λ q_r) the readings see mode r with c_q + λ c_v
     seen = c[:, :n] + 1j * modes.omega[list(law.controlled)] * c[:, n:]
     gain = assign(a.T, c.T, poles, seen.conj(), names).T
-    return _controller(law, sensors, a, b, c, gain, "Luenberger observer")
+    return _controller(law, sensors, a, b, c, gain, "Luenberger observer", partial(luenberger, poles=poles))
 
 
 def kalman(
@@ -63,7 +64,8 @@ def kalman(
         gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, push, spread)
     except (np.linalg.LinAlgError, ValueError) as error:
         raise DesignError(f"no Kalman filter settles with these sensors: {error}; move or add one") from error
-    return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter")
+    again = partial(kalman, disturbance=disturbance, noise=noise)
+    return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter", again)
 
 
 def _plant(modes: Modes, law: Law, sensors: Sequence[Sensor]):
@@ -92,7 +94,8 @@ def _intensity(value: ArrayLike, size: int, name: str) -> np.ndarray:
     return matrix
 
 
-def _controller(law: Law, sensors, a, b, c, gain, how: str) -> Controller:
+def _controller(law: Law, sensors, a, b, c, gain, how: str, designed_by) -> Controller:
     state = a - b @ law.gain - gain @ c
     direct = np.zeros((len(law.actuators), len(sensors)))
-    return Controller(law, tuple(sensors), state, gain, -law.gain, direct, f"{law.name} on a {how}")
+    name = f"{law.name} on a {how}"
+    return Controller(law, tuple(sensors), state, gain, -law.gain, direct, name, gain, designed_by)

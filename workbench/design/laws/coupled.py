@@ -1,6 +1,7 @@
 """Coupled control: one law for all controlled modes together, by the Riccati equation or by poles."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import control
 import numpy as np
@@ -59,7 +60,7 @@ def coupled_lqr(
         raise DesignError(
             f"modes {[i + 1 for i in index]} cannot all be stabilised from these places; move an actuator"
         )
-    return Law(np.asarray(gain), index, actuators, "coupled LQR")
+    return Law(np.asarray(gain), index, actuators, "coupled LQR", partial(coupled_lqr, weight=weight))
 
 
 def coupled_poles(
@@ -80,4 +81,4 @@ def coupled_poles(
     b = controllable_input(modes, index, actuators)
     a, full = controlled_plant(modes, index, actuators)
     gain = assign(a, full, poles, b.T.astype(complex), [f"mode {r + 1}" for r in index])
-    return Law(gain, index, tuple(actuators), "coupled poles")
+    return Law(gain, index, tuple(actuators), "coupled poles", partial(coupled_poles, poles=poles))

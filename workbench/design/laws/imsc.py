@@ -5,6 +5,7 @@ actuators by F = B⁺ f, B the participation of the controlled modes.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,7 +85,7 @@ def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actu
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]
     gains = riccati_gains(modes.omega[list(index)], np.broadcast_to(weight, len(index)), c)
-    return _law(modes, index, actuators, gains, "IMSC")
+    return _law(modes, index, actuators, gains, "IMSC", partial(imsc, weight=weight))
 
 
 def imsc_poles(
@@ -93,9 +94,10 @@ def imsc_poles(
     """The IMSC law with the closed-loop poles given, one of each conjugate pair per controlled mode, rad/s."""
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]
-    return _law(modes, index, actuators, pole_gains(modes.omega[list(index)], poles, c), "IMSC poles")
+    again = partial(imsc_poles, poles=poles)
+    return _law(modes, index, actuators, pole_gains(modes.omega[list(index)], poles, c), "IMSC poles", again)
 
 
-def _law(modes: Modes, index, actuators, gains, name: str) -> Law:
+def _law(modes: Modes, index, actuators, gains, name: str, designed_by) -> Law:
     spread = np.linalg.pinv(participation(modes, index, actuators))
-    return Law(spread @ np.hstack([np.diag(g) for g in gains]), index, tuple(actuators), name)
+    return Law(spread @ np.hstack([np.diag(g) for g in gains]), index, tuple(actuators), name, designed_by)

@@ -1,6 +1,6 @@
 """A control law on the modal state of the controlled modes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,12 +29,15 @@ class Law(Printed):
         controlled: (n_controlled,) zero-based indices of the controlled modes among all modes.
         actuators: that the law drives.
         name: for tables and plots.
+        designed_by: designs the law anew with the settings that it has, from modes, controlled modes and actuators;
+            None for a gain given by hand.
     """
 
     gain: np.ndarray
     controlled: tuple[int, ...]
     actuators: tuple[Actuator, ...]
     name: str = "law"
+    designed_by: Callable[[Modes, Sequence[int], Sequence[Actuator]], "Law"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gain", frozen(self.gain))

@@ -4,8 +4,9 @@ Meirovitch, VanLandingham & Öz (1977), reference [77] of the dissertation: f_r 
 s_r = q_r' + λ_r q_r, and F = B⁺ f on the actuators.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,6 +45,7 @@ class OnOffLaw:
         controlled: (n_controlled,) zero-based indices.
         actuators: that the law drives.
         name: for tables and plots.
+        designed_by: as of a `Law`.
     """
 
     relays: tuple[Relay, ...]
@@ -51,6 +53,7 @@ class OnOffLaw:
     controlled: tuple[int, ...]
     actuators: tuple[Actuator, ...]
     name: str = "on-off"
+    designed_by: Callable[[Modes, Sequence[int], Sequence[Actuator]], "OnOffLaw"] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "spread", frozen(self.spread))
@@ -98,4 +101,6 @@ def on_off(
         Relay(float(modes.omega[r]), float(c[r]), float(k), float(d), float(s))
         for r, k, d, s in zip(index, *values, strict=True)
     )
-    return OnOffLaw(relays, np.linalg.pinv(participation(modes, index, actuators)), index, tuple(actuators))
+    spread = np.linalg.pinv(participation(modes, index, actuators))
+    again = partial(on_off, force=force, dead_band=dead_band, slope=slope)
+    return OnOffLaw(relays, spread, index, tuple(actuators), designed_by=again)

@@ -1,0 +1,172 @@
+"""A controller as a computer runs it: once a sample, from readings to commands, with what it makes up for.
+
+    y = scale (reading - offset)
+    w = C z + D y + friction feed-forward,          on-off: w = -spread relay(C z + D y)
+    v = w within ± limit, and within ± rate of the v before
+    command = v + dead zone in the direction of v - bias
+    z ← A z + B y + E v
+
+v is the command that the actuator follows: an observer that is fed v instead of w does not wind up.
+"""
+
+from dataclasses import dataclass, field
+
+import control
+import numpy as np
+from scipy.linalg import expm
+
+from workbench.design.estimation.controller import Controller
+from workbench.structure.modes import frozen
+
+ONSET = 0.01  # of a dead zone: the v over which its inverse sets in, so that it does not jump at zero
+
+
+@dataclass(frozen=True, eq=False)
+class Relays:
+    """On-off forces: w = -spread k sgn(s) outside the dead band of s.
+
+    Attributes:
+        spread: (n_actuators, n_relays).
+        force: (n_relays,) k.
+        dead_band: (n_relays,).
+    """
+
+    spread: np.ndarray
+    force: np.ndarray
+    dead_band: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionForward:
+    """Commands that oppose friction: push force tanh(speed / smoothing), the speed estimated as C z + D y.
+
+    Attributes:
+        push: (n_actuators, n_frictions) command per force of friction.
+        of_state: (n_frictions, n_states) C.
+        of_reading: (n_frictions, n_sensors) D.
+        force: (n_frictions,) N.
+        smoothing: (n_frictions,) m/s.
+    """
+
+    push: np.ndarray
+    of_state: np.ndarray
+    of_reading: np.ndarray
+    force: np.ndarray
+    smoothing: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class DigitalController:
+    """A controller that runs once a sample.
+
+    Attributes:
+        sample_time: s.
+        sensors: (n_sensors,) names of the channels that it reads.
+        actuators: (n_actuators,) names of those that it commands.
+        a, b, c, d, e: (n_states, n_states), (n_states, n_sensors), (n_outputs, n_states), (n_outputs, n_sensors) and
+            (n_states, n_actuators); n_outputs is n_actuators, or the number of relays.
+        offset, scale: (n_sensors,) y = scale (reading - offset).
+        limit, rate, dead_zone, bias: (n_actuators,) in units of the command; the rate by sample.
+        relays: of on-off control.
+        friction: fed forward.
+        name: for tables and plots.
+    """
+
+    sample_time: float
+    sensors: tuple[str, ...]
+    actuators: tuple[str, ...]
+    a: np.ndarray
+    b: np.ndarray
+    c: np.ndarray
+    d: np.ndarray
+    e: np.ndarray
+    offset: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    scale: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    limit: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    rate: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    dead_zone: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    bias: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    relays: Relays | None = None
+    friction: FrictionForward | None = None
+    name: str = "controller"
+
+    def __post_init__(self) -> None:
+        n_sensors, n_actuators = len(self.sensors), len(self.actuators)
+        rest = {"offset": 0.0, "scale": 1.0, "limit": np.inf, "rate": np.inf, "dead_zone": 0.0, "bias": 0.0}
+        for name, neutral in rest.items():
+            size = n_sensors if name in ("offset", "scale") else n_actuators
+            value = getattr(self, name)
+            object.__setattr__(self, name, frozen(value if np.size(value) else np.full(size, neutral)))
+        for name in "abcde":
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+        n = self.a.shape[0]
+        n_outputs = n_actuators if self.relays is None else self.relays.force.size
+        expected = {"a": (n, n), "b": (n, n_sensors), "c": (n_outputs, n), "d": (n_outputs, n_sensors)}
+        for name, shape in (expected | {"e": (n, n_actuators)}).items():
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"DigitalController.{name} must have shape {shape}; got {getattr(self, name).shape}")
+
+    def step(self, z: np.ndarray, before: np.ndarray, reading: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The commands at a sample, what the actuators are to follow of them, and the next state.
+
+        Args:
+            z: (n_states,), zero at the start.
+            before: (n_actuators,) what they were to follow a sample ago, zero at the start.
+            reading: (n_sensors,).
+        """
+        y = self.scale * (reading - self.offset)
+        w = self.c @ z + self.d @ y
+        if self.relays is not None:
+            sign = np.where(np.abs(w) > self.relays.dead_band, np.sign(w), 0.0)
+            w = -self.relays.spread @ (self.relays.force * sign)
+        if self.friction is not None:
+            speed = self.friction.of_state @ z + self.friction.of_reading @ y
+            w = w + self.friction.push @ (self.friction.force * np.tanh(speed / self.friction.smoothing))
+        v = np.clip(np.clip(w, -self.limit, self.limit), before - self.rate, before + self.rate)
+        onset = np.clip(v / np.where(self.dead_zone > 0, ONSET * self.dead_zone, 1.0), -1.0, 1.0)
+        command = v + self.dead_zone * onset - self.bias
+        return command, v, self.a @ z + self.b @ y + self.e @ v
+
+    @property
+    def linear(self) -> bool:
+        """Whether commands are a linear function of readings."""
+        bounded = np.isfinite(self.limit).any() or np.isfinite(self.rate).any() or self.dead_zone.any()
+        return not (bounded or self.bias.any() or self.offset.any() or self.relays or self.friction)
+
+    def state_space(self) -> control.StateSpace:
+        """Its linear part as python-control's discrete `StateSpace` from readings to commands, limits left out.
+
+        Raises:
+            ValueError: on-off control, which has no linear part.
+        """
+        if self.relays is not None:
+            raise ValueError(f"{self.name} switches, so it has no StateSpace; simulate it instead")
+        a, b = self.a + self.e @ self.c, (self.b + self.e @ self.d) * self.scale
+        return control.ss(
+            a, b, self.c, self.d * self.scale, self.sample_time, inputs=list(self.sensors), outputs=list(self.actuators)
+        )
+
+
+def sampled(controller: Controller, sample_time: float) -> DigitalController:
+    """A controller as it is, run once a sample, each reading held until the next.
+
+    z' = A_z z + B_z y becomes z ← e^{A_z T} z + ∫ e^{A_z t} dt B_z y.
+
+    Args:
+        sample_time: T, s.
+    """
+    n, n_sensors = controller.state.shape[0], len(controller.sensors)
+    moving = np.zeros((n + n_sensors, n + n_sensors))
+    moving[:n] = np.hstack([controller.state, controller.reads])
+    held = expm(sample_time * moving)
+    return DigitalController(
+        sample_time,
+        tuple(sensor.name for sensor in controller.sensors),
+        tuple(actuator.name for actuator in controller.law.actuators),
+        held[:n, :n],
+        held[:n, n:],
+        controller.commands,
+        controller.direct,
+        np.zeros((n, len(controller.law.actuators))),
+        name=controller.name,
+    )

@@ -1,0 +1,286 @@
+"""Stepping of a rig under a digital controller: what it reads, commands and does, sample by sample.
+
+The structure is stepped as in `workbench.rig.stepping`; the actuators' and sensors' paths are those of `simulate`.
+"""
+
+import math
+
+import numpy as np
+from numba import njit
+
+from workbench.design.estimation.digital import ONSET
+from workbench.rig.stepping import (
+    BOUC_WEN,
+    FAST,
+    propagators,
+    solve_element,
+    solve_in_turn,
+    solve_pair,
+    spread_forces,
+    yield_update,
+)
+
+RUN_AWAY = 1e100  # of any unit: no loop comes back
+
+
+@njit(cache=True, nogil=True)
+def _headed(u, drive, j, z, before):
+    """The force that actuator j heads for: hysteresis, gain, dead zone, saturation; z is its hysteresis."""
+    if drive[j, 7] > 0.0:
+        z[j], _ = yield_update(z[j], u - before[j], drive[j, 8])
+        before[j] = u
+        u = (1.0 - drive[j, 7]) * u + drive[j, 7] * z[j]
+    f = drive[j, 0] * u
+    f = math.copysign(max(abs(f) - drive[j, 1], 0.0), f)
+    return min(max(f, -drive[j, 2]), drive[j, 2])
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def _commands(controller, k, reading, z, z_next, v, command):
+    """Fill the commands of a `DigitalController` (n_actuators,), what is followed of them, and its next state."""
+    (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (spread, on, band), (push, cf, df, force, smooth) = (
+        controller
+    )
+    nz, ny, nu = a.shape[0], b.shape[1], limit.size
+    n_out, n_friction = c.shape[0], force.size
+    y = scale * (reading - offset)
+    w = np.zeros(nu)
+    for i in range(n_out):
+        s = 0.0
+        for m in range(nz):
+            s += c[i, m] * z[m]
+        for m in range(ny):
+            s += d[i, m] * y[m]
+        if on.size > 0:
+            if abs(s) > band[i]:
+                for j in range(nu):
+                    w[j] -= spread[j, i] * math.copysign(on[i], s)
+        else:
+            w[i] = s
+    for i in range(n_friction):
+        s = 0.0
+        for m in range(nz):
+            s += cf[i, m] * z[m]
+        for m in range(ny):
+            s += df[i, m] * y[m]
+        for j in range(nu):
+            w[j] += push[j, i] * force[i] * math.tanh(s / smooth[i])
+    for j in range(nu):
+        held = min(max(w[j], -limit[j]), limit[j])
+        held = min(max(held, v[j] - rate[j]), v[j] + rate[j])
+        v[j] = held
+        onset = min(max(held / (ONSET * dead[j]), -1.0), 1.0) if dead[j] > 0.0 else 0.0
+        command[j, k] = held + dead[j] * onset - bias[j]
+    for i in range(nz):
+        s = 0.0
+        for m in range(nz):
+            s += a[i, m] * z[m]
+        for m in range(ny):
+            s += b[i, m] * y[m]
+        for m in range(nu):
+            s += e[i, m] * v[m]
+        z_next[i] = s
+    for i in range(nz):
+        z[i] = z_next[i]
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def loop_record(structure, laws, drive, into, sense, seen, noise, controller, start, disturbance, at, dt, n_sub, out):
+    """Fill a loop's motion from a start; False where it runs away.
+
+    Args:
+        structure: omega (n,), damping (n,), coupling (n, n) or empty, stiffness rate, stretch, stretching, drag shapes
+            (n, n_points), drag weights.
+        laws: kinds, shapes (n_elements, n), parameters (n_elements, 3).
+        drive: (n_actuators, 9) gain, dead zone, limit, delay, time constant, bias, rate limit, share and width of
+            hysteresis.
+        into: (n, n_actuators).
+        sense: (n_sensors, 7) gain, bias, drift a sample, delay, time constant, limit, step.
+        seen: (2, n_sensors, n) of displacement and of velocity, cross-talk among it.
+        noise: (n_sensors, n_samples).
+        controller: see `_commands`.
+        start: (2, n) displacements and rates.
+        disturbance: (n_forces, n_samples) held over each sample; at: (n, n_forces).
+        dt: s; n_sub: substeps of a sample.
+        out: displacements and rates (n, n_samples), forces and commands (n_actuators, n_samples), and of each element
+            (n_elements, n_samples) displacement, rate and force.
+    """
+    omega, damping, coupling, stiffening, stretch, stretching, drag_shapes, drag_weights = structure
+    kinds, shapes, parameters = laws
+    q_out, v_out, f_out, u_out, ew, ev, ef = out
+    n, n_el, nu, ny = omega.size, kinds.size, drive.shape[0], sense.shape[0]
+    n_samples, h = noise.shape[1], dt / n_sub
+    n_dis = disturbance.shape[0]
+    prop = np.empty((2, 4, n))
+    propagators(omega, damping, h, prop)
+    q, v = start[0].copy(), start[1].copy()
+    old, new, spread, drives, base_q, base_v = (
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+        np.zeros(n),
+    )
+    changed, push = np.empty(n), np.empty(drag_weights.size)
+    point, earlier, z_el = np.zeros(n_el), np.zeros(n_el), np.zeros(n_el)
+    w_free, v_free, w_old = np.zeros(n_el), np.zeros(n_el), np.zeros(n_el)
+    aw, av = np.zeros((n_el, n_el)), np.zeros((n_el, n_el))
+    distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
+    fine = n_samples * n_sub
+    held = np.zeros((nu, fine))
+    target, ramp, acting, hyst, before = np.zeros(nu), np.zeros(nu), np.zeros(nu), np.zeros(nu), np.zeros(nu)
+    truth, unlagged, reading = np.zeros((ny, fine + 1)), np.zeros(ny), np.zeros(ny)  # truth: what a lag makes of it
+    nz = controller[0][0].shape[0]
+    z, z_next, followed = np.zeros(nz), np.zeros(nz), np.zeros(nu)
+    for j in range(ny):
+        for r in range(n):
+            truth[j, 0] += seen[0, j, r] * q[r] + seen[1, j, r] * v[r]
+        unlagged[j] = truth[j, 0]
+    for i in range(n_el):
+        for r in range(n):
+            w_old[i] += shapes[i, r] * q[r]
+    for k in range(n_samples):
+        if stiffening != 0.0:
+            root = math.sqrt(max(1.0 + stiffening * (k + 0.5) * dt, 1e-6))
+            for r in range(n):
+                changed[r] = omega[r] * root
+            propagators(changed, damping, h, prop)
+        if k == 0 or stiffening != 0.0:
+            for i in range(n_el):
+                for j in range(n_el):
+                    aw[i, j] = 0.0
+                    av[i, j] = 0.0
+                    for r in range(n):
+                        aw[i, j] += shapes[i, r] * prop[0, 3, r] * shapes[j, r]
+                        av[i, j] += shapes[i, r] * prop[1, 3, r] * shapes[j, r]
+        # --- read
+        for j in range(ny):
+            y = truth[j, k * n_sub]
+            if sense[j, 3] > 0.0:
+                back = k * n_sub - sense[j, 3] / h
+                whole = math.floor(back)
+                part = back - whole
+                y = (1.0 - part) * truth[j, whole] + part * truth[j, whole + 1] if whole >= 0 else 0.0
+            y = sense[j, 0] * y + sense[j, 1] + sense[j, 2] * k + noise[j, k]
+            y = min(max(y, -sense[j, 5]), sense[j, 5])
+            reading[j] = sense[j, 6] * np.round(y / sense[j, 6]) if sense[j, 6] > 0.0 else y
+        # --- command
+        _commands(controller, k, reading, z, z_next, followed, u_out)
+        for r in range(n):
+            q_out[r, k] = q[r]
+            v_out[r, k] = v[r]
+            if not abs(q[r]) <= RUN_AWAY:
+                return False
+        for i in range(n_el):
+            speed = 0.0
+            for r in range(n):
+                speed += shapes[i, r] * v[r]
+            ew[i, k], ev[i, k], ef[i, k] = w_old[i], speed, point[i]
+        # --- act and move
+        for j in range(nu):
+            f_out[j, k] = 0.0
+            target[j] = _headed(u_out[j, k], drive, j, hyst, before)
+        for sub in range(n_sub):
+            now = k * n_sub + sub
+            for r in range(n):
+                drives[r] = 0.0
+            for j in range(n_dis):
+                for r in range(n):
+                    drives[r] += at[r, j] * disturbance[j, k]
+            for j in range(nu):
+                held[j, now] = target[j]
+                if drive[j, 6] < math.inf:
+                    most = drive[j, 6] * h
+                    step = min(max(target[j] - ramp[j], -most), most)
+                    ramp[j] += step
+                    held[j, now] = ramp[j] - 0.5 * step
+                force = held[j, now]
+                if drive[j, 3] > 0.0:
+                    late = drive[j, 3] / h
+                    shift = math.floor(late + 1e-9)
+                    part = max(late - shift, 0.0)
+                    newer = held[j, now - shift] if now >= shift else 0.0
+                    older = held[j, now - shift - 1] if now >= shift + 1 else 0.0
+                    force = part * older + (1.0 - part) * newer
+                if drive[j, 4] > 0.0:
+                    fade = math.exp(-h / drive[j, 4])
+                    left = acting[j] - force
+                    acting[j] = force + left * fade
+                    force += left * (1.0 - fade) * drive[j, 4] / h
+                force += drive[j, 5]
+                f_out[j, k] += force / n_sub
+                for r in range(n):
+                    drives[r] += into[r, j] * force
+            for r in range(n):
+                first, last = old[r] + drives[r], drives[r]
+                base_q[r] = prop[0, 0, r] * q[r] + prop[0, 1, r] * v[r] + prop[0, 2, r] * first + prop[0, 3, r] * last
+                base_v[r] = prop[1, 0, r] * q[r] + prop[1, 1, r] * v[r] + prop[1, 2, r] * first + prop[1, 3, r] * last
+            if n_el == 0 and not distributed:
+                for r in range(n):
+                    q[r], v[r] = base_q[r], base_v[r]
+            else:
+                for i in range(n_el):
+                    guess = 2.0 * point[i] - earlier[i]
+                    earlier[i], point[i] = point[i], guess
+                for sweep in range(2 if distributed else 1):
+                    for i in range(n_el):
+                        w, u = 0.0, 0.0
+                        for r in range(n):
+                            w += shapes[i, r] * (base_q[r] + prop[0, 3, r] * spread[r])
+                            u += shapes[i, r] * (base_v[r] + prop[1, 3, r] * spread[r])
+                        w_free[i], v_free[i] = w, u
+                    settled = n_el == 0
+                    if n_el == 1:
+                        point[0] = solve_element(
+                            kinds[0],
+                            parameters,
+                            0,
+                            w_free[0],
+                            v_free[0],
+                            aw[0, 0],
+                            av[0, 0],
+                            z_el[0],
+                            w_old[0],
+                            point[0],
+                        )
+                        settled = True
+                    elif n_el == 2:
+                        one, two, settled = solve_pair(
+                            kinds, parameters, w_free, v_free, aw, av, z_el, w_old, point[0], point[1]
+                        )
+                        if settled:
+                            point[0], point[1] = one, two
+                    if not settled:
+                        solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z_el, w_old, point)
+                    for r in range(n):
+                        new[r] = spread[r]
+                    for i in range(n_el):
+                        for r in range(n):
+                            new[r] += shapes[i, r] * point[i]
+                    for r in range(n):
+                        q[r] = base_q[r] + prop[0, 3, r] * new[r]
+                        v[r] = base_v[r] + prop[1, 3, r] * new[r]
+                    if distributed and sweep == 0:
+                        spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
+                for r in range(n):
+                    old[r] = new[r]
+                for i in range(n_el):
+                    w = w_free[i]
+                    for j in range(n_el):
+                        w += aw[i, j] * point[j]
+                    if kinds[i] == BOUC_WEN:
+                        z_el[i], _ = yield_update(z_el[i], w - w_old[i], parameters[i, 1])
+                    w_old[i] = w
+            for j in range(ny):
+                y = 0.0
+                for r in range(n):
+                    y += seen[0, j, r] * q[r] + seen[1, j, r] * v[r]
+                truth[j, now + 1] = y
+                if sense[j, 4] > 0.0:
+                    ratio = h / sense[j, 4]
+                    fade = math.exp(-ratio)
+                    share = (1.0 - fade) / ratio
+                    truth[j, now + 1] = fade * truth[j, now] + (1.0 - share) * y + (share - fade) * unlagged[j]
+                    unlagged[j] = y
+    return True

@@ -1,0 +1,272 @@
+"""A whole rig under a digital controller: every actuator, sensor and element as it is, sample by sample."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from os import cpu_count
+
+import numpy as np
+
+from workbench.design.estimation.digital import DigitalController
+from workbench.design.loop.closed_loop import Response
+from workbench.design.loop.loop_steps import loop_record
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import AirDrag, MidplaneStretching, PeriodicForce, PointElement, RandomForce, UserLaw
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.simulate import LAWS, along, participation_of, stretching_of
+from workbench.rig.statespace import output_matrix
+from workbench.structure.domain import Where
+
+SUBSTEPS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class LoopTest:
+    """What a loop is put through, from rest: an impulse, forces that are held over each sample, or both.
+
+    Attributes:
+        n_samples: of the test.
+        sample_time: s.
+        impulse_at: the place of an impulse at t = 0; None for none.
+        impulse: N s.
+        forces: (n_forces, n_samples) N.
+        ports: (n_forces,) where and how they act: their places, kinds and directions; all else of them is left out.
+        seed: of the sensors' noise and of random disturbances; None for neither.
+    """
+
+    n_samples: int
+    sample_time: float
+    impulse_at: Where | None = None
+    impulse: float = 1.0
+    forces: np.ndarray | None = None
+    ports: tuple[Actuator, ...] = ()
+    seed: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.n_samples < 2 or not self.sample_time > 0:
+            raise ValueError(
+                f"a test needs 2 samples or more, a positive time apart; got {self.n_samples}, {self.sample_time:g} s"
+            )
+        if self.forces is not None and np.shape(self.forces) != (len(self.ports), self.n_samples):
+            raise ValueError(
+                f"LoopTest.forces must have shape ({len(self.ports)} ports, {self.n_samples} samples); got"
+                f" {np.shape(self.forces)}. Is time last?"
+            )
+
+    @property
+    def time(self) -> np.ndarray:
+        return self.sample_time * np.arange(self.n_samples)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopRun:
+    """What a rig does under a controller.
+
+    Attributes:
+        response: modal motion, and the actuators' forces in the mean over each sample.
+        commands: (n_actuators, n_samples).
+        elements: (3, n_elements, n_samples) displacement, rate and force of each element at a point.
+        bounded: whether the motion came to the end of the test; the response is that of the samples before.
+        into: (n_modes, n_actuators) modal forces per force.
+    """
+
+    response: Response
+    commands: np.ndarray
+    elements: np.ndarray
+    bounded: bool
+    into: np.ndarray
+
+    @property
+    def work(self) -> np.ndarray:
+        """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), exact for forces that are held over each sample."""
+        n = self.response.modes.n_modes
+        modal = self.into @ self.response.forces[:, :-1]
+        return np.asarray((modal * np.diff(self.response.modal[:n], axis=1)).sum(axis=1))
+
+    @property
+    def effort(self) -> float:
+        """∫ FᵀF dt."""
+        time = self.response.time
+        return float((self.response.forces**2).sum() * (time[1] - time[0]))
+
+
+def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substeps: int = SUBSTEPS) -> LoopRun:
+    """The motion of a rig under a controller.
+
+    Args:
+        rig: with the sensors that the controller reads and the actuators that it commands, by name.
+        controller: of the test's sample time.
+        test: what the loop is put through.
+        substeps: of a sample.
+
+    Raises:
+        ValueError: sensors or actuators that the rig does not have, another sample time, or what the loop cannot
+            simulate.
+    """
+    check_fits(rig, controller, test)
+    modes, n = rig.modes, rig.modes.n_modes
+    sensors = [_named(rig.sensors, name) for name in controller.sensors]
+    actuators = [_named(rig.actuators, name) for name in controller.actuators]
+    into = participation_of(Rig(modes, tuple(actuators), ()))
+    rng = None if test.seed is None else np.random.default_rng(test.seed)
+    noise = np.zeros((len(sensors), test.n_samples))
+    if rng is not None:
+        noise += np.array([s.noise_std for s in sensors])[:, None] * rng.standard_normal(noise.shape)
+    forces, at = _disturbances(rig, test, rng)
+    start = np.zeros((2, n))
+    if test.impulse_at is not None:
+        start[1] = test.impulse * modes.phi_at(test.impulse_at)
+    points = [e for e in rig.elements if isinstance(e, PointElement)]
+    shape = (len(actuators), test.n_samples)
+    out = (
+        *(np.zeros((n, test.n_samples)) for _ in range(2)),
+        *(np.zeros(shape) for _ in range(2)),
+        *(np.zeros((len(points), test.n_samples)) for _ in range(3)),
+    )
+    bounded = loop_record(
+        _structure(rig),
+        _laws(rig, points),
+        np.array([_drive(a) for a in actuators]).reshape(-1, 9),
+        np.ascontiguousarray(into),
+        np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),
+        _seen(rig, sensors),
+        noise,
+        _arrays(controller),
+        start,
+        forces,
+        at,
+        float(test.sample_time),
+        substeps,
+        out,
+    )
+    q, v, f, u, *elements = out
+    response = Response(test.time, np.vstack([q, v]), f, modes)
+    return LoopRun(response, u, np.array(elements), bool(bounded), into)
+
+
+def run_loops(
+    rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, *, substeps: int = SUBSTEPS
+) -> list[LoopRun]:
+    """The same of many rigs, each with noise of its own, on all cores."""
+    seeds = [test.seed if test.seed is None else test.seed + i for i in range(len(rigs))]
+    tests = [
+        LoopTest(test.n_samples, test.sample_time, test.impulse_at, test.impulse, test.forces, test.ports, s)
+        for s in seeds
+    ]
+    with ThreadPoolExecutor(cpu_count() or 1) as pool:
+        return list(pool.map(lambda rig, one: run_loop(rig, controller, one, substeps=substeps), rigs, tests))
+
+
+def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
+    """Refuse a controller that does not fit a rig or a test, or a rig that no loop simulates."""
+    for kind, names, there in (
+        ("sensor", controller.sensors, {s.name for s in rig.sensors}),
+        ("actuator", controller.actuators, {a.name for a in rig.actuators}),
+    ):
+        missing = [name for name in names if name not in there]
+        if missing:
+            raise ValueError(
+                f"the controller names {kind} {missing[0]!r}, which the rig does not have: it has"
+                f" {', '.join(sorted(there)) or 'none'}; name the controller's {kind}s as the rig does"
+            )
+    if abs(controller.sample_time / test.sample_time - 1.0) > 1e-9:
+        raise ValueError(
+            f"the controller runs every {controller.sample_time:g} s and the test every {test.sample_time:g} s; sample"
+            " both alike"
+        )
+    if any(isinstance(e, UserLaw) for e in rig.elements):
+        raise ValueError("a loop cannot simulate a UserLaw; describe it by one of the laws of workbench.rig.elements")
+    for name in controller.sensors:
+        if MEASURED[_named(rig.sensors, name).quantity][1] > 1:
+            raise ValueError(f"sensor {name} reads acceleration; a controller here reads motion or rates")
+
+
+def _named(parts: Sequence, name: str):
+    return next(part for part in parts if part.name == name)
+
+
+def _structure(rig: Rig) -> tuple:
+    modes, n = rig.modes, rig.modes.n_modes
+    diagonal = np.diag(modes.damping).copy()
+    coupling = modes.damping - np.diag(diagonal)
+    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
+    drag = float(sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag)))
+    drag_shapes, drag_weights = along(rig, 0) if drag else (np.zeros((0, n)), np.zeros(0))
+    return (
+        np.array(modes.omega),
+        diagonal,
+        np.ascontiguousarray(coupling) if coupling.any() else np.zeros((0, 0)),
+        float(rig.stiffness_rate),
+        stretch,
+        np.ascontiguousarray(stretching_of(rig)) if stretch else np.zeros((0, 0)),
+        np.ascontiguousarray(drag_shapes.T),
+        drag * drag_weights,
+    )
+
+
+def _laws(rig: Rig, points: Sequence) -> tuple:
+    parameters = np.zeros((len(points), 3))
+    for row, element in zip(parameters, points, strict=True):
+        values = LAWS[type(element)][1](element)
+        row[: len(values)] = values
+    shapes = np.array([rig.modes.phi_at(e.at) for e in points]).reshape(len(points), rig.modes.n_modes)
+    return np.array([LAWS[type(e)][0] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
+
+
+def _drive(a: Actuator) -> list[float]:
+    late = (a.delay, a.time_constant, a.bias, a.rate_limit)
+    return [a.gain, a.dead_zone, a.limit, *late, a.hysteresis_share, a.hysteresis_width]
+
+
+def _sense(s: Sensor, n_samples: int) -> list[float]:
+    # one that is ahead of the inputs' clock cannot read what is not yet there
+    drift = s.drift / max(n_samples - 1, 1)
+    return [s.gain, s.bias, drift, max(s.delay, 0.0), s.time_constant, s.limit, s.step]
+
+
+def _seen(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
+    """(2, n_sensors, n_modes) truth of each sensor by displacements and by rates, gain left out, cross-talk in."""
+    seen = np.zeros((2, len(sensors), rig.modes.n_modes))
+    for j, sensor in enumerate(sensors):
+        for source, share in ((sensor, 1.0), *((_named(rig.sensors, n), part) for n, part in sensor.crosstalk)):
+            order = MEASURED[source.quantity][1]
+            if order < 2:
+                seen[order, j] += share / source.gain * output_matrix(rig.modes, [source])[0]
+    return seen
+
+
+def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> tuple[np.ndarray, np.ndarray]:
+    """Forces (n_forces, n_samples) that are no commands, and their participation (n_modes, n_forces)."""
+    rows = [] if test.forces is None else list(np.asarray(test.forces, float))
+    columns = list(participation_of(Rig(rig.modes, test.ports, ())).T) if test.ports else []
+    middle = test.time + 0.5 * test.sample_time
+    for element in rig.elements:
+        if isinstance(element, PeriodicForce):
+            rows.append(element.amplitude * np.sin(2 * np.pi * element.frequency_hz * middle + element.phase))
+            columns.append(rig.modes.phi_at(element.at))
+        elif isinstance(element, RandomForce) and rng is not None:
+            rows.append(element.rms * rng.standard_normal(test.n_samples))
+            columns.append(rig.modes.phi_at(element.at))
+    n = rig.modes.n_modes
+    return np.array(rows).reshape(-1, test.n_samples), np.ascontiguousarray(np.array(columns).reshape(-1, n).T)
+
+
+def _arrays(one: DigitalController) -> tuple:
+    n, n_sensors, n_actuators = one.a.shape[0], len(one.sensors), len(one.actuators)
+    relays, friction = one.relays, one.friction
+    switching = (np.zeros((n_actuators, 0)), np.zeros(0), np.zeros(0))
+    forward = (np.zeros((n_actuators, 0)), np.zeros((0, n)), np.zeros((0, n_sensors)), np.zeros(0), np.ones(0))
+    if relays is not None:
+        switching = (relays.spread, relays.force, relays.dead_band)
+    if friction is not None:
+        forward = (friction.push, friction.of_state, friction.of_reading, friction.force, friction.smoothing)
+    return tuple(
+        tuple(np.array(x, float, order="C") for x in group)
+        for group in (
+            (one.a, one.b, one.c, one.d, one.e),
+            (one.offset, one.scale, one.limit, one.rate, one.dead_zone, one.bias),
+            switching,
+            forward,
+        )
+    )
