@@ -55,6 +55,9 @@ from .rig.sensors import Sensor as Sensor
 from .rig.simulate import simulate as simulate
 from .rig.statespace import state_space as state_space
 from .robust.posterior import UncertainRig as UncertainRig
+from .robust.proof import prove as prove
+from .robust.redesign import Redesign as Redesign
+from .robust.redesign import redesign as redesign
 from .structure.damping import ModalDamping as ModalDamping
 from .structure.damping import ProportionalDamping as ProportionalDamping
 from .structure.damping import ViscousDamping as ViscousDamping

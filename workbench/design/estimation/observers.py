@@ -34,7 +34,7 @@ def luenberger(modes: Modes, law: Law, sensors: Sequence[Sensor], *, poles: Arra
     Raises:
         DesignError: a mode that no sensor sees, or poles that these sensors cannot place.
     """
-    a, b, c = _plant(modes, law, sensors)
+    a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
     names = [f"mode {r + 1} of the observer" for r in law.controlled]
     # along (q_r, q_r' = λ q_r) the readings see mode r with c_q + λ c_v
@@ -56,7 +56,7 @@ def kalman(
     Raises:
         DesignError: a mode that no sensor sees, intensities that are not positive.
     """
-    a, b, c = _plant(modes, law, sensors)
+    a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
     push = _intensity(disturbance, n, "disturbance")
     spread = _intensity(noise, len(sensors), "noise")
@@ -68,7 +68,12 @@ def kalman(
     return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter", again)
 
 
-def _plant(modes: Modes, law: Law, sensors: Sequence[Sensor]):
+def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, B and C of the controlled modes alone, from forces to readings.
+
+    Raises:
+        DesignError: no sensors, or a mode that none sees.
+    """
     index = list(law.controlled)
     own = modes.select(index)
     c = reading(own, sensors)

@@ -1,0 +1,121 @@
+"""A controller redesigned for what a diagnosis found: what is lost on the way is won back, or said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.design.estimation.observers import kalman
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.on_off import on_off
+from workbench.design.loop.rig_loop import LoopTest, run_loop
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.rig.sensors import Sensor
+from workbench.robust.posterior import UncertainRig
+from workbench.robust.redesign import redesign
+
+DT = 0.01
+
+
+def possible(rig, *effects: Effect, spread: float = 1e-2, **more) -> UncertainRig:
+    n = sum(len(e.parameters(rig)) for e in effects)
+    return UncertainRig(rig, effects, spread**2 * np.eye(n), **more)
+
+
+def effect(kind: str, target=None, **values) -> Effect:
+    return Effect(kind_named(kind), target, values)
+
+
+@pytest.fixture(scope="module")
+def controller(rig):
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
+    return kalman(rig.modes, law, rig.sensors[:4], disturbance=1.0, noise=1e-6)
+
+
+FAULTS = {
+    "delay of 1.5 samples": effect("actuator_delay", "all", delay=1.5 * DT),
+    "lag of two samples": effect("actuator_lag", "all", time_constant=2.0 * DT),
+    "dead zone": effect("actuator_dead_zone", "all", width=0.3),
+    "gain of an actuator": effect("actuator_gain", "F1", gain=0.6),
+    "gain of a sensor": effect("sensor_gain", "d2", gain=1.5),
+    "offset of a sensor": effect("sensor_bias", "d2", bias=0.05),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault):
+    found = redesign(possible(rig, FAULTS[fault]), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
+    kept = [step for step in found.steps if step.kept]
+    assert found.steps[0].loss > 0.03
+    assert kept[-1].loss < 0.5 * found.steps[0].loss
+    assert found.safe and "stable on 4 of 4 draws" in found.sentence
+
+
+def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
+    late = possible(rig, effect("actuator_delay", "all", delay=6.0 * DT))
+    found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=8, placement=False)
+    assert found.present_proof.share_stable == 0.0 and found.proof.share_stable == 1.0
+    assert "the present controller is unstable on 8 of 8 draws" in found.sentence
+
+
+def test_every_draw_is_judged_by_its_own_simulation(rig, controller):
+    """The figures of a proof are those of single loops, run one by one."""
+    spring = possible(rig, effect("cubic_spring", at=0.9, stiffness=400.0), spread=0.1)
+    found = redesign(spring, controller, sample_time=DT, impulse_at=0.8, draws=3, seed=4, placement=False)
+    again = redesign(spring, controller, sample_time=DT, impulse_at=0.8, draws=3, seed=4, placement=False)
+    assert np.array_equal(found.proof.work, again.proof.work)
+    for i, drawn in enumerate(spring.draws(3, np.random.default_rng(4))):
+        run = run_loop(drawn, found.redesigned, replace(found.test, seed=found.test.seed + i))
+        assert found.proof.work[i] == pytest.approx(run.work, rel=1e-12)
+        assert found.proof.peak_force[i] == np.abs(run.response.forces).max()
+        energy = run.response.energy.sum(axis=0)
+        after = run.response.time >= found.proof.settling[i]
+        assert energy[after].max() <= 0.01 * energy.max() < energy[~after][-1]
+
+
+def test_on_off_control_is_told_by_its_settling(rig):
+    relays = on_off(rig.modes, 2, rig.actuators, force=0.5, dead_band=0.05)
+    stuck = possible(rig, effect("actuator_dead_zone", "all", width=0.3))
+    found = redesign(stuck, relays, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
+    assert "settles in" in found.sentence and found.steps[-1].loss < 0.1 * found.steps[0].loss
+
+
+def test_moving_the_actuators_is_offered_where_it_pays(rig):
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.5)
+    found = redesign(possible(rig, effect("modulus_error", factor=0.8)), law, sample_time=DT, impulse_at=0.8, draws=2)
+    moved = found.relocation
+    assert moved is not None and 0.0 < moved.gain < 1.0
+    assert moved.moved.effort <= 1.001 * moved.present.effort
+    assert found.to_json()["placement"]["residual_work"][1] < found.to_json()["placement"]["residual_work"][0]
+
+
+def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, controller):
+    sure = possible(rig, unexplained=0.01, outcome="unknown")
+    found = redesign(sure, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
+    assert found.proof.margin > 0.01 and found.safe and "stability is sure" in found.sentence
+    unsure = redesign(
+        replace(sure, unexplained=0.5), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False
+    )
+    assert not unsure.safe and "off by 50 %" in unsure.sentence and "not sure" in unsure.sentence
+
+
+def test_what_cannot_be_redesigned_is_named(rig, controller):
+    plain = possible(rig)
+    with pytest.raises(
+        DesignError, match=r"10 samples a second are too slow for mode 2 at 3.142 Hz: sample at 12.57 Hz"
+    ):
+        redesign(plain, controller, sample_time=0.1)
+    with pytest.raises(DesignError, match="how often"):
+        redesign(plain, controller)
+    by_hand = Law(controller.law.gain, controller.law.controlled, controller.law.actuators)
+    with pytest.raises(DesignError, match="given by its gain"):
+        redesign(plain, by_hand, sample_time=DT)
+    elsewhere = kalman(rig.modes, controller.law, [Sensor("s", 0.5)], disturbance=1.0, noise=1e-4)
+    with pytest.raises(DesignError, match=r"displacement at x = 0.5.*has no such sensor: it has d1"):
+        redesign(plain, elsewhere, sample_time=DT)
+    with pytest.raises(DesignError, match="where the rig has no actuator"):
+        redesign(possible(replace(rig, actuators=rig.actuators[:1])), controller, sample_time=DT)
+    with pytest.raises(ValueError, match="2 samples or more"):
+        LoopTest(1, DT)

@@ -1,0 +1,207 @@
+"""Proof by draws: what a controller does on each rig that a diagnosis leaves possible."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from workbench.design.estimation.digital import DigitalController
+from workbench.design.loop.rig_loop import LoopRun, LoopTest, run_loop, run_loops
+from workbench.rig.rig import Rig
+from workbench.robust.posterior import UncertainRig
+from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
+from workbench.structure.modes import frozen
+from workbench.threads import one_blas_thread
+
+SETTLED = 0.01  # of the largest energy: a tenth of the amplitude
+GROWN = 2.0  # times the largest energy of the first quarter, in the last: it grows
+LEVEL = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Proof:
+    """A controller on many possible rigs.
+
+    Attributes:
+        stable: (n_draws,) whether the loop of small motion is stable and the motion under test stays.
+        damping: (n_draws, n_modes) ratio of each mode's pole in the closed loop, about the motion under test.
+        peak_force, stroke: (n_draws,) the largest force of any actuator, N, and displacement at any actuator, m.
+        work: (n_draws, n_modes) W_r; controlled: zero-based modes among them.
+        effort: (n_draws,) ∫ FᵀF dt.
+        vibration: (n_draws,) ∫ of the energy of all modes over time.
+        settling: (n_draws,) s until the energy stays below a hundredth of its peak; inf where it does not within the
+            test.
+        margin: relative error of all readings, at once and of any phase, that the loop bears for sure; 0 where it is
+            not stable, inf where nothing is fed back, nan where it has no linear part.
+        margin_frequency_hz: where the least of it is.
+    """
+
+    stable: np.ndarray
+    damping: np.ndarray
+    peak_force: np.ndarray
+    stroke: np.ndarray
+    work: np.ndarray
+    controlled: tuple[int, ...]
+    effort: np.ndarray
+    vibration: np.ndarray
+    settling: np.ndarray
+    margin: float
+    margin_frequency_hz: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stable", frozen(self.stable, bool))
+        for name in ("damping", "peak_force", "stroke", "work", "effort", "vibration", "settling"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def n_draws(self) -> int:
+        return int(self.stable.size)
+
+    @property
+    def share_stable(self) -> float:
+        return float(self.stable.mean())
+
+    @property
+    def worst_damping(self) -> np.ndarray:
+        """(n_draws,) the least damping ratio of any mode."""
+        return np.asarray(self.damping.min(axis=1))
+
+    @property
+    def controlled_work(self) -> np.ndarray:
+        """W_C (n_draws,)."""
+        return np.asarray(self.work[:, list(self.controlled)].sum(axis=1))
+
+    @property
+    def residual_work(self) -> np.ndarray:
+        """W_R (n_draws,)."""
+        return np.asarray(self.work.sum(axis=1) - self.controlled_work)
+
+    def to_json(self) -> dict:
+        """Median and 95 % interval of each figure, as plain numbers; null where a figure is not finite."""
+        figures = {
+            "worst_damping": self.worst_damping,
+            "peak_force": self.peak_force,
+            "stroke": self.stroke,
+            "W_C": self.controlled_work,
+            "W_R": self.residual_work,
+            "effort": self.effort,
+            "vibration": self.vibration,
+            "settling": self.settling,
+        }
+        return {
+            "draws": self.n_draws,
+            "stable": int(self.stable.sum()),
+            "margin": _plain(self.margin),
+            "margin_frequency_hz": _plain(self.margin_frequency_hz),
+            "damping": [[_plain(v) for v in interval(self.damping[:, r])] for r in self.controlled],
+            **{name: [_plain(v) for v in interval(values)] for name, values in figures.items()},
+        }
+
+
+def interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Median, and lower and upper end of the 95 % interval; as an order statistic where some are infinite."""
+    outer = 0.5 * (1.0 - LEVEL)
+    middle, low, high = np.quantile(values, (0.5, outer, 1.0 - outer), method="nearest")
+    return float(middle), float(low), float(high)
+
+
+def _plain(value: float) -> float | None:
+    return float(f"{value:.6g}") if np.isfinite(value) else None
+
+
+@one_blas_thread
+def prove(
+    possible: UncertainRig | Sequence[Rig],
+    controller: DigitalController,
+    test: LoopTest,
+    *,
+    controlled: Sequence[int] = (),
+    draws: int = 200,
+    seed: int = 0,
+    centre: Rig | None = None,
+) -> Proof:
+    """What a controller does on each of many possible rigs under a test, all nonlinear elements in.
+
+    What the diagnosis leaves unexplained is drawn too: an error of each sensor's gain within ± that share.
+
+    Args:
+        possible: rig with its uncertainty, or rigs drawn from it.
+        controller: of the test's sample time.
+        test: what each loop is put through, with noise of its own where it has a seed.
+        controlled: zero-based modes whose work is W_C.
+        draws: how many rigs, where they are not drawn yet.
+        seed: of the draws.
+        centre: the rig whose margin is stated; the first where rigs are given.
+
+    Raises:
+        ValueError: a controller or a test that does not fit the rig.
+    """
+    if isinstance(possible, UncertainRig):
+        rigs: Sequence[Rig] = drawn_with_errors(possible, draws, seed)
+        centre = centre or possible.rig
+    else:
+        rigs, centre = possible, centre or possible[0]
+    runs = run_loops(rigs, controller, test)
+    n_modes = min(rig.modes.n_modes for rig in rigs)
+    poles = [loop_poles(rig, controller, modes_in_motion(rig, run)) for rig, run in zip(rigs, runs, strict=True)]
+    energies = [run.response.energy.sum(axis=0) for run in runs]
+    stable = [
+        run.bounded and p.spectral_radius <= 1.0 + 1e-9 and not (test.forces is None and _grows(e))
+        for run, p, e in zip(runs, poles, energies, strict=True)
+    ]
+    margin, frequency = small_gain_margin(
+        centre, controller, modes_in_motion(centre, run_loop(centre, controller, test))
+    )
+    dt = test.sample_time
+    with np.errstate(over="ignore", invalid="ignore"):
+        return Proof(
+            stable=np.array(stable),
+            damping=np.array([p.damping[:n_modes] for p in poles]),
+            peak_force=_finite([np.abs(run.response.forces).max() for run in runs]),
+            stroke=_finite([_stroke(rig, controller, run) for rig, run in zip(rigs, runs, strict=True)]),
+            work=np.array([_finite(run.work[:n_modes]) for run in runs]),
+            controlled=tuple(controlled),
+            effort=_finite([run.effort for run in runs]),
+            vibration=_finite([e.sum() * dt for e in energies]),
+            settling=np.array([_settling(e, dt) if s else np.inf for e, s in zip(energies, stable, strict=True)]),
+            margin=margin,
+            margin_frequency_hz=frequency,
+        )
+
+
+def drawn_with_errors(possible: UncertainRig, draws: int, seed: int = 0) -> tuple[Rig, ...]:
+    """Rigs drawn from what is possible, each sensor's gain off by what is unexplained: uniform within ± that share."""
+    rng = np.random.default_rng(seed)
+    rigs = possible.draws(draws, rng)
+    if not possible.unexplained:
+        return rigs
+    return tuple(
+        replace(
+            rig,
+            sensors=tuple(
+                replace(s, gain=s.gain * (1.0 + possible.unexplained * rng.uniform(-1.0, 1.0))) for s in rig.sensors
+            ),
+        )
+        for rig in rigs
+    )
+
+
+def _finite(values) -> np.ndarray:
+    values = np.asarray(values, float)
+    return np.where(np.isfinite(values), values, np.inf)
+
+
+def _grows(energy: np.ndarray) -> bool:
+    quarter = max(energy.size // 4, 1)
+    return bool(energy[-quarter:].max() > GROWN * energy[:quarter].max())
+
+
+def _settling(energy: np.ndarray, sample_time: float) -> float:
+    above = np.flatnonzero(energy > SETTLED * energy.max())
+    return np.inf if above[-1] == energy.size - 1 else float(sample_time * (above[-1] + 1))
+
+
+def _stroke(rig: Rig, controller: DigitalController, run: LoopRun) -> float:
+    there = [a.at for a in rig.actuators if a.name in controller.actuators]
+    shapes = np.array([rig.modes.phi_at(at) for at in there])
+    return float(np.abs(shapes @ run.response.modal[: rig.modes.n_modes]).max())

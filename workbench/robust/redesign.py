@@ -1,0 +1,587 @@
+"""A controller redesigned for what a diagnosis found, step by step, and proved on what remains unknown."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from workbench.design.estimation.controller import Controller
+from workbench.design.estimation.digital import DigitalController, sampled
+from workbench.design.estimation.observers import kalman
+from workbench.design.laws.coupled import controlled_plant
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.rig_loop import LoopRun, LoopTest, run_loop
+from workbench.design.placement.task import PlacementTask
+from workbench.gap.report.verdict import Verdict
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.statespace import output_matrix
+from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
+from workbench.robust.posterior import UncertainRig
+from workbench.robust.proof import Proof, drawn_with_errors, interval, prove
+from workbench.robust.relocation import Relocation, relocated
+from workbench.robust.small_motion import loop_poles, modes_in_motion
+from workbench.structure.domain import Where
+from workbench.structure.modes import Modes, mac
+from workbench.threads import one_blas_thread
+
+Design = Law | OnOffLaw | Controller | PlacementTask
+Report = Callable[[str, float], None]
+
+PERIODS = 25  # of the lowest controlled mode: the length of a test
+MOST_SAMPLES = 6000
+PAYS = 0.005  # of the loss: what a step must take away
+SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over what is stated
+ENOUGH, BETTER = 0.8, 1.02  # of the damping designed for; a faster filter must give so much more
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step from the present controller to the redesigned one.
+
+    Attributes:
+        name: such as "delay".
+        what: in words, with the numbers that it takes out.
+        vibration, effort: ∫ of the energy of all modes and ∫ FᵀF dt, on the corrected rig under test.
+        loss: how much more of both it takes than the redesigned law with perfect actuators and sensors: the sum of the
+            shares in excess, with this step and those kept before.
+        kept: whether it paid.
+    """
+
+    name: str
+    what: str
+    vibration: float
+    effort: float
+    loss: float
+    kept: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Redesign:
+    """A controller redesigned for the structure that a diagnosis found.
+
+    Attributes:
+        possible: the corrected rig with its uncertainty.
+        present, redesigned: the controllers, once a sample.
+        loop: law and estimator of the redesigned one, on the corrected rig in the motion under test.
+        controlled: zero-based modes of the corrected rig.
+        steps: from one to the other.
+        test: what the loops were put through.
+        before, after: the present and the redesigned controller on the corrected rig under test.
+        present_proof, proof: both on the same draws.
+        relocation: where the actuators should stand for the corrected structure; None where that is not known.
+        notes: what else a reader should know.
+    """
+
+    possible: UncertainRig
+    present: DigitalController
+    redesigned: DigitalController
+    loop: Loop
+    controlled: tuple[int, ...]
+    steps: tuple[Step, ...]
+    test: LoopTest
+    before: LoopRun
+    after: LoopRun
+    present_proof: Proof
+    proof: Proof
+    relocation: Relocation | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def mode(self) -> int:
+        """The controlled mode (zero-based) whose damping is changed most."""
+        old, new = (np.median(p.damping[:, list(self.controlled)], axis=0) for p in (self.present_proof, self.proof))
+        return self.controlled[int(np.argmax(np.abs(new - old)))]
+
+    @property
+    def sentence(self) -> str:
+        """The redesign in one sentence."""
+        old, new = self.present_proof, self.proof
+        unstable = old.n_draws - int(old.stable.sum())
+        effort = interval(new.effort)[0] / max(interval(old.effort)[0], 1e-300)
+        if old.share_stable < 0.5:
+            text = f"the present controller is unstable on {_of(unstable, old.n_draws)} draws; redesigned, it "
+            text += self._does(new, "95 %: ")
+        else:
+            text = f"the present controller {self._does(old, '95 %: ')}"
+            text += f", unstable on {unstable} draws" if unstable else ""
+            text += f"; redesigned: {self._does(new, '', named=False)}, {effort:.2g} times the effort"
+        text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
+        return text if self.possible.explained else f"{text} {self._promise}"
+
+    def _does(self, proof: Proof, lead: str, *, named: bool = True) -> str:
+        """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
+        if self.redesigned.relays is not None:
+            middle, low, high = interval(proof.settling)
+            return f"{'settles in ' * named}{middle:.3g} s ({lead}{low:.3g} to {high:.3g})"
+        ratios = _ratios(proof.damping[:, self.mode], lead)
+        return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
+
+    @property
+    def safe(self) -> bool:
+        """Whether every draw is stable, and the error that the loop bears for sure exceeds what is unexplained."""
+        holds = self.proof.margin > self.possible.unexplained or np.isnan(self.proof.margin)
+        return bool(self.proof.stable.all() and (self.possible.explained or holds))
+
+    @property
+    def _promise(self) -> str:
+        """What can be promised where the gap is not explained."""
+        share, margin = self.possible.unexplained, self.proof.margin
+        error = f"the model's readings are off by {100 * share:.2g} % that nothing explains"
+        if np.isnan(margin):
+            return f"No promise: {error}, and on-off control has no linear bound."
+        bears = f"the loop bears {100 * min(margin, 9.99):.2g} % of any phase"
+        return (
+            f"No effect explains the gap: {error}; {bears}, so stability is {'sure' if margin > share else 'not sure'}."
+        )
+
+    def __repr__(self) -> str:
+        return f"<Redesign: {self.sentence}>"
+
+    def to_json(self) -> dict[str, Any]:
+        """The redesign as plain numbers."""
+        moved = self.relocation
+        return {
+            "sentence": self.sentence,
+            "safe": self.safe,
+            "controlled": [r + 1 for r in self.controlled],
+            "steps": [asdict(s) for s in self.steps],
+            "present": self.present_proof.to_json(),
+            "redesigned": self.proof.to_json(),
+            "unexplained": self.possible.unexplained,
+            "placement": None if moved is None else moved.to_json(),
+            "notes": list(self.notes),
+        }
+
+
+@one_blas_thread
+def redesign(
+    verdict: Verdict | UncertainRig,
+    design: Design,
+    *,
+    sample_time: float | None = None,
+    impulse_at: Where | None = None,
+    test: LoopTest | None = None,
+    draws: int = 200,
+    seed: int = 0,
+    placement: bool = True,
+    report: Report = lambda text, share: None,
+) -> Redesign:
+    """A controller of the same kind, designed anew for the corrected rig, and both proved on the same possible rigs.
+
+    The law and the estimator are designed with the settings that they have, on the modes of the corrected rig, with
+    each element at a point as the spring and damper that it is worth in the motion under test. Then every loss on the
+    way is made up for by a step of its own, which is kept where it lowers the vibration.
+
+    Args:
+        verdict: of the diagnosis, or the corrected rig with its uncertainty.
+        design: in use: a `Controller` from `luenberger`, `kalman` or a modal filter; a law, which then reads a Kalman
+            filter on the rig's sensors; or a `PlacementTask`, whose IMSC law the rig's actuators then take.
+        sample_time: s, of the controller; that of the records unless given.
+        impulse_at: where the test strikes; at the hammer, or the first actuator, unless given.
+        test: in place of the impulse.
+        draws: possible rigs on which both are proved.
+        seed: of the draws and of the sensors' noise.
+        placement: whether to look where the actuators should stand instead.
+        report: told (what, share done).
+
+    Raises:
+        DesignError: a controller that does not fit the rig, a rate too slow for the modes, or modes that cannot be
+            controlled on the corrected rig.
+    """
+    possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
+    nominal, corrected = possible.nominal, possible.rig
+    if test is not None:
+        sample_time = test.sample_time if sample_time is None else sample_time
+    if sample_time is None:
+        if isinstance(verdict, UncertainRig):
+            raise DesignError("how often does the controller run? give sample_time, in s")
+        sample_time = verdict.attribution.search.data.records[0].sample_time
+    check_rate(nominal.modes, _controlled(design), sample_time)
+    report("the present controller", 0.05)
+    level = _level(verdict)
+    test = test or impulse_test(nominal, _controlled(design), sample_time, impulse_at, level=level, seed=seed)
+    loop = fitted(nominal, design, test)
+    present = _present(nominal, loop, sample_time)
+    before = run_loop(corrected, present, test)
+    report("designing for the corrected rig", 0.15)
+    quiet = _silent(present)
+    modes = modes_in_motion(corrected, run_loop(corrected, quiet, test))
+    steps: tuple[Step, ...]
+    for _ in range(2):  # elements are worth another stiffness in the smaller motion of the redesigned loop
+        anew = designed_anew(loop, corrected, modes)
+        redesigned, steps = _compensated(corrected, anew, test, present)
+        after = run_loop(corrected, redesigned, test)
+        if not corrected.elements or not after.bounded:
+            break
+        modes = modes_in_motion(corrected, after)
+    report("proof on the draws", 0.4)
+    rigs = drawn_with_errors(possible, draws, seed)
+    old = prove(rigs, present, test, controlled=anew.law.controlled, centre=corrected)
+    report("proof on the draws", 0.65)
+    new = prove(rigs, redesigned, test, controlled=anew.law.controlled, centre=corrected)
+    report("where actuators should stand", 0.9)
+    moved = relocated(anew, test) if placement else None
+    report("done", 1.0)
+    return Redesign(
+        possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, moved,
+        _notes(possible, corrected),
+    )  # fmt: skip
+
+
+def _law_of(design: Law | OnOffLaw | Controller) -> Law | OnOffLaw:
+    return design.law if isinstance(design, Controller) else design
+
+
+def _controlled(design: Design) -> tuple[int, ...]:
+    return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else _law_of(design).controlled
+
+
+def _level(verdict: Verdict | UncertainRig) -> np.ndarray | None:
+    """The largest reading of each sensor in the records (n_outputs,)."""
+    if isinstance(verdict, UncertainRig):
+        return None
+    return np.max([np.abs(r.outputs).max(axis=1) for r in verdict.attribution.search.data.records], axis=0)
+
+
+def impulse_test(
+    rig: Rig,
+    controlled: Sequence[int],
+    sample_time: float,
+    impulse_at: Where | None = None,
+    *,
+    level: np.ndarray | None = None,
+    seed: int | None = 0,
+) -> LoopTest:
+    """An impulse, and the free motion after it for 25 periods of the lowest controlled mode.
+
+    Args:
+        rig: nominal.
+        controlled: zero-based modes.
+        sample_time: s.
+        impulse_at: the place; that of a hammer, or of the first actuator, unless given.
+        level: (n_outputs,) readings that the nominal rig without control then peaks at, in the median of the sensors;
+            None for a unit impulse.
+        seed: of the noise.
+    """
+    if impulse_at is None:
+        struck = next((a for a in rig.actuators if a.direct), rig.actuators[0])
+        impulse_at = struck.at
+    omega = rig.modes.omega[list(controlled)]
+    omega = omega[omega > 0]
+    if not omega.size:
+        raise DesignError("the controlled modes are all rigid, so they have no period: give a test of your own")
+    n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
+    test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
+    if level is None:
+        return test
+    shape = rig.modes.phi_at(impulse_at)
+    damped = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time)
+    omega = np.maximum(rig.modes.omega, 1e-9)[:, None]
+    motion = (
+        damped * np.sin(omega * test.time) * (shape[:, None] / omega),
+        damped * np.cos(omega * test.time) * shape[:, None],
+    )
+    peaks = []
+    for sensor, reached in zip(rig.sensors, level, strict=True):
+        derivative, order = MEASURED[sensor.quantity]
+        if order < 2:
+            row = rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
+            peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
+    return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
+
+
+def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
+    """A design on the sensors and actuators of a rig, by their names; a law alone reads a Kalman filter.
+
+    Raises:
+        DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
+    """
+    if isinstance(design, PlacementTask):
+        actuators = [a for a in rig.actuators if not a.direct]
+        design = imsc(rig.modes, design.n_controlled, actuators, weight=design.weight)
+    law = _law_of(design)
+    if law.designed_by is None:
+        raise DesignError(
+            f"{law.name} was given by its gain, which no other structure can be designed from: make it by imsc,"
+            " imsc_poles, coupled_lqr, coupled_poles or on_off"
+        )
+    law = replace(law, actuators=tuple(_same_actuator(rig, a) for a in law.actuators))
+    linear = law if isinstance(law, Law) else _without_gain(law)
+    if isinstance(design, Controller):
+        if design.designed_by is None:
+            raise DesignError(
+                f"{design.name} does not tell how its estimator was designed: make it by luenberger, kalman or"
+                " filtered(law, hermite_filter(...))"
+            )
+        return Loop(rig.modes, law, replace(design, law=linear, sensors=_same_sensors(rig, design.sensors)))
+    return Loop(rig.modes, law, default_estimator(rig, linear, test))
+
+
+def _without_gain(law: OnOffLaw) -> Law:
+    return Law(np.zeros((len(law.actuators), 2 * len(law.controlled))), law.controlled, law.actuators, law.name)
+
+
+def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
+    """A Kalman filter on all sensors of motion and rate, as fast as the loop of all modes bears.
+
+    The intensity of the readings' noise is σ² T, and the modal forces are those that excite each mode within the test
+    to the speed that the impulse gives it, by a factor that leaves the loop of the nominal rig with the most damping of
+    its controlled modes, residual ones stable.
+    """
+    sensors = without([s for s in rig.sensors if MEASURED[s.quantity][1] < 2])
+    if not sensors:
+        raise DesignError("no sensor of the rig reads motion or rate, so no law can know the state; add one")
+    index = list(law.controlled)
+    at = rig.actuators[0].at if test.impulse_at is None else test.impulse_at
+    speed = np.abs(test.impulse * rig.modes.phi_at(at)[index])
+    speed = np.maximum(speed, 0.1 * speed.max())
+    push = speed**2 / (test.n_samples * test.sample_time)
+    shapes = np.abs(output_matrix(rig.modes, sensors)[:, index])
+    rates = np.array([MEASURED[s.quantity][1] for s in sensors])[:, None]
+    signal = (shapes * speed / np.maximum(rig.modes.omega[index], 1e-9) ** (1 - rates)).max(axis=1)
+    noise = np.maximum([s.noise_std for s in sensors], 1e-6 * signal) ** 2 * test.sample_time
+    damping = _design_damping(rig.modes, law)
+    best, least = None, -np.inf
+    for factor in SPEEDS:
+        try:
+            controller = kalman(rig.modes, law, sensors, disturbance=push, noise=factor * noise)
+        except DesignError:
+            continue
+        found = loop_poles(rig, sampled(controller, test.sample_time))
+        # fast enough for the damping that the law was designed for is enough; the slower one is the more robust
+        reached = float(np.minimum(found.damping[index] / damping, ENOUGH).mean())
+        if found.spectral_radius < 1.0 and reached > least * BETTER:
+            best, least = controller, reached
+    if best is None:
+        raise DesignError(
+            f"no Kalman filter on {', '.join(s.name for s in sensors)} leaves the loop of all modes stable; hand a"
+            " controller, weigh the forces more, or control fewer modes"
+        )
+    return best
+
+
+def _design_damping(modes: Modes, law: Law) -> np.ndarray:
+    """Damping ratios (n_controlled,) with exact modal coordinates fed back; those without control for a law of none."""
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    poles = np.linalg.eigvals(a - b @ law.gain)
+    poles = poles[poles.imag >= 0]
+    ratios = -poles.real / np.maximum(np.abs(poles), 1e-300)
+    order = np.argsort(np.abs(poles))[: law.n_controlled]
+    return np.maximum(np.resize(ratios[order], law.n_controlled), 1e-6)
+
+
+def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
+    for a in rig.actuators:
+        if a.name == wanted.name or (a.at == wanted.at and a.kind == wanted.kind and not a.direct):
+            return replace(a)
+    names = ", ".join(f"{a.name} at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    raise DesignError(
+        f"the law drives {wanted.name} at {rig.modes.domain.text(wanted.at)}, where the rig has no actuator: it has"
+        f" {names}; design the law for these"
+    )
+
+
+def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    found = []
+    for one in wanted:
+        alike = [
+            s
+            for s in rig.sensors
+            if s.quantity == one.quantity and (s.name == one.name or rig.modes.domain.separation(s.at, one.at) < 1e-9)
+        ]
+        if not alike:
+            names = ", ".join(f"{s.name} ({s.quantity})" for s in rig.sensors)
+            raise DesignError(
+                f"the controller reads {one.quantity} at {rig.modes.domain.text(one.at)}, where the rig has no such"
+                f" sensor: it has {names}; design the estimator for these"
+            )
+        found.append(alike[0])
+    return tuple(found)
+
+
+def _present(rig: Rig, loop: Loop, sample_time: float) -> DigitalController:
+    """The controller in use, as it is: designed for the nominal rig, and nothing made up for."""
+    if isinstance(loop.law, OnOffLaw):
+        return compensated(rig, loop, sample_time, ())
+    return sampled(loop.controller, sample_time)
+
+
+def _silent(controller: DigitalController) -> DigitalController:
+    """A controller that commands nothing."""
+    nothing = {"c": np.zeros_like(controller.c), "d": np.zeros_like(controller.d), "friction": None}
+    n_u = len(controller.actuators)
+    if controller.relays is not None:
+        nothing |= {
+            "c": np.zeros((n_u, controller.a.shape[0])),
+            "d": np.zeros((n_u, len(controller.sensors))),
+            "relays": None,
+        }
+    rest = {"dead_zone": np.zeros(n_u), "bias": np.zeros(n_u)}
+    return replace(controller, **nothing, **rest)
+
+
+def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
+    """The same law and estimator, designed with their settings for the modes of another rig.
+
+    Args:
+        loop: as it is.
+        rig: whose actuators and sensors are taken, by name.
+        modes: of the rig in its motion.
+        removed: sensors that are not to be read.
+
+    Raises:
+        DesignError: modes that cannot be controlled or seen on that rig.
+    """
+    controlled = paired(loop.modes, modes, loop.law.controlled)
+    actuators = [next(a for a in rig.actuators if a.name == old.name) for old in loop.law.actuators]
+    assert loop.law.designed_by is not None and loop.controller.designed_by is not None
+    if isinstance(loop.law, OnOffLaw):
+        modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
+    law = loop.law.designed_by(modes, controlled=controlled, actuators=actuators)  # type: ignore[call-arg]
+    linear = law if isinstance(law, Law) else _without_gain(law)
+    sensors = [next(s for s in rig.sensors if s.name == old.name) for old in loop.controller.sensors]
+    controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
+    return Loop(modes, law, controller)
+
+
+def _estimated(
+    old: Controller, modes: Modes, law: Law, sensors: Sequence[Sensor], removed: Sequence[str]
+) -> Controller:
+    assert old.designed_by is not None
+    kept = [i for i, s in enumerate(sensors) if s.name not in removed]
+    design: Any = old.designed_by
+    if removed and np.ndim(noise := getattr(design, "keywords", {}).get("noise", 0.0)):
+        chosen = np.asarray(noise)[kept] if np.ndim(noise) == 1 else np.asarray(noise)[np.ix_(kept, kept)]
+        anew = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
+    else:
+        anew = design(modes, law, [sensors[i] for i in kept])
+    if anew.state.size == 0:  # a filter's own sensors stand where the rig's do
+        anew = replace(anew, sensors=tuple(sensors))
+    return anew
+
+
+def paired(nominal: Modes, modes: Modes, controlled: Sequence[int]) -> tuple[int, ...]:
+    """Which modes of a changed structure are the controlled ones, by their shapes; increasing.
+
+    Raises:
+        DesignError: more modes controlled than there are.
+    """
+    if len(controlled) > modes.n_modes:
+        raise DesignError(f"{len(controlled)} modes are controlled; the corrected rig shows {modes.n_modes}")
+    grid = nominal.domain.grid(8 * nominal.n_modes + 9)
+    alike = mac(nominal.phi(grid)[:, list(controlled)], modes.phi(grid))
+    _, found = linear_sum_assignment(-alike)
+    return tuple(sorted(int(r) for r in found))
+
+
+def _compensated(
+    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController
+) -> tuple[DigitalController, tuple[Step, ...]]:
+    """The redesigned controller: compensations one after the other, each kept where it pays."""
+    perfect = replace(
+        rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
+    )
+    ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
+
+    def tried(name: str, what: str, controller: DigitalController) -> Step:
+        run = run_loop(rig, controller, test)
+        vibration, effort = _vibration(run), run.effort if run.bounded else np.inf
+        excess = vibration / max(_vibration(ideal), 1e-300) - 1.0, effort / max(ideal.effort, 1e-300) - 1.0
+        return Step(name, what, vibration, effort, float(max(excess[0], 0.0) + max(excess[1], 0.0)), True)
+
+    kept: list[str] = []
+    best = compensated(rig, loop, test.sample_time, ())
+    steps = [
+        tried("present", f"{present.name}, as it is", present),
+        tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig", best),
+    ]
+    least = steps[-1].loss
+    for name in STEPS:
+        what = _losses(rig, loop, name)
+        if not what:
+            continue
+        trial = compensated(rig, loop, test.sample_time, (*kept, name))
+        step = tried(name, what, trial)
+        pays = step.loss < least - PAYS or not np.isfinite(least)
+        steps.append(replace(step, kept=pays))
+        if pays:
+            kept.append(name)
+            best, least = trial, step.loss
+    return best, tuple(steps)
+
+
+def _perfect(actuator: Actuator) -> Actuator:
+    """The actuator with its gain and nothing lost on the way."""
+    at = {"kind": actuator.kind, "direction": actuator.direction, "direct": actuator.direct}
+    return Actuator(actuator.name, actuator.at, gain=actuator.gain, **at)  # type: ignore[arg-type]
+
+
+def _vibration(run: LoopRun) -> float:
+    if not run.bounded:
+        return np.inf
+    time = run.response.time
+    return float(run.response.energy.sum() * (time[1] - time[0]))
+
+
+def _losses(rig: Rig, loop: Loop, step: str) -> str:
+    """What a step takes out, in words; empty where there is nothing."""
+    words = []
+    for a in (next(x for x in rig.actuators if x.name == one.name) for one in loop.law.actuators):
+        if step == "delay" and (a.delay or a.time_constant):
+            late = [f"delay {1e3 * a.delay:.3g} ms"] * (a.delay > 0) + [f"lag {1e3 * a.time_constant:.3g} ms"] * (
+                a.time_constant > 0
+            )
+            words.append(f"{a.name}: {', '.join(late)}")
+        elif step == "dead zone" and (a.dead_zone or a.bias):
+            words.append(f"{a.name}: dead zone {a.dead_zone:.3g} N, bias {a.bias:.3g} N")
+        elif step == "saturation" and (np.isfinite(a.limit) or np.isfinite(a.rate_limit)):
+            words.append(
+                f"{a.name}: limit {a.limit:.3g} N"
+                + (f", rate {a.rate_limit:.3g} N/s" if np.isfinite(a.rate_limit) else "")
+            )
+    if step == "sensors":
+        for s in (next(x for x in rig.sensors if x.name == one.name) for one in loop.controller.sensors):
+            faults = [
+                *([f"gain {s.gain:.3g}"] if s.gain != 1 else []),
+                *([f"offset {s.bias:.3g}"] if s.bias else []),
+                *([f"late by {1e3 * (s.delay + s.time_constant):.3g} ms"] if s.delay > 0 or s.time_constant else []),
+                *(["cross-talk"] if s.crosstalk else []),
+            ]
+            if faults:
+                words.append(f"{s.name}: {', '.join(faults)}")
+    if step == "friction":
+        words += [
+            f"{e.force:.3g} N at {rig.modes.domain.text(e.at)}"
+            for e in rig.elements
+            if type(e).__name__ == "CoulombFriction"
+        ]
+    return "; ".join(words)
+
+
+def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
+    notes = []
+    if any(a.hysteresis_share for a in rig.actuators):
+        notes.append("The hysteresis of an actuator is in the proof, but no step makes up for it.")
+    if possible.rivals:
+        share = sum(p for _, p in possible.rivals)
+        notes.append(f"{100 * share:.0f} % of the draws are rival sets of effects that the records do not exclude.")
+    return tuple(notes)
+
+
+def _of(part: int, whole: int) -> str:
+    return f"{part:,} of {whole:,}"
+
+
+def _ratios(values: np.ndarray, lead: str = "") -> str:
+    middle, low, high = (100.0 * v for v in interval(values))
+    return f"{_two(middle)} % ({lead}{_two(low)} to {_two(high)})"
+
+
+def _two(value: float) -> str:
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"

@@ -1,0 +1,76 @@
+"""Where actuators should stand for a corrected structure, and what moving them is worth."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError
+from workbench.design.loop.rig_loop import LoopTest
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.placement import place
+from workbench.design.placement.task import Placement, placement_task
+from workbench.robust.compensation import Loop
+from workbench.structure.domain import Interval, position
+
+SPACING, STARTS = 0.05, 4  # of the length; random starts of the search
+
+
+@dataclass(frozen=True, eq=False)
+class Relocation:
+    """Actuators as they stand and as they should, on the corrected structure, for no more effort than now.
+
+    Attributes:
+        present, moved: W_R, effort and peak force of each.
+    """
+
+    present: Placement
+    moved: Placement
+
+    @property
+    def gain(self) -> float:
+        """Share of W_R that moving takes away."""
+        return 1.0 - self.moved.residual_work / self.present.residual_work
+
+    @property
+    def sentence(self) -> str:
+        old, new = (", ".join(f"{x:.3g}" for x in p.positions) for p in (self.present, self.moved))
+        return (
+            f"Actuators at x = {new} m instead of {old} m would spill {100 * self.gain:.0f} % less work into residual"
+            " modes, for no more effort."
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "present": self.present.positions.tolist(),
+            "moved": self.moved.positions.tolist(),
+            "residual_work": [self.present.residual_work, self.moved.residual_work],
+            "effort": [self.present.effort, self.moved.effort],
+        }
+
+
+def relocated(loop: Loop, test: LoopTest) -> Relocation | None:
+    """The best places for the law's actuators on its modes; None where they are better where they are, or not known.
+
+    Known for IMSC of the lowest modes along an interval, by point forces of one kind, after an impulse.
+    """
+    law, modes = loop.law, loop.modes
+    n = len(law.controlled)
+    settings = getattr(law.designed_by, "keywords", {})
+    if getattr(law.designed_by, "func", None) is not imsc or test.impulse_at is None or n == modes.n_modes:
+        return None
+    if not isinstance(modes.domain, Interval) or law.controlled != tuple(range(n)) or len(law.actuators) != n:
+        return None
+    if not all(isinstance(a.at, float) and a.kind == "force" for a in law.actuators):
+        return None
+    try:
+        task = placement_task(
+            modes, n, impulse_at=position(test.impulse_at), weight=settings["weight"], impulse=test.impulse
+        )
+        present = task.placed(np.array([position(a.at) for a in law.actuators]), "as they stand")
+        limits = Limits(effort=present.effort, spacing=SPACING * modes.length)
+        moved = place(task, limits, starts=STARTS)
+    except DesignError:
+        return None
+    return Relocation(present, moved) if moved.residual_work < present.residual_work else None

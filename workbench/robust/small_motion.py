@@ -1,0 +1,196 @@
+"""The loop of small motion about that under test: its poles, and the error of the readings that it bears for sure."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+from scipy.optimize import minimize_scalar
+
+from workbench.design.estimation.digital import DigitalController
+from workbench.design.loop.rig_loop import LoopRun
+from workbench.rig.elements import PointElement
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED
+from workbench.rig.simulate import participation_of
+from workbench.rig.statespace import output_matrix
+from workbench.structure.modes import Modes
+from workbench.structure.modification import attach
+from workbench.structure.supports import Attachment, PointDamper, PointSpring
+
+FREQUENCIES = 240
+
+
+def modes_in_motion(rig: Rig, run: LoopRun) -> Modes:
+    """The modes with each element at a point as the spring and damper that do the same in the motion of a run.
+
+    (k, c) by least squares of f = -k w - c v over the run: equivalent linearisation (Caughey, J. Acoust. Soc. Am. 35
+    (1963) 1706).
+    """
+    points = [e for e in rig.elements if isinstance(e, PointElement)]
+    parts: list[Attachment] = []
+    for element, motion in zip(points, np.moveaxis(run.elements, 1, 0), strict=True) if run.bounded else ():
+        w, v, f = motion
+        if not (np.abs(w).max() > 0 and np.abs(v).max() > 0):
+            continue
+        stiffness, coefficient = np.linalg.lstsq(-np.column_stack([w, v]), f, rcond=None)[0]
+        if stiffness > 0:
+            parts.append(PointSpring(element.at, float(stiffness)))
+        if coefficient > 0:
+            parts.append(PointDamper(element.at, float(coefficient)))
+    return attach(rig.modes, tuple(parts)) if parts else rig.modes
+
+
+@dataclass(frozen=True, eq=False)
+class LoopPoles:
+    """Poles of a sampled loop, and the damping that each mode has in it.
+
+    Attributes:
+        poles: (n_states,) in the z plane.
+        damping: (n_modes,) ratio of the pole in which a mode moves most.
+    """
+
+    poles: np.ndarray
+    damping: np.ndarray
+
+    @property
+    def spectral_radius(self) -> float:
+        return float(np.abs(self.poles).max())
+
+
+def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = None) -> LoopPoles:
+    """Poles of the loop of small motion: delays exact, dead zones and limits left out, on-off control switched off.
+
+    Args:
+        rig: whose actuators and sensors close the loop.
+        controller: with or without compensation.
+        modes: of the motion, where elements stand at points; those of the rig unless given.
+    """
+    modes = modes or rig.modes
+    closed, _, _ = _closed(rig, controller, modes)
+    poles, vectors = np.linalg.eig(closed)
+    n = modes.n_modes
+    moved = np.abs(modes.omega[:, None] * vectors[:n]) ** 2 + np.abs(vectors[n : 2 * n]) ** 2
+    share = moved / np.maximum(moved.sum(axis=0), 1e-300) * (np.abs(poles) > 1e-6)
+    rates = np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / controller.sample_time
+    ratio = -rates.real / np.maximum(np.abs(rates), 1e-300)
+    ratio = np.where(np.abs(rates.imag) * controller.sample_time < 1e-9, np.sign(-rates.real), ratio)
+    return LoopPoles(poles, ratio[np.argmax(share, axis=1)])
+
+
+def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The loop z ← A z, what errors of the readings add to it, and the readings: A, B, C."""
+    plant_a, plant_b, plant_c = _plant(rig, controller, modes)
+    n_c, n_u = len(controller.a), len(controller.actuators)
+    c, d = controller.c, controller.d * controller.scale
+    if controller.relays is not None:
+        c, d = np.zeros((n_u, n_c)), np.zeros((n_u, len(controller.sensors)))
+    b = controller.b * controller.scale
+    a_c, b_c = controller.a + controller.e @ c, b + controller.e @ d
+    closed = np.block([[plant_a + plant_b @ d @ plant_c, plant_b @ c], [b_c @ plant_c, a_c]])
+    by_error = np.vstack([plant_b @ d, b_c])
+    return closed, by_error, np.hstack([plant_c, np.zeros((plant_c.shape[0], n_c))])
+
+
+def _plant(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A, B, C from commands to readings over a sample: modes, lags, and commands on their way."""
+    dt = controller.sample_time
+    actuators = [next(a for a in rig.actuators if a.name == name) for name in controller.actuators]
+    sensors = [next(s for s in rig.sensors if s.name == name) for name in controller.sensors]
+    n, n_u = modes.n_modes, len(actuators)
+    into = participation_of(Rig(modes, tuple(actuators), ())) * np.array([a.gain for a in actuators])
+    slow = [j for j, a in enumerate(actuators) if a.time_constant > 0]
+    size = 2 * n + len(slow)
+    a, b = np.zeros((size, size)), np.zeros((size, n_u))
+    a[: 2 * n, : 2 * n] = modes.state_matrix
+    b[n : 2 * n] = into
+    for i, j in enumerate(slow):
+        a[n : 2 * n, 2 * n + i], b[n : 2 * n, j] = into[:, j], 0.0
+        rate = 1.0 / actuators[j].time_constant
+        a[2 * n + i, 2 * n + i], b[2 * n + i, j] = -rate, rate
+    delays = np.array([x.delay for x in actuators]) / dt
+    whole = np.floor(np.round(delays, 9)).astype(int)
+    part = np.maximum(delays - whole, 0.0)
+    memory = np.where(delays > 1e-9, whole + (part > 1e-9), 0)
+    starts = size + np.r_[0, np.cumsum(memory)[:-1]].astype(int)
+    total = size + int(memory.sum())
+    wide, entering = np.zeros((total, total)), np.zeros((total, n_u))
+    step, _ = _step(a, b, dt)
+    wide[:size, :size] = step
+    for share in np.unique(part):
+        # over a sample the older command acts for its share, the newer one for the rest
+        columns = np.flatnonzero(part == share)
+        _, late = _step(a, b[:, columns], (1.0 - share) * dt)
+        _, early = _step(a, b[:, columns], share * dt)
+        after = expm(a * (1.0 - share) * dt) if share else np.eye(size)
+        for k, j in enumerate(columns):
+            for age, effect in ((whole[j], late[:, k]), (whole[j] + 1, after @ early[:, k] if share else None)):
+                if effect is None:
+                    continue
+                if age == 0:
+                    entering[:size, j] += effect
+                else:
+                    wide[:size, starts[j] + age - 1] += effect
+    for j in np.flatnonzero(memory):
+        entering[starts[j], j] = 1.0
+        for k in range(1, memory[j]):
+            wide[starts[j] + k, starts[j] + k - 1] = 1.0
+    reads = np.zeros((len(sensors), total))
+    shapes = output_matrix(modes, sensors)
+    for i, sensor in enumerate(sensors):
+        order = MEASURED[sensor.quantity][1]
+        # a late or slow sensor by what it makes of each mode at its frequency
+        h = np.exp(-1j * modes.omega * max(sensor.delay, 0.0)) / (1.0 + 1j * modes.omega * sensor.time_constant)
+        safe = np.where(modes.omega > 0, modes.omega, 1.0)
+        if order == 0:
+            reads[i, :n], reads[i, n : 2 * n] = shapes[i] * h.real, shapes[i] * h.imag / safe
+        else:
+            reads[i, :n], reads[i, n : 2 * n] = -shapes[i] * modes.omega * h.imag, shapes[i] * h.real
+    names = [s.name for s in sensors]
+    mixed = np.eye(len(sensors))
+    for i, sensor in enumerate(sensors):
+        for name, share in sensor.crosstalk:
+            if name in names:
+                mixed[i, names.index(name)] += share * sensor.gain / sensors[names.index(name)].gain
+    reads = mixed @ reads
+    return wide, entering, reads
+
+
+def _step(a: np.ndarray, b: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray]:
+    """e^{A h} and ∫ e^{A s} ds B."""
+    size, n_u = b.shape
+    block = np.zeros((size + n_u, size + n_u))
+    block[:size, :size], block[:size, size:] = a, b
+    moved = expm(block * span)
+    return moved[:size, :size], moved[:size, size:]
+
+
+def small_gain_margin(rig: Rig, controller: DigitalController, modes: Modes | None = None) -> tuple[float, float]:
+    """The relative error of all readings that a loop bears whatever its phase, and the frequency where it is least, Hz.
+
+    With y_real = (I + Δ) y, Δ = diag(δ_j), and M from what Δ adds to the readings, the loop is stable for all
+    |δ_j| < 1 / max_ω ρ(|M(e^{iωT})|): ρ(|M|), the Perron root, bounds the structured singular value of M for a
+    diagonal Δ (Safonov, IEE Proc. D 129 (1982) 251).
+    """
+    if controller.relays is not None:
+        return np.nan, np.nan
+    closed, by_error, reads = _closed(rig, controller, modes or rig.modes)
+    poles = np.linalg.eigvals(closed)
+    if np.abs(poles).max() >= 1.0:
+        return 0.0, np.nan
+    if not by_error.any():
+        return np.inf, np.nan
+    angles, widths = np.angle(poles), -np.log(np.maximum(np.abs(poles), 1e-12))
+    near = (angles[:, None] + widths[:, None] * np.linspace(-2.0, 2.0, 9)).ravel()
+    grid = np.unique(np.r_[np.geomspace(1e-4, np.pi, FREQUENCIES), near[(near > 1e-4) & (near < np.pi)], np.pi])
+    values, vectors = np.linalg.eig(closed)
+    left, right = reads @ vectors, np.linalg.solve(vectors, by_error.astype(complex))
+
+    def bound(angle: float) -> float:
+        m = np.abs((left / (np.exp(1j * angle) - values)) @ right)
+        return float(np.abs(np.linalg.eigvals(m)).max())
+
+    worst = int(np.argmax([bound(angle) for angle in grid]))
+    around = grid[max(worst - 1, 0)], grid[min(worst + 1, grid.size - 1)]
+    refined = minimize_scalar(lambda angle: -bound(angle), bounds=around, method="bounded", options={"xatol": 1e-9})
+    angle = max((float(grid[worst]), float(refined.x)), key=bound)
+    return 1.0 / bound(angle), angle / (2.0 * np.pi * controller.sample_time)
