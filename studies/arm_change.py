@@ -16,7 +16,7 @@ from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import predict
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 from workbench.structure.profile import Profile
@@ -61,7 +61,7 @@ def believed(record):
 
 def left(rig, record):
     """What a rig leaves of a record: (n_samples,) encoder counts."""
-    return (record.outputs - simulate(rig, record.inputs, sample_time=record.sample_time).outputs)[0]
+    return (record.outputs - predict(rig, record))[0]
 
 
 def identified(records, start, at=None):
@@ -169,7 +169,7 @@ def _plot_responses(before, after, rig, corrected):
     for ax, record, models in ((axes[0], before, (first,)), (axes[1], after, (first, second))):
         ax.loglog(*_response(record, record.outputs), color=COLOURS[6], linewidth=3.0, alpha=0.4, label="measured")
         for model, label, colour, style in models:
-            outputs = simulate(model, record.inputs, sample_time=record.sample_time).outputs
+            outputs = predict(model, record)
             label = "the rig of the first test" if record is after and model is rig else label
             ax.loglog(*_response(record, outputs), color=colour, linestyle=style, label=label)
         ax.set(title=f"{record.name} the change", xlabel="frequency [Hz]")

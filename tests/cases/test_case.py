@@ -224,3 +224,15 @@ def test_all_shared_cases_load():
         structure = table["structure"]
         assert case.rig.modes.n_modes == structure.get("modes", len(structure.get("natural_frequencies_hz", ())))
         assert all(isinstance(r, Record) and isinstance(r.output_channels[0], Channel) for r in case.fit)
+
+
+def test_inputs_are_held_or_run_straight_as_the_case_says(case, tmp_path):
+    folder = write_case(replace(case, fit=(replace(case.fit[0], input_hold="first"),)), tmp_path / "case").parent
+    read = read_case(folder)
+    assert [read.fit[0].input_hold, read.validation[0].input_hold] == ["first", "zero"]
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text('input_hold = "first"\n' + text)
+    assert read_case(folder).validation[0].input_hold == "first"
+    (folder / "case.toml").write_text('input_hold = "second"\n' + text)
+    with pytest.raises(CaseError, match=r"zero \(held\) or first"):
+        read_case(folder)

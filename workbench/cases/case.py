@@ -24,7 +24,7 @@ from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_record
 from workbench.records.limits import check_size
 from workbench.records.npz_file import arrays as load_arrays
-from workbench.records.record import Channel, Record
+from workbench.records.record import HOLDS, Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
@@ -39,7 +39,7 @@ LEAST_SAMPLES = 16
 MOST_MODES = 200
 
 # What each table may hold; a key beside these is a misspelt one.
-TABLES = ("title", "structure", "input", "output", "record")
+TABLES = ("title", "input_hold", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
@@ -55,7 +55,8 @@ PLATE = (
 )
 EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
-INPUT, OUTPUT, RECORD = ("name", "kind"), ("name", "quantity", "noise_std"), ("name", "file", "sample_time", "use")
+INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
+RECORD = ("name", "file", "sample_time", "use", "input_hold")
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +90,11 @@ def read_case(folder: str | Path) -> Case:
         raise CaseError(f"{folder} holds no case.toml, so it is not a case folder")
     table = table_of(path)
     rig = _rig(table, path)
-    records = [(_read_record(folder, entry, rig, path), _use(entry, path)) for entry in tables(table, "record", path)]
+    hold = _hold(table, str(path))
+    records = [
+        (_read_record(folder, {"input_hold": hold, **entry}, rig, path), _use(entry, path))
+        for entry in tables(table, "record", path)
+    ]
     fit = tuple(record for record, use in records if use == "fit")
     if not fit:
         raise CaseError(f'{path}: no record has use = "fit"; a diagnosis needs at least one')
@@ -287,6 +292,14 @@ def _sensor(entry: dict, at: Place) -> Sensor:
 # --- records
 
 
+def _hold(table: dict, where: str) -> str:
+    """How inputs run between samples."""
+    hold = table.get("input_hold", "zero")
+    if hold not in HOLDS:
+        raise CaseError(f"{where}: input_hold is zero (held) or first (straight between samples); got {shown(hold)}")
+    return str(hold)
+
+
 def _use(entry: dict, path: Path) -> str:
     if entry.get("use") not in ("fit", "validate"):
         raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {shown(entry.get('use'))}")
@@ -341,6 +354,7 @@ def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
         output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
         inputs=np.array([arrays[a.name] for a in rig.actuators]),
         input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
+        input_hold=_hold(entry, where),
         name=name,
     )
 

@@ -43,7 +43,10 @@ def write_case(case: Case, folder: str | Path) -> Path:
         file = f"records/{record.name}.npz"
         arrays: dict[str, Any] = {"t": record.time, **_arrays(record)}
         np.savez_compressed(folder / file, **arrays)
-        blocks.append(_table("[[record]]", name=record.name, file=file, sample_time=record.sample_time, use=use))
+        hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
+        blocks.append(
+            _table("[[record]]", name=record.name, file=file, sample_time=record.sample_time, use=use, **hold)
+        )
     path = folder / "case.toml"
     path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     return path

@@ -14,7 +14,7 @@ from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, NamedPoints, Rectangle, Where
 
 MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown, and few have their names level
@@ -25,9 +25,7 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure
     records = list(records)[-3:]
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
     for ax, record in zip(axes[:, 0], records, strict=True):
-        outputs = {
-            name: simulate(rig, record.inputs, sample_time=record.sample_time).outputs for name, rig in rigs.items()
-        }
+        outputs = {name: predict(rig, record) for name, rig in rigs.items()}
         first = next(iter(outputs.values()))
         spread = ((record.outputs - first) / record.outputs.std(axis=1, keepdims=True)) ** 2
         j = int(spread.mean(axis=1).argmax())

@@ -135,7 +135,7 @@ def identify_driven(
     records: Record | Sequence[Record],
     *,
     at_rest: bool = False,
-    straight: bool = False,
+    straight: bool | None = None,
     feedthrough: bool = True,
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
@@ -150,7 +150,8 @@ def identify_driven(
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
         at_rest: that nothing moves at the first sample; otherwise each record has an initial state of its own.
         straight: whether inputs run straight from sample to sample, as measured signals through a filter nearly do;
-            otherwise they are held over each sample interval, as a converter gives them.
+            otherwise they are held over each sample interval, as a converter gives them. As the records say
+            (`input_hold`) unless given.
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
@@ -166,6 +167,7 @@ def identify_driven(
     records = [records] if isinstance(records, Record) else list(records)
     check_same_sensors(records)
     _check_inputs(records)
+    straight = records[0].input_hold == "first" if straight is None else straight
     data = KnownInputs(records, at_rest=at_rest, straight=straight, feedthrough=feedthrough)
     rows, columns = data.fixed.shape
     if rows < columns + 4 * (data.n_excitations + 2):

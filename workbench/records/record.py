@@ -1,7 +1,7 @@
 """A record: named, placed, uniformly sampled signals, going in and coming out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,7 @@ from workbench.structure.printed import Printed, counted, place_text
 if TYPE_CHECKING:
     import control  # takes seconds to import: most who read a record never need it
 
+HOLDS = ("zero", "first")  # how an input runs between samples: held, or straight from one to the next
 QUANTITIES = {
     "displacement": "m",
     "slope": "rad",
@@ -60,8 +61,10 @@ class Record(Printed):
         sample_time: seconds between samples.
         outputs: (n_outputs, n_samples) measured signals.
         output_channels: one `Channel` a row of `outputs`.
-        inputs: (n_inputs, n_samples) signals that went in, held over each sample interval; may have no rows.
+        inputs: (n_inputs, n_samples) signals that went in; may have no rows.
         input_channels: one `Channel` a row of `inputs`.
+        input_hold: "zero" where inputs are held over each sample interval, as a converter gives them, or "first" where
+            they run straight from sample to sample, as measured forces nearly do.
         start_time: time of the first sample, s.
         name: how messages and plots call it.
         remarks: what reading the file changed: units, time steps.
@@ -75,6 +78,7 @@ class Record(Printed):
     output_channels: tuple[Channel, ...]
     inputs: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
     input_channels: tuple[Channel, ...] = ()
+    input_hold: str = "zero"
     start_time: float = 0.0
     name: str = "record"
     remarks: tuple[str, ...] = ()
@@ -89,6 +93,11 @@ class Record(Printed):
         object.__setattr__(self, "input_channels", tuple(self.input_channels))
         if not (np.isfinite(self.sample_time) and self.sample_time > 0):
             raise ValueError(f"record {self.name!r}: the sample time must be positive; got {self.sample_time}")
+        if self.input_hold not in HOLDS:
+            raise ValueError(
+                f"record {self.name!r}: input_hold is zero (held) or first (straight between samples); got"
+                f" {self.input_hold!r}"
+            )
         if outputs.shape[1] == 0:
             raise ValueError(f"record {self.name!r} is empty: it holds no samples")
         if inputs.shape[1] != outputs.shape[1]:
@@ -176,15 +185,8 @@ class Record(Printed):
             raise ValueError(
                 f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: nothing in {start}..{stop}"
             )
-        return Record(
-            sample_time=self.sample_time,
-            outputs=self.outputs[:, keep],
-            output_channels=self.output_channels,
-            inputs=self.inputs[:, keep],
-            input_channels=self.input_channels,
-            start_time=float(time[keep][0]),
-            name=self.name,
-            remarks=self.remarks,
+        return replace(
+            self, outputs=self.outputs[:, keep], inputs=self.inputs[:, keep], start_time=float(time[keep][0])
         )
 
     def only(self, outputs: Sequence[str]) -> "Record":
@@ -195,16 +197,7 @@ class Record(Printed):
                 f"record {self.name!r} has no output {missing[0]!r}; it has {', '.join(self.output_names)}"
             )
         rows = [self.output_names.index(name) for name in outputs]
-        return Record(
-            sample_time=self.sample_time,
-            outputs=self.outputs[rows],
-            output_channels=tuple(self.output_channels[r] for r in rows),
-            inputs=self.inputs,
-            input_channels=self.input_channels,
-            start_time=self.start_time,
-            name=self.name,
-            remarks=self.remarks,
-        )
+        return replace(self, outputs=self.outputs[rows], output_channels=tuple(self.output_channels[r] for r in rows))
 
     def to_control(self) -> "control.TimeResponseData":
         """The same signals as python-control's `TimeResponseData`."""

@@ -7,6 +7,8 @@ from numba import njit
 
 from workbench.structure.modes import modal_state_matrix
 
+CLOSE = 1e-9  # of a lag's rate: nearer, a pole is as good as on it
+
 
 @dataclass(frozen=True, eq=False)
 class ModalPoles:
@@ -112,6 +114,77 @@ def held_response(
     return response, acting
 
 
+def straight_response(
+    system: ModalPoles,
+    forces: np.ndarray,
+    participation: np.ndarray,
+    sample_time: float,
+    *,
+    delay: float = 0.0,
+    time_constant: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same under inputs that run straight from sample to sample, and are zero before the first.
+
+    With the response R_λ of a pole to the inputs, that of a pole behind a lag T is (R_λ - R_{-1/T}) / (1 + λ T).
+    """
+    poles, weights = system.poles, system.weights @ participation
+    pieces = _StraightPieces.of(forces, sample_time, delay)
+    response = pieces.response(poles, weights)
+    if time_constant == 0:
+        return response, pieces.first[0]
+    beside = 1.0 + poles * time_constant
+    beside = np.where(np.abs(beside) < CLOSE, CLOSE, beside)
+    n_inputs = forces.shape[0]
+    lagging = pieces.response(np.full(n_inputs, -1.0 / time_constant), np.eye(n_inputs)).real
+    return (response - weights @ lagging) / beside[:, None], lagging / time_constant
+
+
+@dataclass(frozen=True, eq=False)
+class _StraightPieces:
+    """Inputs over each sample interval, straight up to the sample that arrives within it, if any, and after it.
+
+    Attributes:
+        first, second: (2, n_inputs, n_samples) values where each piece begins and where it ends.
+        spans: their durations, s.
+    """
+
+    first: np.ndarray
+    second: np.ndarray
+    spans: tuple[float, float]
+
+    @classmethod
+    def of(cls, forces: np.ndarray, sample_time: float, delay: float) -> "_StraightPieces":
+        shift, rest = divmod(delay, sample_time)
+        late, share = int(shift), 1.0 - rest / sample_time
+        ahead = np.c_[forces[:, 1:], forces[:, -1:]]
+        old, middle, new = _shifted(forces, late + 1), _shifted(forces, late), _shifted(ahead, late)
+        if late < forces.shape[1]:
+            middle_before = middle.copy()
+            middle_before[:, late] = 0.0  # nothing runs up to the first sample
+        else:
+            middle_before = middle
+        first = np.stack([old + share * (middle_before - old), middle_before])
+        second = np.stack([middle, middle + share * (new - middle)])
+        return cls(first if rest else np.stack([middle, middle]), second, (rest, sample_time - rest))
+
+    def response(self, poles: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Of poles that the inputs drive by weights (n_poles, n_inputs): (n_poles, n_samples)."""
+        before, after = self.spans
+        drive = np.exp(poles * after)[:, None] * self._driven(poles, weights, self.first, before)
+        drive = drive + self._driven(poles, weights, self.second, after)
+        response = np.zeros(drive.shape, complex)
+        _recursion(np.exp(poles * (before + after)).astype(complex), drive.astype(complex), response)
+        return response
+
+    @staticmethod
+    def _driven(poles: np.ndarray, weights: np.ndarray, ends: np.ndarray, span: float) -> np.ndarray:
+        """What a piece adds to each pole by its end."""
+        if span == 0:
+            return np.zeros((poles.size, ends.shape[2]))
+        level, rise = _growth(poles, span), _ramp_growth(poles, span)
+        return level[:, None] * (weights @ ends[0]) + rise[:, None] * (weights @ (ends[1] - ends[0]))
+
+
 def sinusoid_response(
     system: ModalPoles, participation: np.ndarray, omega: float, phasor: complex, sample_time: float, n_samples: int
 ) -> np.ndarray:
@@ -141,7 +214,18 @@ def _real_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _growth(poles: np.ndarray, span: float) -> np.ndarray:
     """∫_0^span e^{λ t} dt."""
-    return np.expm1(poles * span) / poles
+    z = poles * span
+    still = z == 0  # of a rigid mode: too slow a pole for its product to show
+    return span * np.where(still, 1.0, np.expm1(z) / np.where(still, 1.0, z))
+
+
+def _ramp_growth(poles: np.ndarray, span: float) -> np.ndarray:
+    """∫_0^span e^{λ (span - t)} t/span dt."""
+    z = poles * span
+    small = np.abs(z) < 0.1
+    few = np.where(small, z, 0.0)
+    series = 1.0 / 2 + few * (1.0 / 6 + few * (1.0 / 24 + few * (1.0 / 120 + few * (1.0 / 720 + few / 5040.0))))
+    return span * np.where(small, series, (np.expm1(z) - z) / np.where(small, 1.0, z) ** 2)
 
 
 def _faded_growth(poles: np.ndarray, rate: float, span: float) -> np.ndarray:

@@ -29,7 +29,7 @@ from workbench.rig.elements import (
     RandomForce,
     UserLaw,
 )
-from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response
+from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response, straight_response
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.stepping import (
@@ -109,14 +109,23 @@ class Motion:
         return Motion(q, v, forces, stiffness, self.damping, self.held)
 
 
-def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, name: str = "simulated") -> Record:
-    """The record that the rig gives from rest under inputs held over each sample interval, without noise.
+def simulate(
+    rig: Rig,
+    inputs: np.ndarray,
+    *,
+    sample_time: float,
+    substeps: int = 8,
+    name: str = "simulated",
+    input_hold: str = "zero",
+) -> Record:
+    """The record that the rig gives from rest, without noise.
 
     Args:
         inputs: (n_actuators, n_samples) commands.
         sample_time: s.
         substeps: of each sample interval, where the rig is not linear.
         name: of the record.
+        input_hold: "zero" for inputs held over each sample interval, "first" for straight lines between the samples.
 
     Raises:
         ValueError: inputs that do not fit the actuators.
@@ -126,22 +135,29 @@ def simulate(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int 
         raise ValueError(
             f"inputs must have shape ({len(rig.actuators)} actuators, n_samples); got {inputs.shape}. Is time last?"
         )
-    motion = move(rig, inputs, sample_time=sample_time, substeps=substeps)
+    motion = move(rig, inputs, sample_time=sample_time, substeps=substeps, input_hold=input_hold)
     return Record(
         sample_time=sample_time,
         outputs=read(rig, motion, sample_time=sample_time),
         output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
         inputs=inputs,
         input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
+        input_hold=input_hold,
         name=name,
     )
 
 
-def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8) -> Motion:
+def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
+    """What a rig's sensors read (n_sensors, n_samples) under the inputs of a record, noise apart; see `simulate`."""
+    how = {"sample_time": record.sample_time, "substeps": substeps, "input_hold": record.input_hold}
+    return simulate(rig, record.inputs, **how).outputs
+
+
+def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, input_hold: str = "zero") -> Motion:
     """Modal motion from rest; see `simulate`."""
     if is_stepped(rig):
-        return _move_in_steps(rig, inputs, sample_time, substeps)
-    return _move_exactly(rig, inputs, sample_time)
+        return _move_in_steps(rig, inputs, sample_time, substeps, input_hold)
+    return _move_exactly(rig, inputs, sample_time, input_hold)
 
 
 def is_stepped(rig: Rig) -> bool:
@@ -228,16 +244,17 @@ def participation_of(rig: Rig) -> np.ndarray:
     return shapes
 
 
-def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
+def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: str) -> Motion:
     modes, participation = rig.modes, participation_of(rig)
     system = modal_poles(modes.omega, modes.damping)
     n_samples = inputs.shape[1]
     response = np.zeros((system.poles.size, n_samples), complex)
     acting = np.zeros((modes.n_modes, n_samples))
+    response_to = held_response if input_hold == "zero" else straight_response
     for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
         group = [j for j, a in enumerate(rig.actuators) if (a.delay, a.time_constant) == (delay, lag)]
         forces = np.array([actuator_force(rig.actuators[j], inputs[j]) for j in group])
-        share, at_samples = held_response(
+        share, at_samples = response_to(
             system, forces, participation[:, group], sample_time, delay=delay, time_constant=lag
         )
         response += share
@@ -256,15 +273,16 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float) -> Motion:
         response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
         acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
-    held = modes.proportional and not any(isinstance(e, PeriodicForce) for e in rig.elements)
+    held = input_hold == "zero" and modes.proportional and not any(isinstance(e, PeriodicForce) for e in rig.elements)
     held = held and not any(a.delay or a.time_constant for a in rig.actuators)
     return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping, held)
 
 
-def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int) -> Motion:
+def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int, input_hold: str) -> Motion:
     modes = rig.modes
     q, v, f = motion = tuple(np.zeros((modes.n_modes, inputs.shape[1])) for _ in range(3))
-    participation, at_samples = _step(rig, inputs, NOTHING, NO_GAIN, sample_time, substeps, motion, NOTHING)
+    unmeasured = NOTHING, NO_GAIN
+    participation, at_samples = _step(rig, inputs, *unmeasured, sample_time, substeps, input_hold, motion, NOTHING)
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     stiffness = modes.omega[:, None] ** 2 * (scale if rig.stiffness_rate else 1.0)
     # the forces on the modes hold what couples them; only each mode's own damping is left
@@ -272,7 +290,14 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
 
 
 def follow(
-    rig: Rig, inputs: np.ndarray, outputs: np.ndarray, gain: np.ndarray, *, sample_time: float, substeps: int = 8
+    rig: Rig,
+    inputs: np.ndarray,
+    outputs: np.ndarray,
+    gain: np.ndarray,
+    *,
+    sample_time: float,
+    substeps: int = 8,
+    input_hold: str = "zero",
 ) -> np.ndarray:
     """Errors (n_sensors, n_samples) of predictions one sample ahead, by a rig that every sample sets right.
 
@@ -286,9 +311,10 @@ def follow(
         gain: (2, n_modes, n_sensors) by which an error moves the displacements and velocities of the modes.
         sample_time: s.
         substeps: of each sample interval.
+        input_hold: as of `simulate`.
     """
     errors = np.empty_like(outputs)
-    _step(rig, inputs, outputs, gain, sample_time, substeps, (NOTHING, NOTHING, NOTHING), errors)
+    _step(rig, inputs, outputs, gain, sample_time, substeps, input_hold, (NOTHING, NOTHING, NOTHING), errors)
     return errors
 
 
@@ -315,6 +341,7 @@ def _step(
     gain: np.ndarray,
     sample_time: float,
     substeps: int,
+    input_hold: str,
     motion: tuple[np.ndarray, ...],
     errors: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -329,14 +356,16 @@ def _step(
     if np.abs(coupling).max() == 0:
         coupling = np.zeros((0, 0))
     n_samples = inputs.shape[1]
-    forces, at_samples = _forces_on_substeps(rig, inputs, sample_time, substeps)
+    on_substeps = _forces_on_substeps if input_hold == "zero" else _straight_forces_on_substeps
+    starts, ends, at_samples = on_substeps(rig, inputs, sample_time, substeps)
     participation = participation_of(rig)
     for element in rig.elements:
         if isinstance(element, PeriodicForce):
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
-            forces, at_samples = np.vstack([forces, mean]), np.vstack([at_samples, now])
+            starts, ends = np.vstack([starts, mean]), np.vstack([ends, mean])
+            at_samples = np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi_at(element.at)])
-    driven = forces.any(axis=1)
+    driven = starts.any(axis=1) | ends.any(axis=1)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
     parameters = np.zeros((len(points), 3))
     for row, element in zip(parameters, points, strict=True):
@@ -356,7 +385,8 @@ def _step(
         sample_time,
         substeps,
         rig.stiffness_rate,
-        forces[driven],
+        starts[driven],
+        ends[driven],
         participation[:, driven],
         stretch,
         stretching_of(rig) if stretch else np.zeros((0, 0)),
@@ -410,8 +440,8 @@ def stretching_of(rig: Rig) -> np.ndarray:
 
 def _forces_on_substeps(
     rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean force of each actuator over each substep, and the force at each sample instant."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Force of each actuator at the start and end of each substep, its mean over it, and that at each sample."""
     fine = np.empty((inputs.shape[0], inputs.shape[1] * substeps))
     now = np.empty_like(inputs)
     for j, actuator in enumerate(rig.actuators):
@@ -422,7 +452,27 @@ def _forces_on_substeps(
         fine[j], at_start = _delayed_and_lagged(held, start, actuator, sample_time / substeps)
         fine[j] += actuator.bias
         now[j] = at_start[::substeps] + actuator.bias
-    return fine, now
+    return fine, fine, now
+
+
+def _straight_forces_on_substeps(
+    rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same of inputs that run straight from sample to sample; after the last it stays."""
+    h, n = sample_time / substeps, inputs.shape[1]
+    time = h * np.arange(n * substeps + 1)
+    edges = np.empty((inputs.shape[0], time.size))
+    for j, actuator in enumerate(rig.actuators):
+        force = np.interp(time, sample_time * np.arange(n), actuator_force(actuator, inputs[j]))
+        if np.isfinite(actuator.rate_limit):
+            _, start = ramped(np.r_[force[1:], force[-1]], actuator.rate_limit * h)
+            force = start
+        if actuator.delay:
+            force = np.interp(time - actuator.delay, time, force, left=0.0)
+        if actuator.time_constant:
+            force = _lagged(force, actuator.time_constant, h, settled=False)
+        edges[j] = force + actuator.bias
+    return edges[:, :-1], edges[:, 1:], edges[:, :-1:substeps]
 
 
 def _delayed_and_lagged(
@@ -459,13 +509,14 @@ def _sinusoid_on_substeps(
     return mean, element.amplitude * np.sin(edges[:-1:substeps])
 
 
-def _lagged(truth: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
-    """A first-order lag of a signal that is linear between samples, settled at its first value."""
+def _lagged(truth: np.ndarray, time_constant: float, sample_time: float, *, settled: bool = True) -> np.ndarray:
+    """A first-order lag of a signal that is linear between samples, settled at its first value, or at zero."""
     ratio = sample_time / time_constant
     fade = np.exp(-ratio)
     new = 1.0 - (1.0 - fade) / ratio
     old = (1.0 - fade) / ratio - fade
-    filtered, _ = lfilter([new, old], [1.0, -fade], truth, zi=[(1.0 - new) * truth[0]])
+    first = truth[0] if settled else 0.0
+    filtered, _ = lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])
     return filtered
 
 

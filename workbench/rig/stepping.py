@@ -280,7 +280,8 @@ def step_record(
     dt,
     n_sub,
     rate,
-    forces,
+    starts,
+    ends,
     participation,
     stretch,
     stretching,
@@ -300,14 +301,14 @@ def step_record(
 ):
     """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or error_out.
 
-    forces (n_inputs, n_samples * n_sub) held over each substep; participation (n_modes, n_inputs);
-    stretching (n_modes, n_modes); drag_shapes (n_modes, n_points); shapes (n_elements, n_modes).
+    starts, ends (n_inputs, n_samples * n_sub) of forces that run straight over each substep; participation
+    (n_modes, n_inputs); stretching (n_modes, n_modes); drag_shapes (n_modes, n_points); shapes (n_elements, n_modes).
 
     Where something is measured, (n_sensors, n_samples), its error against reading (n_sensors, n_modes) of displacement,
     velocity or acceleration, by orders (n_sensors,) 0, 1 or 2, fills error_out in place of the motion, which it sets
     right by gain (2, n_modes, n_sensors).
     """
-    n_modes, n_elements, n_inputs = omega.size, kinds.size, forces.shape[0]
+    n_modes, n_elements, n_inputs = omega.size, kinds.size, starts.shape[0]
     n_samples = measured.shape[1] if measured.size > 0 else q_out.shape[1]
     n = LANES * ((n_modes + LANES - 1) // LANES)
     omega, c, coupling = _widened(omega, n, 1.0), _widened(c, n, 0.0), _widened_square(coupling, n)
@@ -325,7 +326,8 @@ def step_record(
     e = np.empty((2, 4, n))
     propagators(omega, c, h, e)
     q, v, base_q, base_v = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    old, new, spread, drive = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    old, new, spread = np.zeros(n), np.zeros(n), np.zeros(n)
+    drive, drive_end = np.zeros(n), np.zeros(n)
     point, earlier = np.zeros(n_elements), np.zeros(n_elements)
     w_free, v_free, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
     aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
@@ -375,12 +377,14 @@ def step_record(
         for sub in range(n_sub):
             for r in range(n):
                 drive[r] = 0.0
+                drive_end[r] = 0.0
             for j in range(n_inputs):
-                force = forces[j, k * n_sub + sub]
+                first, last = starts[j, k * n_sub + sub], ends[j, k * n_sub + sub]
                 for r in range(n):
-                    drive[r] += into[j, r] * force
+                    drive[r] += into[j, r] * first
+                    drive_end[r] += into[j, r] * last
             for r in range(n):
-                start, end = old[r] + drive[r], drive[r]
+                start, end = old[r] + drive[r], drive_end[r]
                 base_q[r] = e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
                 base_v[r] = e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
             if n_elements == 0 and not distributed:

@@ -6,7 +6,7 @@ import numpy as np
 
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
-from workbench.rig.linear import held_response, modal_motion, modal_poles
+from workbench.rig.linear import held_response, modal_motion, modal_poles, straight_response
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import participation_of
 
@@ -66,5 +66,6 @@ def _replies(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
     damping = np.maximum(np.diag(rig.modes.damping)[chosen, None], 1e-3 * omega)
     driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(SPREAD))])
     resonators = modal_poles(omega.ravel(), np.diag(damping.ravel()))
-    response, _ = held_response(resonators, record.inputs, driven, record.sample_time)
+    response_to = held_response if record.input_hold == "zero" else straight_response
+    response, _ = response_to(resonators, record.inputs, driven, record.sample_time)
     return np.concatenate([record.inputs, *modal_motion(resonators, response)])

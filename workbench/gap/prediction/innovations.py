@@ -77,10 +77,11 @@ class Follower:
         slow, measured, dt = _unrounded(rig), record.outputs, record.sample_time
         quick = _at_once(slow)
         if quick is not slow:
-            motion = move(rig, record.inputs, sample_time=dt, substeps=substeps)
+            motion = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
             measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
         gain = self._gain_for(rig.modes.n_modes)
-        return follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps)
+        hold = record.input_hold
+        return follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold)
 
     def errors_of_linear(self, rig: Rig, left: np.ndarray, sample_time: float, substeps: int) -> np.ndarray:
         """What the errors of a linear rig over a whole record leave of themselves when every sample sets it right.

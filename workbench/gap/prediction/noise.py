@@ -8,7 +8,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import predict
 
 MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
@@ -50,7 +50,7 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
     for record in data.counted:
         rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
         noise = rms * rng.standard_normal(record.inputs.shape)
-        response = simulate(replace(rig, elements=()), noise, sample_time=record.sample_time).outputs
+        response = predict(replace(rig, elements=()), replace(record, inputs=noise))
         rows.append((response**2).mean(axis=1) / data.noise**2)
     return np.array(rows)
 

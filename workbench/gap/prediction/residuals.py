@@ -113,7 +113,13 @@ class FitData:
                 self._memory.move_to_end(key)
                 return self._memory[key][1]
         motions = tuple(
-            move(rig, record.inputs, sample_time=record.sample_time, substeps=self.substeps).after(self.lead)
+            move(
+                rig,
+                record.inputs,
+                sample_time=record.sample_time,
+                substeps=self.substeps,
+                input_hold=record.input_hold,
+            ).after(self.lead)
             for record in self.records
         )
         with self._lock:

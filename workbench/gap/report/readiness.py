@@ -12,7 +12,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import predict
 from workbench.structure.domain import Between, Where, same_place
 
 ALIKE = 0.995
@@ -69,7 +69,7 @@ def check_records(rig: Rig, records: Sequence[Record], *, settle: float = 0.0) -
             )
         if (record.n_inputs and not np.any(record.inputs)) or record.n_samples < lead + 2:
             continue
-        predicted = simulate(rig, record.inputs, sample_time=record.sample_time).outputs[:, lead:]
+        predicted = predict(rig, record)[:, lead:]
         outputs = record.outputs[:, lead:]
         row = []
         for sensor, measured, expected in zip(rig.sensors, outputs, predicted, strict=True):

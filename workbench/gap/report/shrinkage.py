@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import predict
 
 DRAWS = 400
 
@@ -47,10 +47,7 @@ def measure(
         measured = record.outputs[:, lead:]
         scale = measured.std(axis=1, keepdims=True)
         scale = np.where(scale > 0, scale, 1.0)
-        predicted = [
-            simulate(rig, record.inputs, sample_time=record.sample_time, substeps=substeps).outputs[:, lead:]
-            for rig in (nominal, corrected)
-        ]
+        predicted = [predict(rig, record, substeps=substeps)[:, lead:] for rig in (nominal, corrected)]
         errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)

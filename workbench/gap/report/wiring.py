@@ -12,7 +12,7 @@ import numpy as np
 
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import is_stepped, simulate
+from workbench.rig.simulate import is_stepped, predict
 from workbench.structure.damping import ModalDamping
 
 Mend = Callable[[Rig, Sequence[Record]], tuple[Rig, tuple[Record, ...]]]
@@ -290,7 +290,7 @@ def _scaled_inputs(rig, records, gap, predicted, before, wide) -> list[WiringFau
     responses = []
     for p in range(n):
         alone = [r.inputs * (np.arange(n) == p)[:, None] for r in records]
-        parts = [simulate(rig, u, sample_time=r.sample_time).outputs for u, r in zip(alone, records, strict=True)]
+        parts = [predict(rig, replace(r, inputs=u)) for u, r in zip(alone, records, strict=True)]
         responses.append(np.concatenate([(weights * part).ravel() for part in parts]))
     matrix = np.array(responses).T
     sizes = np.linalg.norm(matrix, axis=0)
@@ -402,7 +402,7 @@ def _closes(gap: _Gap, before: np.ndarray, wide: np.ndarray, rig: Rig, records: 
 
 def _predict(rig: Rig, record: Record) -> np.ndarray:
     with np.errstate(over="ignore", invalid="ignore"):
-        return simulate(rig, record.inputs, sample_time=record.sample_time).outputs
+        return predict(rig, record)
 
 
 def _named(what: str, names: Sequence[str]) -> str:
