@@ -1,11 +1,18 @@
 """Effects of the surroundings: forces that nobody commanded."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import with_element
+from workbench.identification.signal.periodicity import period_of
+from workbench.records.record import Record
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.structure.domain import Between
+
+SAME_LINE = 0.15  # of the resolution 1/T: so near is the strongest sinusoid to one that is there
+ONE_LEVEL = 1.1  # ratio of the largest rms of an input to the least, at which records are of one level
 
 
 def tone(force: np.ndarray, sample_time: float) -> tuple[float, float, float]:
@@ -21,6 +28,21 @@ def tone(force: np.ndarray, sample_time: float) -> tuple[float, float, float]:
     return frequency, float(np.hypot(sine, cosine)), float(np.arctan2(cosine, sine))
 
 
+def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
+    """Whether a sinusoid is a harmonic of excitation that repeats at one level: any law of the motion makes those.
+
+    At several levels a disturbance stays as it is, and a law does not.
+    """
+    rms = np.array([np.sqrt((record.inputs**2).mean()) for record in records])
+    periods = {period_of(record.inputs) for record in records}
+    if rms.max() > ONE_LEVEL * rms.min() or len(periods) > 1 or None in periods:
+        return False
+    sample_time, (period,) = records[0].sample_time, periods
+    order = frequency * period * sample_time
+    duration = sample_time * min(record.n_samples for record in records)
+    return abs(order - round(order)) / (period * sample_time) < SAME_LINE / duration
+
+
 def _periodic_starts(evidence, _):
     records = evidence.data.records
     shortest = min(record.n_samples for record in records)
@@ -30,7 +52,8 @@ def _periodic_starts(evidence, _):
             continue
         mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
         frequency, amplitude, phase = tone(mean, records[0].sample_time)
-        yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
+        if not _is_distortion(frequency, records):
+            yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
 
 PERIODIC_DISTURBANCE = Kind(

@@ -221,6 +221,13 @@ def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
     return (Effect(POINT_DAMPER, None, {**place_values(friction.at), "coefficient": coefficient}),)
 
 
+def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
+    """Its numbers, without a smoothing speed too small for the records to tell."""
+    speed = friction.values["smoothing_speed"]
+    sudden = friction.deviations.get("smoothing_speed", 0.0) > speed
+    return {name: v for name, v in friction.numbers.items() if name != "smoothing_speed" or not sudden}
+
+
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
@@ -234,6 +241,7 @@ COULOMB_FRICTION = Kind(
     nonlinear=True,
     simpler=_viscous,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
+    numbers=_without_sudden,
     phrase="a friction force",
 )
 
@@ -254,7 +262,7 @@ def _bouc_wen_starts(evidence, _):
 def _sliding(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
     """One that always slides is friction: z is then as far as it goes, and turns round over about twice that path."""
     v = spring.values
-    speed = v["yield_displacement"] * float(rig.modes.omega[rig.modes.omega > 0].min())
+    speed = v["yield_displacement"] / Scales.of(rig).time
     numbers = {"force": v["stiffness"] * v["yield_displacement"], "smoothing_speed": speed}
     return (Effect(COULOMB_FRICTION, None, {**place_values(spring.at), **numbers}),)
 
@@ -325,6 +333,7 @@ TWO_WAY_FRICTION = Kind(
     nonlinear=True,
     simpler=_same_both_ways,
     force_laws={"velocity": _two_way_law},
+    numbers=_without_sudden,
     phrase="a friction force that differs between the two directions",
 )
 

@@ -17,6 +17,7 @@ OF_THE_SENSOR = "unit of the sensor"
 ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
 SLOW = 0.1  # of the rms step between samples: faster, a reading does not come to rest
 OVERSTAYED = 6.0  # steps over their decrease: three times as long as free flight up and back
+TURNING = 2  # samples: a motion that turns round slowly is no longer at its top
 
 # --- targets and changes
 
@@ -480,9 +481,10 @@ def clipped_level(evidence, target: str) -> float | None:
 
 
 def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
-    """Whether readings come to rest at the top rather than being cut off there.
+    """Whether readings come to rest, or turn round, at the top rather than being cut off there.
 
-    What comes to rest slows down before it, and stays longer than its own deceleration would have let it fly on.
+    What comes to rest slows down before it, and stays longer than its own deceleration would have let it fly on; a
+    motion that a controller repeats turns round at the same top, where it hardly stays.
     """
     entering, overstayed = [], []
     for row, flags in zip(rows, at_top, strict=True):
@@ -491,7 +493,8 @@ def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
             if first >= 3:
                 before, step, into = np.abs(np.diff(row[first - 3 : first + 1]))
                 entering.append(into)
-                overstayed.append((last - first) * abs(before - step) > OVERSTAYED * step)
+                stayed = last - first
+                overstayed.append(stayed <= TURNING or stayed * abs(before - step) > OVERSTAYED * step)
     typical = np.sqrt(np.mean(np.concatenate([np.diff(row) for row in rows]) ** 2))
     return bool(entering) and float(np.median(entering)) < SLOW * typical and float(np.mean(overstayed)) > 0.5
 

@@ -137,6 +137,7 @@ MODULUS_ERROR = Kind(
     parameters=lambda rig, _: (Parameter("factor", "", 0.2, 5.0, logarithmic=True, neutral=1.0),),
     apply=solved_once(_modulus),
     starts=_modulus_starts,
+    targets=lambda rig: (None,) if rig.modes.omega.any() else (),
     phrase="an overall stiffness error",
 )
 
