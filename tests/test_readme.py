@@ -78,6 +78,8 @@ ROWS = {
     "ruler": lambda r: _largest(r, "MAC with the free-free beam"),
     "Silverbox": lambda r: 1e3 * r["rmse"]["multisines"]["after"],
     "the same on the arrow": lambda r: 1e3 * r["rmse"]["arrow"]["after"],
+    "EMPS": lambda r: r["friction_velocity"]["dry"],
+    "the same, force": lambda r: 100 * r["force_residual"]["slow and fast strokes"]["corrected"],
     "a flexible arm": lambda r: 1e3 * r["mass"]["kg"],
     "two hundred cases": lambda r: _share(r, "single"),
     "the same, two effects": lambda r: _share(r, "pair"),

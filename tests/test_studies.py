@@ -15,9 +15,10 @@ DATA = {"ruler": SHARED / "measured/ruler/ruler.mat", "blind_trials": SHARED / "
 DATA["arm_change"] = SHARED / "measured/arm-change"
 DATA["identification_peers"] = DATA["ruler"]
 DATA["silverbox"] = SHARED / "measured/silverbox/SNLS80mV.mat"
+DATA["emps"] = SHARED / "measured/emps"
 LONG = {"blind_trials", "own_trials", "false_alarms", "many_cases", "design_scaling", "placement_front"}
 LONG |= {"local_loss", "identification_order", "identification_peers", "identification_coverage", "identification_size"}
-LONG |= {"identification_records", "diagnosis_speed", "silverbox", "patch_pairs"}
+LONG |= {"identification_records", "diagnosis_speed", "silverbox", "patch_pairs", "emps"}
 STUDIES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
     for path in sorted((ROOT / "studies").glob("*.py"))

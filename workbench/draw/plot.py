@@ -14,12 +14,14 @@ from workbench.design.spillover.spillover import Spillover
 from workbench.draw.accuracy import plot_bands
 from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
+from workbench.draw.distortion import plot_distortion
 from workbench.draw.gap import plot_where
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.draw.surface import plot_point_modes, plot_surface_modes
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.free_decay.refined import Refined
 from workbench.identification.shapes.bands import Bands
+from workbench.identification.signal.distortion import Distortion
 from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
 from workbench.structure.domain import NamedPoints, Rectangle
@@ -32,7 +34,7 @@ MOST_PANELS = 12
 @singledispatch
 def plot(result) -> Figure:
     """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
-    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter` or `Verdict`.
+    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion` or `Verdict`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -153,6 +155,11 @@ def _(result: ModalFilter) -> Figure:
 @plot.register
 def _(result: Verdict) -> Figure:
     return plot_where(result)
+
+
+@plot.register
+def _(result: Distortion) -> Figure:
+    return plot_distortion([result])
 
 
 def _panels(count: int):

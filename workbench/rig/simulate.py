@@ -149,8 +149,10 @@ def simulate(
 
 def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
     """What a rig's sensors read (n_sensors, n_samples) under the inputs of a record, noise apart; see `simulate`."""
-    how = {"sample_time": record.sample_time, "substeps": substeps, "input_hold": record.input_hold}
-    return simulate(rig, record.inputs, **how).outputs
+    found = simulate(
+        rig, record.inputs, sample_time=record.sample_time, substeps=substeps, input_hold=record.input_hold
+    )
+    return found.outputs
 
 
 def move(rig: Rig, inputs: np.ndarray, *, sample_time: float, substeps: int = 8, input_hold: str = "zero") -> Motion:

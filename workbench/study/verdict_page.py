@@ -1,15 +1,19 @@
 """The page of a diagnosis."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 from workbench.cases.case import Case
+from workbench.draw.distortion import plot_distortion
 from workbench.draw.gap import plot_budget, plot_missing_force, plot_responses, plot_rivals, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.gap.report.verdict import Verdict
+from workbench.identification.signal.distortion import Distortion, distortion_of
+from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes
@@ -66,6 +70,12 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
             each = "What each effect alone leaves of the gap: at the noise floor, it explains all of it."
             figures.append((plot_rivals(verdict), each))
+    distortions = _of_lowest_and_highest(records)
+    if distortions:
+        seen = (
+            "What the records show before any model: lines that are excited, odd and even ones that are not, and noise."
+        )
+        figures.append((plot_distortion(distortions), seen))
     gaps = [
         (name, before, shown["gap"]["after"][name], shown["gap"]["floor"][name], shown["shrinkage"].get(name))
         for name, before in shown["gap"]["before"].items()
@@ -106,6 +116,16 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         made_by=f"workbench diagnose {folder or verdict.case}",
     )
     return write_page(path, story)
+
+
+def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
+    """Distortion of the records of least and of largest excitation, where it repeats."""
+    found = []
+    for record in records:
+        with suppress(ValueError):  # excitation that does not repeat tells none
+            found.append(distortion_of(record))
+    found.sort(key=lambda each: each.input_rms)
+    return found if len(found) < 2 else [found[0], found[-1]]
 
 
 def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict]:

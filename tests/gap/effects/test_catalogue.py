@@ -1,5 +1,6 @@
 """Laws that hold for every kind of the catalogue, and what single kinds promise of themselves."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter
+from workbench.gap.effects.environment import _is_distortion
 from workbench.gap.effects.limiting_cases import contained, simpler_forms
 from workbench.gap.effects.ports import clipped_level
 from workbench.gap.report.verdict import _described, effect_json
@@ -167,6 +169,26 @@ def test_a_number_whose_deviation_exceeds_it_is_not_significant():
     assert sure.significant(nominal) and not unsure.significant(nominal) and not gain.significant(nominal)
 
 
+def test_a_harmonic_of_excitation_at_one_level_is_no_disturbance():
+    one = np.random.default_rng(1).standard_normal(100)
+    u = np.tile(one, 5)[None]
+    low, high = (Record(0.01, u, (Channel("d"),), size * u, (Channel("F"),)) for size in (1.0, 3.0))
+    assert _is_distortion(7.0, [low]) and _is_distortion(7.02, [low, low])
+    assert not _is_distortion(7.3, [low])
+    assert not _is_distortion(7.0, [low, high]), "a disturbance does not grow with the level: the records decide"
+    rng = np.random.default_rng(2)
+    assert not _is_distortion(7.0, [replace(low, inputs=rng.standard_normal(u.shape))])
+
+
+def test_a_speed_too_small_to_tell_is_not_stated():
+    sudden = {"at": 0.8, "force": 1.0, "smoothing_speed": 1e-9}
+    told = Effect(kind_named("coulomb_friction"), None, sudden, {"force": 0.1, "smoothing_speed": 1e-4})
+    assert effect_json(told, rig())["parameters"] == {"force": 1.0}
+    assert "smoothing" not in _described(told, rig())
+    sure = Effect(kind_named("coulomb_friction"), None, sudden, {"force": 0.1, "smoothing_speed": 1e-10})
+    assert effect_json(sure, rig())["parameters"] == {"force": 1.0, "smoothing_speed": 1e-9}
+
+
 def _readings(series: np.ndarray) -> SimpleNamespace:
     record = Record(0.01, series[None], (Channel("d", "displacement"),))
     return SimpleNamespace(rig=SimpleNamespace(sensors=(Sensor("d", 0.0),)), data=SimpleNamespace(records=(record,)))
@@ -180,6 +202,8 @@ def test_what_comes_to_rest_at_a_level_is_not_clipped_there():
     rest = np.where(np.mod(t, 8.0) < 4.0, 1.0, -1.0) * (0.5 - 0.5 * np.cos(np.pi * moving))
     there_and_back = np.where(np.mod(t, 8.0) < 4.0, rest, rest + 1.0)
     assert clipped_level(_readings(there_and_back), "d") is None
+    strokes = 0.25 * np.sin(np.pi * np.arange(3000) / 400) ** 3
+    assert clipped_level(_readings(strokes), "d") is None, "it turns round at one place every time"
     noisy = there_and_back + 0.01 * np.random.default_rng(0).standard_normal(t.size)
     assert clipped_level(_readings(np.clip(noisy, -1.0, 1.0)), "d") == 1.0, "noise is cut off where the mass rests"
 

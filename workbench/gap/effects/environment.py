@@ -44,15 +44,18 @@ def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
 
 
 def _periodic_starts(evidence, _):
-    records = evidence.data.records
+    records, sample_time = evidence.data.counted, evidence.data.records[0].sample_time
     shortest = min(record.n_samples for record in records)
     ends = np.cumsum([0, *(record.n_samples for record in records)])
     for place in evidence.at_peaks:
         if isinstance(place.at, Between):
             continue
         mean = np.mean([place.force[a : a + shortest] for a in ends[:-1]], axis=0)
-        frequency, amplitude, phase = tone(mean, records[0].sample_time)
-        if not _is_distortion(frequency, records):
+        frequency, amplitude, phase = tone(mean, sample_time)
+        if evidence.data.lead:  # a phase counts from the start of the record
+            turned = 2.0 * np.pi * frequency * evidence.data.lead * sample_time
+            phase = float(np.angle(np.exp(1j * (phase - turned))))
+        if not _is_distortion(frequency, evidence.data.records):
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
 

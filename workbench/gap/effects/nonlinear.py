@@ -15,12 +15,14 @@ from workbench.rig.elements import (
     Clearance,
     CoulombFriction,
     CubicSpring,
+    LinearSpring,
     MidplaneStretching,
     OneSidedStop,
     PowerDamper,
 )
 from workbench.rig.rig import Rig
 from workbench.rig.stepping import hysteresis
+from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Structure
 
 LEAST, MOST = 1e-12, 1e12  # bounds of a strength, in units of the rig's own
@@ -282,6 +284,37 @@ BOUC_WEN = Kind(
     phrase="a hysteretic spring",
 )
 
+# --- joint_slip
+
+
+def _slip_starts(evidence, _):
+    for place in evidence.at_peaks:
+        size = float(np.sqrt(np.mean(place.displacement**2)))
+        for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
+            k = -strength_along(place.force, place.displacement - hysteresis(place.displacement, share * size))
+            for part in (0.5, 1.0) if k > 0 else ():
+                yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
+
+
+def _slipping(rig: Rig, _, v: dict[str, Any]) -> Rig:
+    """What the joint no longer holds, k (w - z): nothing as long as it sticks, and its whole stiffness once it slips."""
+    where, stiffness = place_of(v), v["stiffness"]
+    return with_element(
+        with_element(rig, LinearSpring(where, -stiffness)), BoucWen(where, stiffness, v["yield_displacement"])
+    )
+
+
+JOINT_SLIP = Kind(
+    name="joint_slip",
+    path="structure",
+    parameters=BOUC_WEN.parameters,
+    apply=_slipping,
+    starts=_slip_starts,
+    targets=lambda rig: (None,) if isinstance(rig.modes.domain, NamedPoints) and any(rig.modes.domain.pairs()) else (),
+    nonlinear=True,
+    phrase="a joint that slips",
+)
+
 # --- two_way_friction
 
 
@@ -373,6 +406,7 @@ KINDS = (
     ONE_SIDED_STOP,
     COULOMB_FRICTION,
     BOUC_WEN,
+    JOINT_SLIP,
     TWO_WAY_FRICTION,
     QUADRATIC_DAMPER,
 )

@@ -201,8 +201,9 @@ class Verdict:
 def effect_json(effect: Effect, nominal: Rig) -> dict:
     """One effect: kind, parameters with their standard deviations, place, input or output."""
     kind = effect.kind
-    entry: dict = {"kind": kind.name, "parameters": {n: _rounded(v) for n, v in effect.stated(nominal).items()}}
-    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n not in COORDINATES}
+    stated = effect.stated(nominal)
+    entry: dict = {"kind": kind.name, "parameters": {n: _rounded(v) for n, v in stated.items()}}
+    deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n in stated}
     if deviations:
         entry["parameters_std"] = deviations
     if kind.path in ("actuator", "sensor"):
@@ -260,7 +261,8 @@ def where_json(where: Where) -> dict:
 
 def _described(effect: Effect, nominal: Rig) -> str:
     """Such as: a friction force (force 0.021 ± 0.002 N) at x = 3.40 ± 0.01."""
-    units = {p.name: p.unit for p in effect.parameters(nominal)}
+    stated = effect.stated(nominal)
+    units = {p.name: p.unit for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
         " ".join((name.replace("_", " "), _with_deviation(effect.values[name], effect.deviations.get(name, 0.0)), unit))
         for name, unit in units.items()

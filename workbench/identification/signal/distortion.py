@@ -1,0 +1,101 @@
+"""Nonlinear distortion and noise seen in periodic excitation, before any model.
+
+What a linear structure answers stands on the lines that are excited. The mean over periods on the other lines is
+distortion: of an even law on even multiples of 1/T, where only odd ones are excited, and of an odd law on odd ones.
+What differs from period to period is noise. Pintelon & Schoukens, System Identification: A Frequency Domain Approach,
+2nd ed., Wiley 2012, section 4.3.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.identification.signal.periodicity import period_of
+from workbench.records.record import Channel, Record
+from workbench.structure.modes import frozen
+
+EXCITED = 0.05  # of the largest line of the inputs: the least that counts as excited
+SETTLING = 1  # periods at the start that a structure takes to settle
+
+
+@dataclass(frozen=True, eq=False)
+class Distortion:
+    """Lines of the mean period of a record, and their noise.
+
+    Attributes:
+        name: of the record.
+        frequencies_hz: (n_lines,) multiples k / T of the period's frequency, k = 1, 2, ...
+        excited: (n_lines,) whether the inputs have that line.
+        amplitudes: (n_outputs, n_lines) rms of each line, in the unit of the output.
+        noise: (n_outputs, n_lines) standard error of each, from the scatter between periods.
+        channels: of the outputs.
+        n_periods: that were averaged.
+        input_rms: of all inputs together.
+    """
+
+    name: str
+    frequencies_hz: np.ndarray
+    excited: np.ndarray
+    amplitudes: np.ndarray
+    noise: np.ndarray
+    channels: tuple[Channel, ...]
+    n_periods: int
+    input_rms: float
+
+    @property
+    def even(self) -> np.ndarray:
+        """(n_lines,) whether a line is an even multiple that is not excited."""
+        return np.asarray(~self.excited & (np.arange(self.excited.size) % 2 == 1))
+
+    @property
+    def odd(self) -> np.ndarray:
+        """(n_lines,) whether a line is an odd multiple that is not excited."""
+        return np.asarray(~self.excited & (np.arange(self.excited.size) % 2 == 0))
+
+    @property
+    def tells_parity(self) -> bool:
+        """Whether only odd lines are excited: even ones then tell an even law."""
+        return not self.excited[1::2].any()
+
+    @property
+    def rms(self) -> Mapping[str, np.ndarray]:
+        """Rms of each output (n_outputs,) on excited, odd and even lines, and of the noise of one period."""
+        kinds = {"excited": self.excited, "odd": self.odd, "even": self.even}
+        found = {kind: np.sqrt((self.amplitudes[:, lines] ** 2).sum(axis=1)) for kind, lines in kinds.items()}
+        return found | {"noise": np.sqrt(self.n_periods * (self.noise**2).sum(axis=1))}
+
+
+def distortion_of(record: Record) -> Distortion:
+    """Distortion and noise of a record whose inputs repeat three times or more, the first period left to settle.
+
+    Raises:
+        ValueError: inputs that do not repeat, or too few periods.
+    """
+    period = period_of(record.inputs)
+    if period is None:
+        raise ValueError(f"record {record.name!r}: its inputs do not repeat, so no line is free of them")
+    n_periods = record.n_samples // period - SETTLING
+    if n_periods < 2:
+        raise ValueError(f"record {record.name!r} has {n_periods + SETTLING} periods; noise needs three or more")
+    whole = slice(SETTLING * period, (SETTLING + n_periods) * period)
+
+    def lines_of(signals: np.ndarray) -> np.ndarray:
+        """(n_signals, n_periods, n_lines), by rms."""
+        periods = signals[:, whole].reshape(signals.shape[0], n_periods, period)
+        return np.asarray(np.sqrt(2.0) / period * np.fft.rfft(periods, axis=2)[:, :, 1 : (period + 1) // 2])
+
+    inputs, outputs = lines_of(record.inputs).mean(axis=1), lines_of(record.outputs)
+    size = np.sqrt((np.abs(inputs) ** 2).sum(axis=0))
+    mean = outputs.mean(axis=1)
+    scatter = (np.abs(outputs - mean[:, None]) ** 2).sum(axis=1) / (n_periods - 1)
+    return Distortion(
+        name=record.name,
+        frequencies_hz=frozen(np.arange(1, size.size + 1) / (period * record.sample_time)),
+        excited=frozen(size > EXCITED * size.max(), bool),
+        amplitudes=frozen(np.abs(mean)),
+        noise=frozen(np.sqrt(scatter / n_periods)),
+        channels=record.output_channels,
+        n_periods=n_periods,
+        input_rms=float(np.sqrt((record.inputs**2).mean())),
+    )
