@@ -297,7 +297,7 @@ def _slip_starts(evidence, _):
 
 
 def _slipping(rig: Rig, _, v: dict[str, Any]) -> Rig:
-    """What the joint no longer holds, k (w - z): nothing as long as it sticks, and its whole stiffness once it slips."""
+    """The rig with + k (w - z), what the joint no longer holds: nothing while it sticks, all of k w once it slips."""
     where, stiffness = place_of(v), v["stiffness"]
     return with_element(
         with_element(rig, LinearSpring(where, -stiffness)), BoucWen(where, stiffness, v["yield_displacement"])
