@@ -24,7 +24,7 @@ FLOORS = {
 # Rooms inside a room, ground floor first; the room's own files stand above them all.
 INSIDE = {
     "identification": ("signal", "free_decay", "input_output", "output_only", "shapes", "updating"),
-    "design": ("laws", "estimation", "loop", "spillover", "placement"),
+    "design": ("laws", "estimation", "loop", "export", "spillover", "placement"),
     "gap": ("effects", "prediction", "localisation", "search", "report"),
 }
 ENGINES = {

@@ -4,6 +4,7 @@
 from .cases.case import read_case as read_case
 from .design.estimation.observers import kalman as kalman
 from .design.estimation.observers import luenberger as luenberger
+from .design.export.export import export as export
 from .design.laws.coupled import coupled_lqr as coupled_lqr
 from .design.laws.coupled import coupled_poles as coupled_poles
 from .design.laws.imsc import imsc as imsc
@@ -34,7 +35,6 @@ from .identification.free_decay.order import identify as identify
 from .identification.rig_from import rig_from as rig_from
 from .identification.ring_down import ring_down as ring_down
 from .identification.shapes.eigenfunctions import eigenfunctions as eigenfunctions
-from .identification.signal.aliases import aliases as aliases
 from .identification.transfer import identify_transfer as identify_transfer
 from .identification.updating.distributions import mass_and_stiffness as mass_and_stiffness
 from .identification.updating.local_loss import locate_damage as locate_damage
@@ -56,7 +56,6 @@ from .rig.simulate import simulate as simulate
 from .rig.statespace import state_space as state_space
 from .robust.posterior import UncertainRig as UncertainRig
 from .robust.proof import prove as prove
-from .robust.redesign import Redesign as Redesign
 from .robust.redesign import redesign as redesign
 from .structure.damping import ModalDamping as ModalDamping
 from .structure.damping import ProportionalDamping as ProportionalDamping

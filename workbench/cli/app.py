@@ -7,6 +7,7 @@ import typer
 from workbench.cli.bench import bench
 from workbench.cli.design import design
 from workbench.cli.diagnose import diagnose
+from workbench.cli.export import export
 from workbench.cli.identify import identify
 from workbench.cli.look import look
 from workbench.cli.new import new
@@ -42,7 +43,7 @@ def _options(
     """Options of the command itself."""
 
 
-for command in (look, identify, design, place, diagnose, trial, study, report, bench, new):
+for command in (look, identify, design, place, export, diagnose, trial, study, report, bench, new):
     app.command()(command)
 
 

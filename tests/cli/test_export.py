@@ -1,0 +1,66 @@
+"""`workbench export`: a controller of a case as a file, and one line where it cannot be."""
+
+import runpy
+
+import pytest
+
+RIG = """
+[structure]
+kind = "beam"
+length = 2.0
+mass_per_length = 1.0
+bending_stiffness = 4.0
+left = "hinged"
+right = "hinged"
+damping_ratio = 0.01
+modes = 5
+[[input]]
+name = "F1"
+kind = "actuator"
+at = 0.45
+[[output]]
+name = "d1"
+quantity = "displacement"
+at = 0.3
+noise_std = 0.001
+[[output]]
+name = "a1"
+quantity = "acceleration"
+at = 0.3
+noise_std = 0.001
+"""
+
+
+@pytest.fixture
+def rig(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    return path
+
+
+@pytest.mark.parametrize("estimator", ["luenberger", "kalman"])
+def test_a_controller_of_a_case_is_written(run, rig, tmp_path, estimator):
+    result = run("export", rig, "--rate-hz", 100, "--estimator", estimator, "--to", tmp_path / "one.py")
+    assert result.exit_code == 0, result.output
+    assert "phase lost" in result.output and "stability margin" in result.output
+    assert "not read, as accelerations: a1" in result.output
+    one = runpy.run_path(str(tmp_path / "one.py"))["Controller"]()
+    assert [one.step([1.0]), one.step([0.0])] != [[0.0], [0.0]]
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--rate-hz", "1"], "1 Hz is too slow for mode 1"),
+        (["--rate-hz", "-5"], "sampling rate must be positive"),
+        (["--rate-hz", "100", "--law", "pid"], "--law is one of imsc, coupled"),
+        (["--rate-hz", "100", "--to", "one.txt"], "written as .c, .py or .mat"),
+        (["--rate-hz", "100", "--to", "nowhere/one.c"], "there is no folder nowhere"),
+    ],
+)
+def test_what_cannot_be_exported_is_said_in_one_line(run, rig, tmp_path, monkeypatch, options, said):
+    monkeypatch.chdir(tmp_path)
+    result = run("export", rig, "--to", "one.c", *options)
+    assert result.exit_code == 2
+    assert said in " ".join(result.stderr.split()) and len(result.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "one.c").exists()

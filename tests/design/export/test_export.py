@@ -1,0 +1,220 @@
+"""A design that leaves the workbench does there what it does here."""
+
+import ctypes
+import runpy
+import shutil
+import subprocess
+
+import control
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.io import loadmat
+from scipy.signal import cont2discrete
+
+from workbench.design.estimation.controller import Controller
+from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays
+from workbench.design.estimation.observers import luenberger
+from workbench.design.export.export import export, write_controller
+from workbench.design.export.sampled_loop import sampled_loop
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError, Law
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import state_space
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+from workbench.structure.modes import Modes
+
+RATE = 200.0
+ACTUATORS = (Actuator("F1", 0.45), Actuator("F2", 1.2, gain=0.7, time_constant=0.004))
+SENSORS = (Sensor("d1", 0.3), Sensor("v2", 1.7, "velocity"))
+COMPILER = shutil.which("cc")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler, cc, on this machine")
+
+
+@pytest.fixture(scope="module")
+def modes():
+    beam = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="hinged", right="hinged",
+        damping=ModalDamping(0.01),
+    )  # fmt: skip
+    return beam.modes(5)
+
+
+@pytest.fixture(scope="module")
+def observer(modes):
+    law = imsc(modes, 2, ACTUATORS, weight=1.0)
+    return luenberger(modes, law, SENSORS, poles=modes.omega[:2] * (-0.3 + 1j))
+
+
+def everything(rng) -> DigitalController:
+    """A controller that makes up for all that one can."""
+    n, ny, nu = 4, 2, 2
+    a = rng.standard_normal((n, n))
+    return DigitalController(
+        0.01, ("y1", "y2"), ("F1", "F2"),
+        0.9 * a / np.abs(np.linalg.eigvals(a)).max(), rng.standard_normal((n, ny)), rng.standard_normal((nu, n)),
+        rng.standard_normal((nu, ny)), 0.1 * rng.standard_normal((n, nu)), offset=np.array([0.1, -0.3]),
+        scale=np.array([1.1, 0.9]), limit=np.array([2.0, np.inf]), rate=np.array([np.inf, 0.8]),
+        dead_zone=np.array([0.0, 0.2]), bias=np.array([0.05, 0.0]),
+        friction=FrictionForward(
+            rng.standard_normal((nu, 1)), rng.standard_normal((1, n)), rng.standard_normal((1, ny)), np.array([0.3]),
+            np.array([0.1]),
+        ),
+        name="all at once",
+    )  # fmt: skip
+
+
+def switching(rng) -> DigitalController:
+    """A modal filter with relays, so without states."""
+    relays = Relays(rng.standard_normal((2, 3)), np.array([1.0, 2.0, 0.5]), np.array([0.3, 0.5, 0.0]))
+    none = np.zeros((0, 0)), np.zeros((0, 2)), np.zeros((3, 0)), rng.standard_normal((3, 2)), np.zeros((0, 2))
+    return DigitalController(0.01, ("y1", "y2"), ("F1", "F2"), *none, relays=relays, name="on-off")
+
+
+def stepped(controller: DigitalController, readings: np.ndarray) -> np.ndarray:
+    z, before, commands = np.zeros(controller.a.shape[0]), np.zeros(len(controller.actuators)), []
+    for reading in readings.T:
+        command, before, z = controller.step(z, before, reading)
+        commands.append(command)
+    return np.array(commands).T
+
+
+def compiled(path, readings: np.ndarray, n_commands: int) -> np.ndarray:
+    """What the C function commands, compiled as strictly as can be."""
+    library = path.with_suffix(".so")
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-pedantic", "-Werror", "-shared", "-fPIC"]
+    subprocess.run([COMPILER, *flags, path, "-lm", "-o", library], check=True)
+    code = ctypes.CDLL(str(library))
+    state, doubles = ctypes.create_string_buffer(4096), ctypes.POINTER(ctypes.c_double)
+    getattr(code, f"{path.stem}_reset")(state)
+    step, command, commands = getattr(code, f"{path.stem}_step"), np.zeros(n_commands), []
+    for reading in np.ascontiguousarray(readings.T):
+        step(state, reading.ctypes.data_as(doubles), command.ctypes.data_as(doubles))
+        commands.append(command.copy())
+    return np.array(commands).T
+
+
+def interpreted(path, readings: np.ndarray) -> np.ndarray:
+    one = runpy.run_path(str(path))["Controller"]()
+    return np.array([one.step(reading) for reading in readings.T.tolist()]).T
+
+
+def error(found: np.ndarray, true: np.ndarray) -> float:
+    return float(np.abs(found - true).max() / np.abs(true).max())
+
+
+@needs_compiler
+def test_an_exported_controller_commands_what_python_control_simulates(modes, observer, tmp_path):
+    readings = np.random.default_rng(1).standard_normal((2, 10_000))
+    design = export(modes, observer, tmp_path / "arm.c", sample_rate_hz=RATE)
+    export(modes, observer, tmp_path / "arm.py", sample_rate_hz=RATE)
+    time = np.arange(10_000) / RATE
+    true = control.forced_response(design.controller.state_space(), time, readings).outputs
+    assert error(compiled(tmp_path / "arm.c", readings, 2), true) < 1e-12
+    assert error(interpreted(tmp_path / "arm.py", readings), true) < 1e-12
+
+
+@needs_compiler
+@pytest.mark.parametrize("make", [everything, switching])
+def test_what_a_controller_makes_up_for_is_exported_too(make, tmp_path):
+    rng = np.random.default_rng(2)
+    controller, readings = make(rng), rng.standard_normal((2, 10_000))
+    true = stepped(controller, readings)
+    (tmp_path / "py").mkdir()
+    write_controller(controller, tmp_path / "arm.c")
+    write_controller(controller, tmp_path / "py" / "arm.py")
+    assert error(compiled(tmp_path / "arm.c", readings, 2), true) < 1e-12
+    assert error(interpreted(tmp_path / "py" / "arm.py", readings), true) < 1e-12
+
+
+@needs_compiler
+def test_names_cannot_end_a_comment(tmp_path):
+    none = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1)), np.zeros((0, 1))
+    wild = DigitalController(0.1, ('*/ int x = "\\" """\nimport os',), ("F*/",), *none, name='"""*/\n#error')
+    write_controller(wild, tmp_path / "a.c")
+    write_controller(wild, tmp_path / "a.py")
+    readings = np.arange(3.0)[None]
+    assert (compiled(tmp_path / "a.c", readings, 1) == readings).all()
+    assert (interpreted(tmp_path / "a.py", readings) == readings).all()
+
+
+def test_the_controller_is_held_over_each_sample_as_scipy_does_it(modes, observer, tmp_path):
+    design = export(modes, observer, tmp_path / "arm.mat", sample_rate_hz=RATE)
+    a, b, c, d, _ = cont2discrete((observer.state, observer.reads, observer.commands, observer.direct), 1 / RATE)
+    written = loadmat(tmp_path / "arm.mat", squeeze_me=True)
+    for found in (design.controller.state_space(), control.ss(*(written[k] for k in "ABCD"), written["sample_time"])):
+        for matrix, true in zip((found.A, found.B, found.C, found.D), (a, b, c, d)):
+            np.testing.assert_allclose(matrix, true, atol=1e-12 * max(np.abs(true).max(), 1.0))
+    assert [text.split(":")[0] for text in written["readings"]] == ["d1", "v2"]
+    assert len(written["states"]) == 4
+
+
+@pytest.mark.parametrize("late", [0.0, 0.3, 1.0, 2.6])
+def test_the_sampled_loop_is_that_of_the_differential_equation(modes, observer, late):
+    period = 1 / RATE
+    digital = export(modes, observer, sample_rate_hz=RATE).controller
+    matrix = sampled_loop(modes, ACTUATORS, SENSORS, digital, late * period)
+    plant = state_space(modes, ACTUATORS, SENSORS)
+    n = plant.nstates
+    x, z = np.random.default_rng(3).standard_normal(n), np.zeros(4)
+    found = np.linalg.matrix_power(matrix, 6) @ np.r_[x, np.zeros(matrix.shape[0] - n)]
+    whole, rest = int(late), late - int(late)
+    past = [np.zeros(2)] * 4
+    for _ in range(6):
+        y = plant.C @ x
+        command, z = digital.c @ z + digital.d @ y, digital.a @ z + digital.b @ y
+        past = [command, *past]
+        for held, span in ((past[whole + 1], rest * period), (past[whole], (1 - rest) * period)):
+            if span > 0:
+
+                def moving(_, s, u=held):
+                    return plant.A @ s + plant.B @ u
+
+                x = solve_ivp(moving, (0, span), x, method="DOP853", rtol=1e-12, atol=1e-12).y[:, -1]
+    np.testing.assert_allclose(found[: n + 4], np.r_[x, z], atol=1e-9)
+
+
+def test_the_delay_margin_is_that_of_the_bode_plot():
+    # u = -g q' on q'' + q = u: |L| = 1 at ω² - 1 = g ω, 90° from instability; a fast sample takes half of itself away
+    omega, gain, period = 1.0, 0.4, 0.02
+    modes = Modes(np.array([omega]), np.array([0.0]), lambda x, k: np.ones((np.size(x), 1)), 1.0)
+    law = Law(np.array([[0.0, gain]]), (0,), (Actuator("F", 0.5),))
+    empty = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    controller = Controller(law, (Sensor("v", 0.5, "velocity"),), *empty, np.array([[-gain]]), "rate feedback")
+    crossing = 0.5 * gain + np.sqrt(0.25 * gain**2 + omega**2)
+    bears = 0.5 * np.pi / crossing - 0.5 * period
+    design = export(modes, controller, sample_rate_hz=1 / period, computing_delay=bears - 0.02)
+    assert design.delay_margin == pytest.approx(0.02, abs=1e-4)
+    assert design.phase_lost == pytest.approx([omega * (0.5 * period + bears - 0.02)])
+
+
+def test_a_rate_too_slow_is_refused_with_one_that_holds(modes, observer):
+    with pytest.raises(DesignError, match=r"too slow for mode 2 at 3\.142 Hz.* sample at 32 Hz"):
+        export(modes, observer, sample_rate_hz=6.0)
+    with pytest.raises(DesignError, match=r"sample at [0-9.]+ Hz or more") as refused:
+        export(modes, observer, sample_rate_hz=25.0, computing_delay=0.055)
+    rate = float(str(refused.value).split("sample at ")[1].split()[0])
+    assert export(modes, observer, sample_rate_hz=rate, computing_delay=0.055).margin > 0
+
+
+def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, tmp_path):
+    with pytest.raises(DesignError, match="put it on an observer"):
+        export(modes, observer.law, sample_rate_hz=RATE)
+    with pytest.raises(DesignError, match="must be positive"):
+        export(modes, observer, sample_rate_hz=0.0)
+    with pytest.raises(DesignError, match="computing delay must be 0 s or more"):
+        export(modes, observer, sample_rate_hz=RATE, computing_delay=-1e-3)
+    with pytest.raises(DesignError, match="destabilise"):
+        export(modes, observer, sample_rate_hz=RATE, computing_delay=0.3)
+    with pytest.raises(DesignError, match="samples pass until a command acts"):
+        export(modes, observer, sample_rate_hz=RATE, computing_delay=10.0)
+    with pytest.raises(ValueError, match=r"written as \.c, \.py or \.mat"):
+        export(modes, observer, tmp_path / "arm.cpp", sample_rate_hz=RATE)
+    with pytest.raises(ValueError, match="cannot name a function"):
+        export(modes, observer, tmp_path / "2arm.c", sample_rate_hz=RATE)
+    fierce = imsc(modes, 2, ACTUATORS, weight=1e-4)
+    unstable = luenberger(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
+    with pytest.raises(DesignError, match="unstable before any sampling"):
+        export(modes, unstable, sample_rate_hz=1e4)

@@ -1,0 +1,212 @@
+"""A design at the rate of the computer that is to run it: what sampling costs it, and what delay it still bears."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from workbench.design.estimation.controller import Controller
+from workbench.design.estimation.digital import DigitalController, sampled
+from workbench.design.export.sampled_loop import MOST_PAST, sampled_loop
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.closed_loop import close_with
+from workbench.records.record import QUANTITIES
+from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed
+
+ON_CIRCLE = 1e-9  # a pole no further outside the unit circle stands on it
+COMFORTABLE = 10.0  # samples a period of the highest controlled mode
+FASTEST = 1024.0  # times the rate asked for, up to which a rate that holds is looked for
+MOST_LATE, TRIES = 40, 160  # samples of further delay that are tried, in so many steps
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SampledDesign(Printed):
+    """A controller as a computer runs it once a sample, beside the structure that it controls.
+
+    Attributes:
+        modes: controlled and residual.
+        source: the controller in continuous time.
+        controller: the same at the sampling rate, each reading held until the next.
+        computing_delay: from a reading to the first effect of its command, s.
+        poles: (n_states,) of the sampled loop of all modes, in the z-plane.
+        delay_margin: further delay until a pole leaves the unit circle, s; infinite where 40 samples do not do it.
+    """
+
+    modes: Modes
+    source: Controller
+    controller: DigitalController
+    computing_delay: float
+    poles: np.ndarray
+    delay_margin: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "poles", frozen(self.poles, complex))
+
+    @property
+    def sample_rate_hz(self) -> float:
+        return 1.0 / self.controller.sample_time
+
+    @property
+    def margin(self) -> float:
+        """Stability margin of the sampled loop, -ln|z| / T of its slowest pole, 1/s."""
+        return float(-np.log(np.abs(self.poles).max()) / self.controller.sample_time)
+
+    @property
+    def phase_lost(self) -> np.ndarray:
+        """Phase lag (n_controlled,) of the held command and the computer at each controlled mode, ω (T/2 + τ), rad."""
+        own = self.modes.omega[list(self.source.law.controlled)]
+        return np.asarray(own * (0.5 * self.controller.sample_time + self.computing_delay))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """What each state of the controller is, in order."""
+        kinds = (("displacement", "kg^0.5 m"), ("rate", "kg^0.5 m/s"))
+        of = [f"estimated {kind} of mode {r + 1}, {unit}" for kind, unit in kinds for r in self.source.law.controlled]
+        return tuple(of) if self.controller.a.shape[0] else ()
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """What each reading is, in order."""
+        text = self.modes.domain.text
+        return tuple(f"{s.name}: {s.quantity} at {text(s.at)}, {QUANTITIES[s.quantity]}" for s in self.source.sensors)
+
+    @property
+    def commands(self) -> tuple[str, ...]:
+        """What each command is, in order."""
+        text = self.modes.domain.text
+        return tuple(f"{a.name}: {a.kind} at {text(a.at)}" for a in self.source.law.actuators)
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        late = f", {1e3 * self.computing_delay:.4g} ms to compute" if self.computing_delay else ""
+        line = f"{self.controller.name} at {self.sample_rate_hz:.6g} Hz{late}"
+        own = self.source.law.controlled
+        rows = [
+            (str(r + 1), f"{f:.5g}", f"{self.sample_rate_hz / f:.3g}" if f else "", f"{np.degrees(lost):.3g}")
+            for r, f, lost in zip(own, self.modes.frequencies_hz[list(own)], self.phase_lost)
+        ]
+        return line, ("mode", "frequency [Hz]", "samples a period", "phase lost [°]"), rows, self.remarks
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a user should know before it runs: stability before and after sampling, and what is aliased."""
+        before = close_with(self.modes, self.source).margin
+        bears = f"further delay borne: {1e3 * self.delay_margin:.3g} ms"
+        if not np.isfinite(self.delay_margin):
+            bears = f"{MOST_LATE} samples of further delay do not destabilise it"
+        said = [f"stability margin {self.margin:.3g} 1/s, {before:.3g} 1/s in continuous time; {bears}"]
+        rate, own = self.sample_rate_hz, self.source.law.controlled
+        folded = [(r, f) for r, f in enumerate(self.modes.frequencies_hz) if f > 0.5 * rate and r not in own]
+        if folded:
+            r, f = folded[0]
+            more = f", and {len(folded) - 1} more above it" if len(folded) > 1 else ""
+            said.append(
+                f"mode {r + 1} at {f:.4g} Hz{more}: beyond half the rate, so it is read as"
+                f" {abs(f - rate * round(f / rate)):.4g} Hz; filter it before sampling, or sample faster"
+            )
+        return tuple(said)
+
+
+def sample_design(
+    modes: Modes, controller: Controller | Law | OnOffLaw, *, sample_rate_hz: float, computing_delay: float = 0.0
+) -> SampledDesign:
+    """The controller run at a rate, with the loop of all modes that it then closes.
+
+    Args:
+        modes: controlled and residual.
+        controller: a law through a modal filter, or on an observer.
+        sample_rate_hz: Hz.
+        computing_delay: τ from a reading to the first effect of its command, beside the actuators' own delays, s.
+
+    Raises:
+        DesignError: a law that reads no sensors, a loop that is unstable before any sampling, a rate too slow for the
+            modes, or a delay under which no rate is stable.
+    """
+    if not isinstance(controller, Controller):
+        raise DesignError(
+            f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer (luenberger,"
+            " kalman) or through a modal filter first"
+        )
+    if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
+        raise DesignError(f"the sampling rate must be positive; got {sample_rate_hz:g} Hz")
+    before = close_with(modes, controller)
+    if not before.stable:
+        raise DesignError(
+            f"{controller.name}: the loop of all {modes.n_modes} modes is unstable before any sampling, a pole at"
+            f" {-before.margin:+.3g} 1/s; explain(modes, controller) names the path, remedies(...) a mend"
+        )
+    fastest = float(modes.frequencies_hz[list(controller.law.controlled)].max())
+    if sample_rate_hz <= 2.0 * fastest:
+        raise DesignError(
+            f"{sample_rate_hz:g} Hz is too slow for mode {_highest(modes, controller) + 1} at {fastest:.4g} Hz, which"
+            f" needs more than {2 * fastest:.4g} Hz; sample at {_round_up(COMFORTABLE * fastest):g} Hz"
+        )
+
+    def poles(rate: float, delay: float) -> np.ndarray:
+        digital = sampled(controller, 1.0 / rate)
+        loop = sampled_loop(modes, controller.law.actuators, controller.sensors, digital, delay)
+        return np.asarray(np.linalg.eigvals(loop))
+
+    found = poles(sample_rate_hz, computing_delay)
+    if not _stable(found):
+        late = computing_delay + max(actuator.delay for actuator in controller.law.actuators)
+        raise DesignError(_too_slow(lambda rate: _stable(poles(rate, computing_delay)), sample_rate_hz, late))
+    return SampledDesign(
+        modes,
+        controller,
+        sampled(controller, 1.0 / sample_rate_hz),
+        computing_delay,
+        found,
+        _delay_margin(1.0 / sample_rate_hz, lambda more: _stable(poles(sample_rate_hz, computing_delay + more))),
+    )
+
+
+def _highest(modes: Modes, controller: Controller) -> int:
+    return max(controller.law.controlled, key=lambda r: float(modes.omega[r]))
+
+
+def _stable(poles: np.ndarray) -> bool:
+    return bool(np.abs(poles).max() <= 1.0 + ON_CIRCLE)
+
+
+def _too_slow(stable: Callable[[float], bool], rate: float, delay: float) -> str:
+    """Why a rate at which the loop is unstable will not do, and which will."""
+    fast = 2.0 * rate
+    while not stable(fast):
+        fast *= 2.0
+        if fast > FASTEST * rate or fast * delay > MOST_PAST:
+            return (
+                f"delays of {1e3 * delay:.4g} ms destabilise the loop at this rate and at faster ones; shorten them, or"
+                " lower the gains"
+            )
+    slow = 0.5 * fast
+    for _ in range(20):
+        middle = 0.5 * (slow + fast)
+        slow, fast = (slow, middle) if stable(middle) else (middle, fast)
+    least = next(r for r in (_round_up(fast), 1.1 * fast, 2.0 * fast) if stable(r) or r > 1.5 * fast)
+    return (
+        f"at {rate:g} Hz the loop is unstable, as a held command comes half a sample late; sample at"
+        f" {_round_up(least):g} Hz or more, or lower the gains"
+    )
+
+
+def _round_up(value: float) -> float:
+    """Two digits, not less than the value."""
+    step = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.ceil(value / step - 1e-9) * step)
+
+
+def _delay_margin(period: float, stable: Callable[[float], bool]) -> float:
+    """The least further delay that destabilises, s."""
+    tried = period * np.linspace(0.0, MOST_LATE, TRIES + 1)
+    slow = next((i for i, more in enumerate(tried) if not stable(more)), None)
+    if slow is None:
+        return np.inf
+    if slow == 0:
+        return 0.0
+    low, high = tried[slow - 1], tried[slow]
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return float(low)

@@ -1,0 +1,137 @@
+"""A controller as plain C and plain Python, from templates: one function that is called once a sample."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+
+from workbench.design.estimation.digital import ONSET, DigitalController
+
+HERE = Path(__file__).parent
+TEMPLATES = {"c": ("h", "c"), "python": ("py",)}
+WIDTH = 108
+
+
+def source(
+    controller: DigitalController,
+    language: str,
+    name: str,
+    *,
+    readings: Sequence[str] = (),
+    commands: Sequence[str] = (),
+    states: Sequence[str] = (),
+) -> dict[str, str]:
+    """Text by file name of a controller in "c" or "python".
+
+    Args:
+        controller: to write.
+        language: one of TEMPLATES.
+        name: of the files and, in C, of the functions.
+        readings, commands, states: what each is, in words; bare names unless given.
+    """
+    infinite = "INFINITY" if language == "c" else "inf"
+    given = _Numbers(controller, infinite)
+    words = {
+        "name": name,
+        "title": fill(f"{_plain(controller.name)}, at {1 / controller.sample_time:.6g} Hz", WIDTH),
+        "period": f"{controller.sample_time:.10g}",
+        "rate": f"{1 / controller.sample_time:.6g}",
+        "equations": "\n".join(_equations(given)),
+        "signals": "\n".join(
+            [
+                *_listed("reading", readings or controller.sensors),
+                *_listed("command", commands or controller.actuators),
+                *_listed("z", states or ["state of the controller"] * given.sizes["n_states"]),
+            ]
+        ),
+        "matrices": given.matrices,
+        "vectors": given.vectors,
+        "uses_math": bool(given.vectors.keys() - {"SCALE", "OFFSET", "BIAS"}),
+        **given.sizes,
+    }
+    environment = Environment(undefined=StrictUndefined, keep_trailing_newline=True)
+    texts = {end: (HERE / f"step.{end}.jinja").read_text(encoding="utf-8") for end in TEMPLATES[language]}
+    return {f"{name}.{end}": environment.from_string(text).render(words) for end, text in texts.items()}
+
+
+class _Numbers:
+    """The numbers of a controller as text, without those that do nothing."""
+
+    def __init__(self, controller: DigitalController, infinite: str) -> None:
+        def text(value: float) -> str:
+            return repr(float(value)) if np.isfinite(value) else infinite if value > 0 else f"-{infinite}"
+
+        def table(values: np.ndarray) -> list[list[str]]:
+            return [[text(value) for value in row] for row in values]
+
+        def row(values: np.ndarray) -> list[str]:
+            return [text(value) for value in values]
+
+        one, relays, friction = controller, controller.relays, controller.friction
+        n_states, n_commands = one.a.shape[0], len(one.actuators)
+        self.sizes = {
+            "n_states": n_states,
+            "n_readings": len(one.sensors),
+            "n_commands": n_commands,
+            "n_outputs": one.d.shape[0],
+        }
+        self.matrices: dict[str, Any] = {"D": table(one.d)}
+        self.vectors: dict[str, Any] = {}
+        if n_states:
+            self.matrices |= {"A": table(one.a), "B": table(one.b), "C": table(one.c)}
+            if one.e.any():
+                self.matrices["E"] = table(one.e)
+        if one.offset.any() or (one.scale != 1).any():
+            self.vectors |= {"SCALE": row(one.scale), "OFFSET": row(one.offset)}
+        if relays is not None:
+            self.matrices["SPREAD"] = table(relays.spread)
+            self.vectors |= {"FORCE": row(relays.force), "DEAD_BAND": row(relays.dead_band)}
+        if friction is not None:
+            self.matrices |= {"PUSH": table(friction.push), "SPEED_Y": table(friction.of_reading)}
+            if n_states:
+                self.matrices["SPEED_Z"] = table(friction.of_state)
+            self.vectors |= {"FRICTION": row(friction.force), "SMOOTHING": row(friction.smoothing)}
+        for name, values in (("LIMIT", one.limit), ("RATE", one.rate)):
+            if np.isfinite(values).any():
+                self.vectors[name] = row(values)
+        if one.dead_zone.any():
+            onset = np.where(one.dead_zone > 0, ONSET * one.dead_zone, 1.0)
+            self.vectors |= {"DEAD_ZONE": row(one.dead_zone), "ONSET": row(onset)}
+        if one.bias.any():
+            self.vectors["BIAS"] = row(one.bias)
+
+
+def _equations(given: _Numbers) -> list[str]:
+    """What the step computes, line by line."""
+    there, states = given.vectors, "z" if given.sizes["n_states"] else ""
+    lines = ["y = SCALE (reading - OFFSET)" if "SCALE" in there else "y = reading"]
+    lines.append("w = C z + D y" if states else "w = D y")
+    if "FORCE" in there:
+        lines.append("w <- -SPREAD (FORCE sgn w outside the DEAD_BAND)")
+    if "FRICTION" in there:
+        lines.append("w <- w + PUSH (FRICTION tanh(speed / SMOOTHING)), speed = SPEED_Z z + SPEED_Y y")
+    if "LIMIT" in there or "RATE" in there:
+        bounds = [text for name, text in (("LIMIT", "+-LIMIT"), ("RATE", "+-RATE of the v before")) if name in there]
+        lines.append(f"v = w within {' and '.join(bounds)}")
+    else:
+        lines.append("v = w")
+    command = "command = v"
+    if "DEAD_ZONE" in there:
+        command += " + DEAD_ZONE (v / ONSET within +-1)"
+    lines.append(command + (" - BIAS" if "BIAS" in there else ""))
+    if states:
+        lines.append("z <- A z + B y" + (" + E v" if "E" in given.matrices else ""))
+    return lines
+
+
+def _listed(array: str, words: Sequence[str]) -> list[str]:
+    return [f"{array}[{i}]  {_plain(text)}" for i, text in enumerate(words)]
+
+
+def _plain(text: str) -> str:
+    """Words that can stand in a comment: a name in a case file must not end it."""
+    line = "".join(sign if sign.isprintable() else " " for sign in text)
+    return line.replace("\\", "/").replace("*/", "* /").replace('"', "'")
