@@ -293,7 +293,19 @@ def test_cases_that_fail_are_reported_at_the_end_beside_the_others(tmp_path, mon
 
 
 def test_every_command_explains_itself_with_an_example():
-    for name in ("study", "identify", "design", "place", "diagnose", "trial", "report", "bench", "look", "new"):
+    for name in (
+        "study",
+        "identify",
+        "design",
+        "place",
+        "diagnose",
+        "redesign",
+        "trial",
+        "report",
+        "bench",
+        "look",
+        "new",
+    ):
         result = run(name, "--help")
         assert result.exit_code == 0 and "Example: workbench" in result.output
 

@@ -12,6 +12,7 @@ from workbench.cli.identify import identify
 from workbench.cli.look import look
 from workbench.cli.new import new
 from workbench.cli.place import place
+from workbench.cli.redesign import redesign
 from workbench.cli.report import report
 from workbench.cli.study import study
 from workbench.cli.trial import trial
@@ -43,7 +44,7 @@ def _options(
     """Options of the command itself."""
 
 
-for command in (look, identify, design, place, export, diagnose, trial, study, report, bench, new):
+for command in (look, identify, design, place, export, diagnose, redesign, trial, study, report, bench, new):
     app.command()(command)
 
 

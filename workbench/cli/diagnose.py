@@ -50,6 +50,7 @@ def diagnose(
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
+    from workbench.robust.posterior import UncertainRig
     from workbench.study.measured_case import measured_case
     from workbench.study.verdict_page import verdict_page
     from workbench.study.whole_file import check_target, write_whole
@@ -101,6 +102,7 @@ def diagnose(
     for note in verdict.notes:
         say(f"  {note}")
     if json_path is not None:
+        shown["posterior"] = UncertainRig.of(verdict).to_json()
         write_whole(json_path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
         say(f"  verdict    {short(json_path)}")
     target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)

@@ -16,6 +16,7 @@ from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.distortion import plot_distortion
 from workbench.draw.gap import plot_where
+from workbench.draw.robust import plot_redesign
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.draw.surface import plot_point_modes, plot_surface_modes
 from workbench.gap.report.verdict import Verdict
@@ -24,6 +25,7 @@ from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
 from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
+from workbench.robust.redesign import Redesign
 from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.modes import Modes, SampledModes
 from workbench.structure.printed import place_text
@@ -34,7 +36,7 @@ MOST_PANELS = 12
 @singledispatch
 def plot(result) -> Figure:
     """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
-    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion` or `Verdict`.
+    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion`, `Verdict` or `Redesign`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -160,6 +162,11 @@ def _(result: Verdict) -> Figure:
 @plot.register
 def _(result: Distortion) -> Figure:
     return plot_distortion([result])
+
+
+@plot.register
+def _(result: Redesign) -> Figure:
+    return plot_redesign(result)
 
 
 def _panels(count: int):

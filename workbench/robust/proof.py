@@ -31,6 +31,7 @@ class Proof:
         vibration: (n_draws,) ∫ of the energy of all modes over time.
         settling: (n_draws,) s until the energy stays below a hundredth of its peak; inf where it does not within the
             test.
+        energy: (3, n_samples) of all modes: median over the draws, and lower and upper end of the 95 % interval.
         margin: relative error of all readings, at once and of any phase, that the loop bears for sure; 0 where it is
             not stable, inf where nothing is fed back, nan where it has no linear part.
         margin_frequency_hz: where the least of it is.
@@ -45,12 +46,13 @@ class Proof:
     effort: np.ndarray
     vibration: np.ndarray
     settling: np.ndarray
+    energy: np.ndarray
     margin: float
     margin_frequency_hz: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stable", frozen(self.stable, bool))
-        for name in ("damping", "peak_force", "stroke", "work", "effort", "vibration", "settling"):
+        for name in ("damping", "peak_force", "stroke", "work", "effort", "vibration", "settling", "energy"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
@@ -164,6 +166,7 @@ def prove(
             effort=_finite([run.effort for run in runs]),
             vibration=_finite([e.sum() * dt for e in energies]),
             settling=np.array([_settling(e, dt) if s else np.inf for e, s in zip(energies, stable, strict=True)]),
+            energy=_band(energies),
             margin=margin,
             margin_frequency_hz=frequency,
         )
@@ -184,6 +187,11 @@ def drawn_with_errors(possible: UncertainRig, draws: int, seed: int = 0) -> tupl
         )
         for rig in rigs
     )
+
+
+def _band(energies: Sequence[np.ndarray]) -> np.ndarray:
+    outer = 0.5 * (1.0 - LEVEL)
+    return np.asarray(np.quantile(energies, (0.5, outer, 1.0 - outer), axis=0, method="nearest"))
 
 
 def _finite(values) -> np.ndarray:

@@ -1,0 +1,66 @@
+"""`workbench redesign`: from a case and its verdict to a controller, a page and JSON."""
+
+import json
+
+import numpy as np
+import pytest
+
+from workbench.cases.case import Case
+from workbench.cases.writing import write_case
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.robust.posterior import UncertainRig
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """A case whose actuators are late, and its verdict as the diagnosis writes it."""
+    beam = Beam(
+        length=2.0,
+        mass_per_length=1.0,
+        bending_stiffness=4.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    sensors = [Sensor(f"d{i}", x, noise_std=1e-5) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
+    rig = Rig(beam.modes(5), (Actuator("F1", 0.45), Actuator("F2", 1.2)), tuple(sensors), structure=beam)
+    late = Effect(kind_named("actuator_delay"), "all", {"delay": 0.04})
+    inputs = np.random.default_rng(0).normal(size=(2, 400))
+    folder = tmp_path_factory.mktemp("case") / "late"
+    write_case(Case("late", rig, (simulate(late.apply(rig), inputs, sample_time=0.01, name="low"),), ()), folder)
+    verdict = folder.parent / "verdict.json"
+    verdict.write_text(json.dumps({"posterior": UncertainRig(rig, (late,), np.array([[1e-4]])).to_json()}))
+    return folder, verdict
+
+
+def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
+    folder, verdict = case
+    page, told = tmp_path / "p.html", tmp_path / "r.json"
+    options = ("--verdict", verdict, "--damping", 0.3, "--draws", 6, "--page", page, "--json", told)
+    done = run("redesign", folder, *options)
+    assert done.exit_code == 0, done.output
+    assert "stable on 6 of 6 draws" in done.output and "F1: delay 40 ms" in done.output
+    found = json.loads(told.read_text())
+    assert found["safe"] and found["redesigned"]["stable"] == 6
+    assert found["steps"][-1]["loss"] < 0.5 * found["steps"][0]["loss"]
+    html = page.read_text(encoding="utf-8")
+    assert found["sentence"].split(";")[0] in html and "Under the inputs of the measured record low" in html
+
+
+def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
+    folder, verdict = case
+    plain = tmp_path / "plain.json"
+    plain.write_text('{"effects": []}')
+    refused = run("redesign", folder, "--verdict", plain)
+    assert refused.exit_code == 2 and "workbench diagnose CASE --json plain.json" in refused.output
+    unknown = run("redesign", folder, "--verdict", verdict, "--law", "magic")
+    assert unknown.exit_code == 2 and "the laws are imsc, coupled, poles, on-off" in unknown.output
+    slow = run("redesign", folder, "--verdict", verdict, "--rate-hz", 5)
+    assert slow.exit_code == 2 and "too slow for mode 2" in slow.output

@@ -1,0 +1,112 @@
+"""`workbench redesign`: the controller that holds on the real structure."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
+
+
+@guarded
+def redesign(
+    case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
+    verdict: Annotated[
+        Path | None, typer.Option(help="Verdict that `workbench diagnose --json` wrote; diagnosed now unless given.")
+    ] = None,
+    law: Annotated[str, typer.Option(help="Law in use: imsc, coupled, poles or on-off.")] = "imsc",
+    control: Annotated[
+        int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
+    ] = None,
+    damping: Annotated[float, typer.Option(help="Damping ratio that the controlled modes should have.")] = 0.1,
+    rate_hz: Annotated[
+        float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
+    ] = None,
+    impulse_at: Annotated[
+        float | None, typer.Option(help="Place of the impulse of the test, m; that of the hammer unless given.")
+    ] = None,
+    draws: Annotated[int, typer.Option(help="Possible rigs on which both controllers are proved.")] = 200,
+    seed: Annotated[int, typer.Option(help="Of the draws and of the noise.")] = 0,
+    workers: Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")] = None,
+    json_path: JsonPath = None,
+    page: PagePath = None,
+) -> None:
+    """Design the controller anew for what a diagnosis found, and prove both on what remains unknown.
+
+    The law in use is designed for the nominal model and reads a Kalman filter on the case's sensors.
+
+    Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05
+    """
+    from workbench.cases.case import read_case
+    from workbench.gap.diagnose import diagnose
+    from workbench.robust.plain_law import plain_law
+    from workbench.robust.posterior import UncertainRig
+    from workbench.robust.redesign import impulse_test
+    from workbench.robust.redesign import redesign as run
+    from workbench.study.redesign_page import redesign_page
+    from workbench.study.whole_file import check_target
+
+    check_target(json_path)
+    found = read_case(case)
+    rig, records = found.rig, (*found.fit, *found.validation)
+    with progress_bar() as progress:
+        report = reporter(progress, "reading")
+        if verdict is None:
+            told = diagnose(
+                rig,
+                found.fit,
+                validation=found.validation,
+                name=found.name,
+                workers=workers,
+                report=lambda what, share: report(what, 0.7 * share),
+            )
+            possible = UncertainRig.of(told)
+        else:
+            possible = _read_verdict(verdict, rig)
+        level = _largest(records)
+        sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
+        controlled = range(len([a for a in rig.actuators if not a.direct]) if control is None else control)
+        test = impulse_test(rig, controlled, sample_time, impulse_at, level=level, seed=seed)
+        chosen = plain_law(law, rig, control, damping=damping, impulse_at=test.impulse_at, impulse=test.impulse)
+        result = run(
+            possible,
+            chosen,
+            test=test,
+            draws=draws,
+            seed=seed,
+            report=lambda what, share: report(what, 0.7 + 0.3 * share),
+        )
+    say(result.sentence, bold=True)
+    table = Table("step", "what", "loss", "kept", box=None, pad_edge=False)
+    for step in result.steps:
+        table.add_row(step.name, step.what, f"{100 * step.loss:.3g} %", "yes" if step.kept else "no")
+    console.print(table)
+    if result.relocation is not None:
+        say(f"  {result.relocation.sentence}")
+    for note in result.notes:
+        say(f"  {note}")
+    write_json(json_path, result.to_json())
+    target = page or Path("out") / f"{found.name}-redesign.html"
+    shown = (found.validation or found.fit)[0]
+    say(f"  page       {short(redesign_page(result, target, name=found.name, record=shown, folder=case))}")
+
+
+def _largest(records):
+    import numpy as np
+
+    return np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
+
+
+def _read_verdict(path: Path, rig):
+    from workbench.robust.posterior import UncertainRig
+
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        posterior = told["posterior"]
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
+        raise ValueError(
+            f"{path} holds no verdict with its uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
+        ) from None
+    return UncertainRig.from_json(rig, posterior)

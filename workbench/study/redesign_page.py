@@ -1,0 +1,153 @@
+"""The page of a redesign: which controller is better on the real structure, and how sure that is."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from workbench.design.loop.closed_loop import Response
+from workbench.design.loop.rig_loop import LoopTest, run_loop
+from workbench.draw.motion import response_motion
+from workbench.draw.robust import plot_redesign, plot_steps
+from workbench.draw.style import COLOURS, new_figure
+from workbench.records.record import Record
+from workbench.rig.actuators import Actuator
+from workbench.robust.proof import Proof, interval
+from workbench.robust.redesign import Redesign
+from workbench.structure.domain import Interval
+from workbench.study.page import Story, block, write_page
+from workbench.study.verdict_page import case_inputs
+
+MOST = 3000  # samples of a record that are replayed
+
+
+def redesign_page(
+    found: Redesign, path: Path, *, name: str, record: Record | None = None, folder: Path | None = None
+) -> Path:
+    """Write the page.
+
+    Args:
+        found: the redesign.
+        path: of the HTML file.
+        name: of the case.
+        record: measured, whose inputs are then replayed as forces on both loops.
+        folder: that the case was read from.
+    """
+    blocks = []
+    if record is not None:
+        blocks += _replayed(found, record)
+    impulse = found.test.impulse_at is not None and isinstance(found.possible.rig.modes.domain, Interval)
+    if impulse and record is None:
+        blocks.append(_moving(found, found.before.response, found.after.response, "The test"))
+    blocks += [
+        block(
+            plot_redesign(found),
+            "Both controllers on the same possible rigs, drawn from the diagnosis; every dead zone, delay, friction and"
+            " noise is in.",
+        ),
+        block(plot_steps(found), "From the present controller to the redesigned one, one step after the other."),
+    ]
+    tables: list[tuple[str, tuple[str, ...], list]] = [
+        ("On the same draws: median (95 %)", ("", "present", "redesigned"), _figures(found)),
+        (
+            "Steps",
+            ("step", "what", "loss [%]", "kept"),
+            [(s.name, s.what, f"{100.0 * s.loss:.3g}", "yes" if s.kept else "no") for s in found.steps],
+        ),
+    ]
+    moved = [] if found.relocation is None else [found.relocation.sentence]
+    story = Story(
+        title=f"Redesign for {name}",
+        lead=found.sentence,
+        standing="good" if found.safe else "bad" if found.proof.share_stable < 0.95 else "part",
+        lines=[*moved, *found.notes],
+        blocks=blocks,
+        tables=tables,
+        inputs={} if folder is None else case_inputs(folder),
+        made_by=f"workbench redesign {folder or name}",
+    )
+    return write_page(path, story)
+
+
+def _figures(found: Redesign) -> list[tuple[str, str, str]]:
+    old, new = found.present_proof, found.proof
+    rows = [("stable draws", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
+    for r in found.controlled:
+        rows.append((f"damping of mode {r + 1} [%]", *(_told(100.0 * p.damping[:, r]) for p in (old, new))))
+    each = ("worst_damping", "worst damping of any mode [%]", 100.0), ("settling", "settling [s]", 1.0)
+    each += ("peak_force", "peak force [N]", 1.0), ("stroke", "largest displacement at an actuator [m]", 1.0)
+    each += (
+        ("controlled_work", "work in controlled modes, W_C [J]", 1.0),
+        ("residual_work", "in residual modes, W_R [J]", 1.0),
+    )
+    each += (("effort", "effort, ∫ FᵀF dt", 1.0),)
+    rows += [(words, *(_told(scale * getattr(p, name)) for p in (old, new))) for name, words, scale in each]
+    rows.append(("error of all readings that the loop bears [%]", *(_margin(p) for p in (old, new))))
+    return rows
+
+
+def _told(values: np.ndarray) -> str:
+    middle, low, high = interval(values)
+    return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+
+def _margin(proof: Proof) -> str:
+    return "no linear bound" if np.isnan(proof.margin) else f"{100.0 * proof.margin:.3g}"
+
+
+def _replayed(found: Redesign, record: Record) -> list[dict]:
+    """Both loops on the corrected rig under the inputs of a measured record, as forces at the same places."""
+    rig = found.possible.rig
+    step = found.test.sample_time
+    if abs(record.sample_time / step - 1.0) > 1e-6:
+        return []
+    inputs = record.inputs[:, :MOST]
+    ports = tuple(Actuator(a.name, a.at, kind=a.kind, direction=a.direction) for a in rig.actuators)
+    test = LoopTest(inputs.shape[1], step, forces=inputs, ports=ports, seed=found.test.seed)
+    old, new = run_loop(rig, found.present, test), run_loop(rig, found.redesigned, test)
+    if not (old.bounded or new.bounded):
+        return []
+    caption = f"Under the inputs of the measured record {record.name or ''}".rstrip()
+    shown = []
+    if isinstance(rig.modes.domain, Interval) and old.bounded and new.bounded:
+        shown.append(_moving(found, old.response, new.response, caption))
+    shown.append(
+        block(
+            _readings(found, record, {"present": old.response, "redesigned": new.response}),
+            f"{caption}: the displacement where it is largest. Measured without control where a sensor stands there.",
+        )
+    )
+    return shown
+
+
+def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict:
+    scale = np.abs(new.modal[: new.modes.n_modes]).max()
+    limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -1e3 * scale, 1e3 * scale))
+    actuators = [a for a in found.possible.rig.actuators if a.name in found.redesigned.actuators]
+    sensors = [s for s in found.possible.rig.sensors if s.name in found.redesigned.sensors]
+    motion = response_motion({"present": limited, "redesigned": new}, actuators=actuators, sensors=sensors)
+    return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.")
+
+
+def _readings(found: Redesign, record: Record, responses: dict[str, Response]):
+    rig = found.possible.rig
+    seen = [(i, s) for i, s in enumerate(rig.sensors) if s.quantity == "displacement"]
+    figure, ax = new_figure(width=9, height=3.6)
+    n = next(iter(responses.values())).time.size
+    if seen:
+        i, sensor = max(seen, key=lambda one: float(np.abs(record.outputs[one[0], :n]).max()))
+        at, name = sensor.at, sensor.name
+        ax.plot(
+            record.time[:n], record.outputs[i, :n], color="#8a8a8a", linewidth=0.8, label="measured, without control"
+        )
+    else:
+        at, name = rig.actuators[0].at, f"at {rig.actuators[0].name}"
+    for (label, response), colour in zip(responses.items(), (COLOURS[1], COLOURS[0]), strict=True):
+        shape = response.modes.phi_at(at)
+        ax.plot(
+            response.time, shape @ response.modal[: response.modes.n_modes], color=colour, linewidth=1.0, label=label
+        )
+    limit = 1.3 * max(float(np.abs(line.get_ydata()).max()) for line in ax.lines if line.get_label() != "present")
+    ax.set(xlabel="time [s]", ylabel=f"displacement, {name}", ylim=(-limit, limit))
+    ax.legend(fontsize=8, ncols=3)
+    return figure
