@@ -193,11 +193,7 @@ class Plate(_Surface):
     def ritz_problem(self) -> SurfaceProblem:
         """The eigenvalue problem that `surface_ritz` solves."""
         nu, rigidity, (nx, ny, nxy) = self.poisson_ratio, self.bending_stiffness, self.tension
-        squares = [  # the strain energy as squares, so that nothing cancels
-            Square(lambda x, y: 0.5 * (1.0 + nu) * rigidity(x, y), ((1.0, 2, 0), (1.0, 0, 2))),
-            Square(lambda x, y: 0.5 * (1.0 - nu) * rigidity(x, y), ((1.0, 2, 0), (-1.0, 0, 2))),
-            Square(lambda x, y: 2.0 * (1.0 - nu) * rigidity(x, y), ((1.0, 1, 1),)),
-        ]
+        squares = [*bending_squares(rigidity, nu)]
         principal, directions = np.linalg.eigh([[nx, nxy], [nxy, ny]])
         for value, (c, s) in zip(principal, directions.T):
             if value:
@@ -294,6 +290,16 @@ class Plate(_Surface):
                 row = modes.phi(part.at)[0]
                 damping = damping + part.coefficient * np.outer(row, row)
         return Modes(omega=modes.omega, damping=damping, shapes=modes.shapes, domain=modes.domain)
+
+
+def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]:
+    """The strain energy of bending as squares, so that nothing cancels."""
+    nu = poisson_ratio
+    return (
+        Square(lambda x, y: 0.5 * (1.0 + nu) * rigidity(x, y), ((1.0, 2, 0), (1.0, 0, 2))),
+        Square(lambda x, y: 0.5 * (1.0 - nu) * rigidity(x, y), ((1.0, 2, 0), (-1.0, 0, 2))),
+        Square(lambda x, y: 2.0 * (1.0 - nu) * rigidity(x, y), ((1.0, 1, 1),)),
+    )
 
 
 ROTATIONAL = {

@@ -133,14 +133,6 @@ def mass_and_stiffness(
     """
     if kind not in ("bar", "beam"):
         raise ValueError(f"mass and stiffness are those of a bar or a beam; got {kind!r}")
-    q = modes.n_modes
-    available = (q * (q - 1) // 2 + len(known_mass), q * (q + 1) // 2)
-    for what, basis, most in zip(("mass", "stiffness"), (mass_basis, stiffness_basis), available, strict=True):
-        if basis.n_terms > most:
-            raise ValueError(
-                f"{basis.n_terms} terms of {what} cannot be found from {most} relations of {q} modes;"
-                " use more modes or fewer terms"
-            )
     prior_mass, prior_stiffness = as_profile(prior_mass), as_profile(prior_stiffness)
     unit, scale = _unit_mean_square(modes)
     mass = _mass(unit, mass_basis, prior_mass, known_mass)
@@ -159,23 +151,79 @@ def mass_and_stiffness(
 def _mass(modes: Modes, basis: Basis, prior: Profile, known: Sequence[tuple[float, float]]) -> Distribution:
     if len(known) == 0:
         raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
-    u, u0 = _relations(modes, 0, basis, prior, np.triu_indices(modes.n_modes, 1))
+    shapes, weights, x = _sampled(modes, 0, (*basis.breaks, *prior.breaks))
     places, values = np.array(known, float).T
-    rows, targets = basis.functions(places), values - prior(places)
-    coefficients = _constrained(u, -u0, rows, targets)
-    return Distribution(frozen(coefficients), basis, prior, _misfit(u @ coefficients + u0, u, coefficients, u0))
+    coefficients, misfit = mass_series(
+        shapes, weights, basis.functions(x), prior(x), basis.functions(places), values - prior(places)
+    )
+    return Distribution(frozen(coefficients), basis, prior, misfit)
 
 
 def _stiffness(modes: Modes, order: int, a_squared: np.ndarray, basis: Basis, prior: Profile) -> Distribution:
-    r, s = np.triu_indices(modes.n_modes)
-    v, v0 = _relations(modes, order, basis, prior, (r, s))
-    targets = np.where(r == s, a_squared[r] * modes.omega[r] ** 2, 0.0)
+    strain, weights, x = _sampled(modes, order, (*basis.breaks, *prior.breaks))
+    strains = [(1.0, strain)]
+    coefficients, misfit = stiffness_series(strains, weights, basis.functions(x), prior(x), a_squared, modes.omega)
+    return Distribution(frozen(coefficients), basis, prior, misfit)
+
+
+def mass_series(
+    shapes: np.ndarray,
+    weights: np.ndarray,
+    functions: np.ndarray,
+    prior: np.ndarray,
+    rows: np.ndarray,
+    known: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Coefficients (n_terms,) of the mass from the relations r ≠ s of (4.6), and their misfit.
+
+    Args:
+        shapes: (n_points, n_modes) at points of integration, of one size.
+        weights: (n_points,) of these.
+        functions, prior: (n_points, n_terms) and (n_points,) there.
+        rows, known: (n_known, n_terms) functions where the mass is known, and what it is beyond the prior.
+    """
+    if functions.shape[1] > (most := shapes.shape[1] * (shapes.shape[1] - 1) // 2 + known.size):
+        raise ValueError(_too_many(functions.shape[1], "mass", most, shapes.shape[1]))
+    r, s = np.triu_indices(shapes.shape[1], 1)
+    products = weights[:, None] * shapes[:, r] * shapes[:, s]
+    u, u0 = products.T @ functions, products.T @ prior  # U_rsj of (4.8), U_rs0 of (4.23)
+    coefficients = _constrained(u, -u0, rows, known)
+    return coefficients, _misfit(u @ coefficients + u0, u, coefficients, u0)
+
+
+def stiffness_series(
+    strains: Sequence[tuple[np.ndarray | float, np.ndarray]],
+    weights: np.ndarray,
+    functions: np.ndarray,
+    prior: np.ndarray,
+    a_squared: np.ndarray,
+    omega: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Coefficients (n_terms,) of the stiffness from all relations of (4.6), and their misfit.
+
+    Args:
+        strains: (factor, (n_points, n_modes)): the density of the strain energy of unit stiffness is the sum of factor
+            times squares.
+        weights, functions, prior: as `mass_series` takes them.
+        a_squared, omega: (n_modes,) scales and frequencies.
+    """
+    if functions.shape[1] > (most := omega.size * (omega.size + 1) // 2):
+        raise ValueError(_too_many(functions.shape[1], "stiffness", most, omega.size))
+    r, s = np.triu_indices(omega.size)
+    products = sum((weights * factor)[:, None] * strain[:, r] * strain[:, s] for factor, strain in strains)
+    v, v0 = np.asarray(products).T @ functions, np.asarray(products).T @ prior
+    targets = np.where(r == s, a_squared[r] * omega[r] ** 2, 0.0)
     # A relation between high modes is larger by ω_r ω_s, and so is its error; divided by it they weigh alike.
-    weight = 1.0 / np.maximum(modes.omega[r] * modes.omega[s], 1e-12 * modes.omega.max() ** 2)
+    weight = 1.0 / np.maximum(omega[r] * omega[s], 1e-12 * omega.max() ** 2)
     coefficients = np.linalg.lstsq(weight[:, None] * v, weight * (targets - v0), rcond=None)[0]
     left = weight * (v @ coefficients + v0 - targets)
-    return Distribution(
-        frozen(coefficients), basis, prior, _misfit(left, weight[:, None] * v, coefficients, weight * v0)
+    return coefficients, _misfit(left, weight[:, None] * v, coefficients, weight * v0)
+
+
+def _too_many(n_terms: int, what: str, most: int, n_modes: int) -> str:
+    return (
+        f"{n_terms} terms of {what} cannot be found from {most} relations of {n_modes} modes; use more modes or fewer"
+        " terms"
     )
 
 
@@ -194,15 +242,6 @@ def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np
     h = np.diff(nodes)[:, None]
     x = (nodes[:-1, None] + 0.5 * h * (points + 1.0)).ravel()
     return modes.phi(x, derivative), (0.5 * h * weights).ravel(), x
-
-
-def _relations(
-    modes: Modes, derivative: int, basis: Basis, prior: Profile, pairs: tuple[np.ndarray, ...]
-) -> tuple[np.ndarray, np.ndarray]:
-    """U_rsj (n_relations, n_terms) of (4.8) and U_rs0 (n_relations,) of (4.23) for pairs of modes (r, s)."""
-    shapes, weights, x = _sampled(modes, derivative, (*basis.breaks, *prior.breaks))
-    products = weights[:, None] * shapes[:, pairs[0]] * shapes[:, pairs[1]]
-    return products.T @ basis.functions(x), products.T @ prior(x)
 
 
 def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:

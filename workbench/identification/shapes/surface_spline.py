@@ -1,0 +1,305 @@
+"""From shapes known at scattered sensors to eigenfunctions all over a rectangle: polyharmonic splines and their error.
+
+The spline through values v at places p_i is s(p) = Σ a_i |p - p_i|⁷ + a cubic: of all functions that take the values,
+the one with the least energy of a derivative of order 4½ (Duchon 1977). What edges hold at zero is held at points along
+them. A function of white energy of strength τ² has about it the mean square error τ² κ(p), κ the power function of the
+kernel (Wendland, Scattered Data Approximation, 2005, chapter 11); τ² is the upper limit of what the values say of it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from math import factorial
+
+import numpy as np
+from scipy.linalg import null_space
+from scipy.optimize import brentq, minimize_scalar
+from scipy.stats import chi2
+
+from workbench.identification.shapes.bands import DRAWS, HELD, Bands
+from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.structure.domain import Rectangle
+from workbench.structure.field import FieldLike, as_field
+from workbench.structure.modes import Modes, SampledModes, frozen
+from workbench.structure.supports import SIDES
+from workbench.threads import one_blas_thread
+
+POWER = 3.5  # of |p|², the kernel |p|⁷
+CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))  # powers of x and y that cost no energy
+PER_EDGE = 11  # points where an edge is held
+HELD_BY = {"simply supported": (0,), "clamped": (0, 1), "free": (), "guided": (1,)}
+QUADRATURE = 49  # modes that the points of integration over the rectangle would serve
+UNLIKELY = 0.05  # that τ² is larger than its limit, or that noise alone is taken for an interpolation error
+SAME_PLACE = 1e-6  # of the diagonal: sensors nearer stand at one place
+
+Functional = tuple[np.ndarray, tuple[int, int]]
+
+
+def _kernel(offset: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
+    """∂^(i+j) of |p|⁷ along x and y at offsets p (..., 2), by the chain rule in s = |p|²."""
+    s = (offset**2).sum(axis=-1)
+    found = np.zeros(s.shape)
+    for k in range(derivative[0] // 2 + 1):
+        for m in range(derivative[1] // 2 + 1):
+            order = sum(derivative) - k - m
+            factor, falling = np.ones(s.shape), np.prod(POWER - np.arange(order))
+            for n, part, axis in ((derivative[0], k, 0), (derivative[1], m, 1)):
+                factor = factor * factorial(n) / (factorial(part) * factorial(n - 2 * part))
+                factor = factor * (2.0 * offset[..., axis]) ** (n - 2 * part)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                found += np.where(s > 0, factor * falling * s ** (POWER - order), 0.0)
+    return found
+
+
+def _cubics(at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
+    """The derivative of every cubic monomial at places (n, 2): (n, 10)."""
+    columns = []
+    for powers in CUBIC:
+        column = np.ones(len(at))
+        for axis, (power, order) in enumerate(zip(powers, derivative, strict=True)):
+            below = power - order
+            falling = np.prod(np.arange(power, below, -1)) if below >= 0 else 0.0
+            column = column * falling * at[:, axis] ** max(below, 0)
+        columns.append(column)
+    return np.column_stack(columns)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceSpline:
+    """The linear map from values at scattered places to a spline over a rectangle.
+
+    Attributes:
+        domain: the rectangle, m.
+        places: (n_places, 2) of the values, m.
+        edges: "simply supported", "clamped", "free" or "guided", left, right, bottom and top: where they hold the
+            function or its slope at zero; of a side that is left out nothing is known.
+
+    Raises:
+        ValueError: fewer values and held points than the ten of a cubic, two places that are one, a place outside.
+    """
+
+    domain: Rectangle
+    places: np.ndarray
+    edges: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "places", frozen(self.domain.locate(self.places)))
+        for side, edge in self.edges.items():
+            if side not in SIDES or edge not in HELD_BY:
+                raise ValueError(
+                    f"edges are given by side, {', '.join(SIDES)}, as {', '.join(HELD_BY)}; got {side} {edge!r}"
+                )
+        gaps = np.linalg.norm(self.places[:, None] - self.places, axis=2) + np.eye(len(self.places)) * self.domain.size
+        if gaps.min() < SAME_PLACE * self.domain.size:
+            i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
+            raise ValueError(f"sensors {i + 1} and {j + 1} stand at one place, {self.places[i]} m; keep one of them")
+        if np.linalg.matrix_rank(self._polynomials) < len(CUBIC):
+            raise ValueError(
+                f"{len(self.places)} sensors and the edges do not determine a cubic over the rectangle, which takes"
+                f" {len(CUBIC)} values, not on a line: add sensors, or name the edges that hold it"
+            )
+
+    @cached_property
+    def _held(self) -> list[Functional]:
+        """Points along the edges, and the derivative that is zero there."""
+        a, b = self.domain.length
+        found: list[Functional] = []
+        for side, edge in self.edges.items():
+            i = SIDES.index(side)
+            along, across = (np.arange(PER_EDGE) + 0.5) / PER_EDGE, np.full(PER_EDGE, float(i % 2))
+            points = np.column_stack([across, along] if i < 2 else [along, across]) * (a, b)
+            for order in HELD_BY[edge]:
+                found.append((points, ((order, 0) if i < 2 else (0, order))))
+        return found
+
+    @cached_property
+    def _functionals(self) -> list[Functional]:
+        return [(self.places, (0, 0)), *self._held]
+
+    @cached_property
+    def _polynomials(self) -> np.ndarray:
+        """(n_values, 10) of all functionals, in units of the diagonal."""
+        return np.vstack([self._cubic(at, derivative) for at, derivative in self._functionals])
+
+    def _cubic(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
+        return _cubics(at / self.domain.size, derivative)
+
+    def _covariance(self, at: np.ndarray, derivative: tuple[int, int]) -> np.ndarray:
+        """Of a derivative at places with every functional, for τ² = 1: (n_at, n_values)."""
+        columns = []
+        for places, own in self._functionals:
+            both = (derivative[0] + own[0], derivative[1] + own[1])
+            offset = (at[:, None] - places) / self.domain.size
+            columns.append((-1.0) ** sum(own) * _kernel(offset, both))
+        return np.hstack(columns)
+
+    @cached_property
+    def _system(self) -> np.ndarray:
+        """The inverse of [[K, P], [Pᵀ, 0]]."""
+        k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
+        p = self._polynomials
+        whole = np.block([[k, p], [p.T, np.zeros((p.shape[1],) * 2)]])
+        return np.linalg.inv(whole)
+
+    def matrix(self, at: np.ndarray, derivative: tuple[int, int] = (0, 0)) -> np.ndarray:
+        """Values (or derivatives) at places (n_at, 2) per value at each sensor, (n_at, n_places)."""
+        at = np.atleast_2d(at)
+        rows = np.hstack([self._covariance(at, derivative), self._cubic(at, derivative)])
+        scale = self.domain.size ** -sum(derivative)
+        return np.asarray(scale * (rows @ self._system)[:, : len(self.places)])
+
+    def error(self, at: np.ndarray) -> np.ndarray:
+        """Covariance (n_at, n_at) of what the spline misses between the sensors, for τ² = 1."""
+        rows = np.hstack([self._covariance(at, (0, 0)), self._cubic(at, (0, 0))])
+        own = _kernel((at[:, None] - at) / self.domain.size, (0, 0))
+        return np.asarray(own - rows @ self._system @ rows.T)
+
+    def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
+        """τ² of values (n_places,) of known covariance: the upper end of its interval; 0 where they may be noise.
+
+        By the likelihood of what no cubic takes (restricted maximum likelihood).
+        """
+        n, size = len(self.places), len(self._polynomials)
+        k = np.vstack([self._covariance(at, derivative) for at, derivative in self._functionals])
+        free = null_space(self._polynomials.T)
+        noise = np.zeros((size, size))
+        noise[:n, :n] = covariance
+        scale = float(np.abs(values).max()) ** 2
+        by_rough = free.T @ k @ free
+        by_noise = free.T @ noise @ free + 1e-24 * scale * np.eye(free.shape[1])
+        left = free.T @ np.r_[values, np.zeros(size - n)]
+
+        def unlikely(log_strength: float) -> float:
+            total = by_noise + np.exp(log_strength) * by_rough
+            sign, logarithm = np.linalg.slogdet(total)
+            return float(logarithm + left @ np.linalg.solve(total, left)) if sign > 0 else 1e300
+
+        usual = float(np.trace(by_rough)) / len(left)
+        span = np.log(scale / usual) + np.array([-40.0, 25.0])
+        best = minimize_scalar(unlikely, bounds=tuple(span), method="bounded")
+        limit = best.fun + chi2.isf(2.0 * UNLIKELY, 1)
+        if unlikely(span[0]) < limit:
+            return 0.0
+        return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, span[1])))
+
+
+@one_blas_thread
+def surface_eigenfunctions(
+    sampled: SampledModes,
+    places: np.ndarray,
+    *,
+    length: tuple[float, float],
+    mass_per_area: FieldLike | None = None,
+    edges: Mapping[str, str] | None = None,
+    covariance: np.ndarray | None = None,
+) -> Modes:
+    """`Modes` over a rectangle from shapes at scattered sensors: real parts, interpolated, with ∫∫ m φ_r² dx dy = 1.
+
+    Args:
+        sampled: shapes of displacement, (n_outputs, n_modes).
+        places: (n_outputs, 2) of the sensors, m.
+        length: (a, b), m.
+        mass_per_area: kg/m², where known; without it the mean square of φ_r is 1.
+        edges: what the edges hold, by side, as `SurfaceSpline` takes them.
+        covariance: of (ω, ζ), carried along.
+
+    How far off the shapes may be between the sensors says `surface_bands`.
+
+    Raises:
+        ValueError: as `SurfaceSpline`; places of another number than the outputs.
+    """
+    spline, values = _scaled(sampled, places, length, mass_per_area, edges)
+    return Modes(
+        omega=sampled.omega,
+        damping=sampled.zeta,
+        shapes=lambda at, derivative: spline.matrix(at, derivative) @ values,
+        domain=spline.domain,
+        covariance=covariance,
+    )
+
+
+@one_blas_thread
+def surface_bands(
+    sampled: SampledModes,
+    places: np.ndarray,
+    at: np.ndarray,
+    *,
+    shape_covariance: np.ndarray,
+    length: tuple[float, float],
+    mass_per_area: FieldLike | None = None,
+    edges: Mapping[str, str] | None = None,
+    level: float = 0.95,
+    seed: int | np.random.Generator = 0,
+) -> Bands:
+    """Confidence bands of the eigenfunctions that `surface_eigenfunctions` draws, at places (n_points, 2), m.
+
+    With values v, φ = W v / √q and q = vᵀ M v, an error dv and the interpolation error e move it by
+    W dv / √q + e / √q - φ [vᵀ M dv + ∫∫ m W v e dA] / q, as along an interval (`eigenfunction_bands`).
+
+    Args:
+        sampled, places, length, mass_per_area, edges: as `surface_eigenfunctions` takes them.
+        shape_covariance: (n_modes, n_outputs, n_outputs) of the real parts of the shapes.
+        level: between 0 and 1.
+        seed: of the draws that set the width of the band of the whole surface.
+
+    Raises:
+        ValueError: a level outside 0..1; as `surface_eigenfunctions`.
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
+    spline, scaled = _scaled(sampled, places, length, mass_per_area, edges)
+    at, rng = spline.domain.locate(at), np.random.default_rng(seed)
+    x, weights = _weighed(spline.domain, mass_per_area)
+    along, inside = spline.matrix(at), spline.matrix(x)
+    root = _root(spline.error(np.vstack([at, x])))
+    phi, std, interpolation = (np.zeros((len(at), sampled.n_modes)) for _ in range(3))
+    width = np.zeros(sampled.n_modes)
+    values = normalised_shapes(sampled.shapes).real
+    for r in range(sampled.n_modes):
+        factor = scaled[:, r] @ values[:, r] / (values[:, r] @ values[:, r])  # 1 / √q
+        own = shape_covariance[r] * factor**2
+        phi[:, r] = along @ scaled[:, r]
+        weighing = (weights * (inside @ scaled[:, r])) @ inside
+        noise = (along - np.outer(phi[:, r], weighing)) @ _root(own)
+        rough = spline.roughness(scaled[:, r], own)
+        missed = root[: len(at)] - np.outer(phi[:, r], (weights * (inside @ scaled[:, r])) @ root[len(at) :])
+        missed = np.sqrt(rough) * missed
+        interpolation[:, r] = np.linalg.norm(missed, axis=1)
+        both = np.hstack([noise, missed])
+        std[:, r] = np.linalg.norm(both, axis=1)
+        unsure = std[:, r] > HELD * std[:, r].max()
+        if unsure.any():
+            drawn = (both[unsure] / std[unsure, r, None]) @ rng.standard_normal((both.shape[1], DRAWS))
+            width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
+    return Bands(frozen(at), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)
+
+
+def _scaled(
+    sampled: SampledModes,
+    places: np.ndarray,
+    length: tuple[float, float],
+    mass_per_area: FieldLike | None,
+    edges: Mapping[str, str] | None,
+) -> tuple[SurfaceSpline, np.ndarray]:
+    """The spline, and values (n_outputs, n_modes) at the sensors that it makes mass-normalised shapes of."""
+    if np.shape(places) != (sampled.shapes.shape[0], 2):
+        raise ValueError(
+            f"places of the sensors must have shape ({sampled.shapes.shape[0]}, 2), m; got {np.shape(places)}"
+        )
+    spline = SurfaceSpline(Rectangle(length), np.asarray(places, float), edges or {})
+    values = normalised_shapes(sampled.shapes).real
+    x, weights = _weighed(spline.domain, mass_per_area)
+    return spline, frozen(values / np.sqrt(weights @ (spline.matrix(x) @ values) ** 2))
+
+
+def _weighed(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.ndarray, np.ndarray]:
+    """Points of integration (n, 2), m, and the mass that each stands for."""
+    x, weights = domain.quadrature(QUADRATURE)
+    density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)
+    return x, weights * density(x[:, 0], x[:, 1])
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    """R with R Rᵀ the covariance, which rounding may have made slightly negative."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

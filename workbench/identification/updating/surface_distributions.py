@@ -1,0 +1,197 @@
+"""Mass and bending stiffness over a plate, from modes alone and the mass at a point (Ch. 4, in two dimensions).
+
+Modes are orthogonal with respect to the mass and to the strain energy, whatever their scale:
+
+    ∫∫ m φ_r φ_s dA = a_r² δ_rs,   ∫∫ D [φ_r, φ_s] dA = a_r² ω_r² δ_rs,
+    [φ_r, φ_s] = ½(1+ν) ∇²φ_r ∇²φ_s + ½(1-ν) (φ_r,xx - φ_r,yy)(φ_s,xx - φ_s,yy) + 2(1-ν) φ_r,xy φ_s,xy
+
+which are linear in m, D and a_r², as along an interval (`distributions`): the relations r ≠ s find the mass but for its
+size, all of them then the stiffness. No edge may do work: springs along edges and masses on the plate are not known.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+
+from workbench.identification.shapes.mode_pairing import subspace_mac
+from workbench.identification.updating.distributions import mass_series, stiffness_series
+from workbench.identification.updating.self_check import SelfCheck
+from workbench.structure.domain import Rectangle
+from workbench.structure.field import Field, FieldLike, as_field
+from workbench.structure.modes import Modes, frozen
+from workbench.structure.plate import Plate, bending_squares
+from workbench.structure.supports import Edge
+from workbench.threads import one_blas_thread
+
+QUADRATURE = 144  # modes that the points of integration would serve: what squares of second derivatives take
+PER_SIDE = 21  # points each way where shapes are compared
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceBasis:
+    """Known functions over a rectangle whose sum, with coefficients to be found, is a distribution.
+
+    Attributes:
+        functions: x, y (n_points,) each -> (n_points, n_terms).
+        n_terms: how many.
+    """
+
+    functions: Callable[[np.ndarray, np.ndarray], np.ndarray] = field(repr=False)
+    n_terms: int
+
+    @classmethod
+    def legendre(cls, n_x: int, n_y: int, *, length: tuple[float, float]) -> "SurfaceBasis":
+        """Products of Legendre polynomials, n_x along x and n_y along y, each from edge to edge."""
+        a, b = length
+
+        def functions(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+            along_x = legvander(2.0 * np.asarray(x, float) / a - 1.0, n_x - 1)
+            along_y = legvander(2.0 * np.asarray(y, float) / b - 1.0, n_y - 1)
+            return np.asarray(np.einsum("pi,pj->pij", along_x, along_y).reshape(len(along_x), -1))
+
+        return cls(functions, n_x * n_y)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceDistribution:
+    """An identified mass or stiffness over a plate: a prior estimate (zero if none) plus a series.
+
+    Attributes:
+        coefficients: (n_terms,).
+        basis: the functions they multiply.
+        prior: m_0 or D_0.
+        misfit: root mean square of the relations left over, relative to the terms in them; 0 for a perfect fit.
+    """
+
+    coefficients: np.ndarray
+    basis: SurfaceBasis
+    prior: Field
+    misfit: float
+
+    def __call__(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Values at (x, y), in the shape that x and y have together."""
+        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        series = self.basis.functions(x.ravel(), y.ravel()) @ self.coefficients
+        return np.asarray(self.prior(x, y) + series.reshape(x.shape))
+
+    @property
+    def field(self) -> Field:
+        """The same as a `Field`, to build a plate with."""
+        return Field(self.__call__, self.prior.x_breaks, self.prior.y_breaks)
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceDistributions:
+    """The mass and stiffness of one plate, and the scale of its modes found with them.
+
+    Attributes:
+        mass: kg/m².
+        stiffness: D, N m.
+        scales: (n_modes,) a_r = (∫∫ m φ_r² dA)^½; φ_r / a_r is mass-normalised.
+    """
+
+    mass: SurfaceDistribution
+    stiffness: SurfaceDistribution
+    scales: np.ndarray
+
+
+@one_blas_thread
+def plate_mass_and_stiffness(
+    modes: Modes,
+    *,
+    poisson_ratio: float,
+    mass_basis: SurfaceBasis,
+    stiffness_basis: SurfaceBasis,
+    known_mass: Sequence[tuple[tuple[float, float], float]],
+    prior_mass: FieldLike = 0.0,
+    prior_stiffness: FieldLike = 0.0,
+) -> SurfaceDistributions:
+    """Series for m(x, y) and D(x, y) from the orthogonality of modes of any scale over a rectangle.
+
+    Args:
+        modes: identified or computed; frequencies and shapes are used, and second derivatives of these.
+        poisson_ratio: ν.
+        mass_basis, stiffness_basis: functions of the series.
+        known_mass: (((x, y), kg/m²), ...), at least one place; held exactly.
+        prior_mass, prior_stiffness: first estimates, kg/m² and N m; the series then corrects them.
+
+    Raises:
+        ValueError: modes of another domain, no known mass, more terms than relations, known values that the series
+            cannot take, a mass so negative that a mode has no scale.
+    """
+    if not isinstance(modes.domain, Rectangle):
+        raise ValueError(f"m(x, y) and D(x, y) are those of a plate; these modes are on {modes.domain}")
+    prior_mass, prior_stiffness = as_field(prior_mass), as_field(prior_stiffness)
+    at, weights = modes.domain.quadrature(QUADRATURE)
+    x, y = at.T
+    shapes = modes.phi(at)
+    size = np.sqrt((shapes**2).mean(axis=0))
+    shapes = shapes / size
+    places = np.array([place for place, _ in known_mass], float).reshape(-1, 2)
+    values = np.array([value for _, value in known_mass], float)
+    if not values.size:
+        raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
+    coefficients, misfit = mass_series(
+        shapes,
+        weights,
+        mass_basis.functions(x, y),
+        prior_mass(x, y),
+        mass_basis.functions(*places.T),
+        values - prior_mass(*places.T),
+    )
+    mass = SurfaceDistribution(frozen(coefficients), mass_basis, prior_mass, misfit)
+    a_squared = (weights * mass(x, y)) @ shapes**2
+    if (a_squared <= 0).any():
+        raise ValueError(
+            "the identified mass is negative over so much of the plate that a mode has no positive scale; use fewer"
+            " terms, more sensors, or a prior estimate"
+        )
+    strains = [
+        (square.weight(x, y), sum(factor * modes.phi(at, (i, j)) for factor, i, j in square.parts) / size)
+        for square in bending_squares(Field.constant(1.0), poisson_ratio)
+    ]
+    coefficients, misfit = stiffness_series(
+        strains, weights, stiffness_basis.functions(x, y), prior_stiffness(x, y), a_squared, modes.omega
+    )
+    stiffness = SurfaceDistribution(frozen(coefficients), stiffness_basis, prior_stiffness, misfit)
+    return SurfaceDistributions(mass, stiffness, frozen(size * np.sqrt(a_squared)))
+
+
+@one_blas_thread
+def check_plate(
+    found: SurfaceDistributions,
+    measured: Modes,
+    *,
+    poisson_ratio: float,
+    edges: str | Edge | Mapping[str, str | Edge],
+    first_mode: int = 0,
+    tolerance: float = 1e-4,
+) -> SelfCheck:
+    """Solve the eigenproblem of what was identified and compare it with what was measured, as `self_check` does.
+
+    Args:
+        found: mass and stiffness.
+        measured: the modes that they were found from, consecutive.
+        poisson_ratio, edges: of the plate.
+        first_mode: index of the first measured mode among all modes of the plate; 3 leaves out rigid-body modes.
+        tolerance: of the frequencies of the eigenproblem.
+    """
+    assert isinstance(measured.domain, Rectangle)
+    n = measured.n_modes
+    try:
+        plate = Plate(
+            length=measured.domain.length,
+            mass_per_area=found.mass.field,
+            bending_stiffness=found.stiffness.field,
+            poisson_ratio=poisson_ratio,
+            edges=edges,
+        )
+        again = plate.modes(first_mode + n, tolerance=tolerance).select(slice(first_mode, None))
+    except ValueError as error:
+        return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
+    share = np.linspace(0.0, 1.0, PER_SIDE)
+    grid = np.stack(np.meshgrid(*(side * share for side in measured.domain.length), indexing="ij"), axis=-1)
+    agreement = subspace_mac(measured.phi(grid.reshape(-1, 2)), again.phi(grid.reshape(-1, 2)), again.omega)
+    return SelfCheck(again.omega / measured.omega - 1.0, np.diag(agreement))
