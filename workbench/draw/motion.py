@@ -1,18 +1,23 @@
-"""Motion as plain numbers, for a page to move: shapes along the structure and modal coordinates over time."""
+"""Motion as plain numbers, for a page to move: shapes along a structure, over a plate or of a frame, and over time."""
 
-from collections.abc import Mapping, Sequence
-from typing import cast
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
 from workbench.design.loop.closed_loop import Response
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
+from workbench.structure.domain import ROTATIONS, TRANSLATIONS, Between, Domain, Interval, NamedPoints, Rectangle
 from workbench.structure.modes import Modes, SampledModes
 
 N_PLACES = 161
 MOST_FRAMES = 600
 SHOWN_SECONDS = 12.0
+PER_SIDE = 19  # lines of a plate's net along the longer side
+MOST_NODES = 400  # of a frame, that are drawn
+SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 
 def response_motion(
@@ -58,8 +63,17 @@ def mode_motion(
 ) -> dict:
     """Mode shapes in motion, one mode at a time; several sets of modes over each other, each scaled to one.
 
-    Sampled modes are shown at their sensors, with the phase that each sensor has.
+    Sampled modes are shown at their sensors, with the phase that each sensor has. A plate is a net of lines and a frame
+    its nodes, neighbours joined, as both are seen from above the front; a plane frame from the front.
+
+    Raises:
+        ValueError: modes at named points without positions.
     """
+    first = next(iter(modes.values()))
+    if isinstance(first, Modes) and not isinstance(first.domain, Interval):
+        return _net_motion(
+            {name: found for name, found in modes.items() if isinstance(found, Modes)}, actuators, sensors
+        )
     tracks: list[dict] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
@@ -88,6 +102,114 @@ def mode_motion(
             }
         )
     return {"kind": "modes", "x": tracks[0]["x"], "tracks": tracks, **_places(actuators, sensors)}
+
+
+def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict:
+    first = next(iter(modes.values()))
+    spots = _plate_net(first.domain) if isinstance(first.domain, Rectangle) else _frame_net(first.domain)
+    size = np.ptp(spots.rest, axis=0).max()
+    tracks: list[dict] = []
+    for name, found in modes.items():
+        moves = spots.moves(found)
+        moves = moves * SWAY * size / np.maximum(np.abs(moves).max(axis=(0, 1)), 1e-300)
+        if tracks:  # two sets of modes move together, whatever the sign of each
+            n = min(moves.shape[2], len(tracks[0]["moves"]))
+            other = np.moveaxis(np.array(tracks[0]["moves"])[:n], 0, 2)
+            moves[:, :, :n] *= np.where((moves[:, :, :n] * other).sum(axis=(0, 1)) < 0, -1.0, 1.0)
+        tracks.append(
+            {
+                "label": name,
+                "moves": _numbers(np.moveaxis(moves, 2, 0)),
+                "frequencies_hz": _numbers(found.frequencies_hz),
+                "damping": _numbers(found.zeta),
+            }
+        )
+    net = {"rest": _numbers(spots.rest), "lines": spots.lines}
+    marked = {
+        key: [
+            {"name": part.name, "at": _numbers(spots.at(part.at))} for part in parts if not isinstance(part.at, Between)
+        ]
+        for key, parts in (("actuators", actuators), ("sensors", sensors))
+    }
+    return {"kind": "modes", "net": net, "tracks": tracks, **marked}
+
+
+@dataclass(frozen=True, eq=False)
+class _Net:
+    """Spots of a structure as a page shows them.
+
+    Attributes:
+        rest: (n_spots, 2) at rest, m, as they are seen.
+        lines: pairs of spots that are joined.
+        moves: modes -> (n_spots, 2, n_modes) displacements as they are seen.
+        at: place -> (2,) where it is seen.
+    """
+
+    rest: np.ndarray
+    lines: list[list[int]]
+    moves: Callable[[Modes], np.ndarray]
+    at: Callable[[Any], np.ndarray]
+
+
+def _seen(at: np.ndarray) -> np.ndarray:
+    """(..., 3) as (..., 2): x to the right, z up, y away from the eye."""
+    return np.asarray(np.stack([at[..., 0] + 0.4 * at[..., 1], at[..., 2] + 0.45 * at[..., 1]], axis=-1))
+
+
+def _front(at: np.ndarray) -> np.ndarray:
+    """(..., 3) as (..., 2): x to the right, y up."""
+    return at[..., :2]
+
+
+def _plate_net(domain: Rectangle) -> _Net:
+    sides = domain.length
+    n, m = (max(round(PER_SIDE * side / max(sides)), 6) for side in sides)
+    x, y = (np.linspace(0.0, side, count) for side, count in zip(sides, (n, m), strict=True))
+    places = np.column_stack([np.repeat(x, m), np.tile(y, n)])
+    lines = [[i * m + j, i * m + j + 1] for i in range(n) for j in range(m - 1)]
+    lines += [[i * m + j, i * m + j + m] for i in range(n - 1) for j in range(m)]
+    flat = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+    def moves(modes: Modes) -> np.ndarray:
+        up = modes.phi(places)
+        return np.stack([np.zeros_like(up), up], axis=1)
+
+    return _Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place) @ flat))
+
+
+def _frame_net(domain: Domain) -> _Net:
+    if not isinstance(domain, NamedPoints) or domain.positions is None:
+        raise ValueError("shapes at named points are drawn where their positions are known; give positions")
+    names = list(dict.fromkeys(domain.nodes))
+    names = names[:: -(-len(names) // MOST_NODES)]
+    nodes = {node: i for i, node in enumerate(names)}
+    first = {node: i for i, node in reversed(list(enumerate(domain.nodes)))}
+    at = domain.positions[[first[node] for node in names]]
+    planar = np.ptp(at[:, 2]) == 0 and "z" not in domain.directions
+    see = _front if planar else _seen
+
+    def moves(modes: Modes) -> np.ndarray:
+        shapes = modes.phi(list(domain.names))
+        found = np.zeros((len(nodes), modes.n_modes, 3))
+        for node, direction, shape in zip(domain.nodes, domain.directions, shapes, strict=True):
+            if node in nodes and direction not in ROTATIONS:  # of what moves in no known direction, up
+                found[nodes[node], :, TRANSLATIONS.index(direction) if direction else 1 if planar else 2] = shape
+        return np.moveaxis(see(found), 2, 1)
+
+    def spot(place: Any) -> np.ndarray:
+        return see(np.asarray(domain.positions)[domain.locate(place)[0]])
+
+    return _Net(see(at), _neighbours(at), moves, spot)
+
+
+def _neighbours(at: np.ndarray) -> list[list[int]]:
+    """Pairs of points that no other point is nearer to both of (the relative neighbourhood graph; Toussaint 1980)."""
+    distance = np.linalg.norm(at[:, None] - at, axis=2)
+    pairs = []
+    for i in range(len(at)):
+        between = (np.maximum(distance[i], distance) < distance[i][:, None] * (1.0 - 1e-9)).any(axis=1)
+        pairs += [[i, int(j)] for j in np.flatnonzero(~between) if j > i]
+    return pairs
 
 
 def _places(actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict:

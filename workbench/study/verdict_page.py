@@ -15,7 +15,7 @@ from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval
+from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 from workbench.study.page import Story, block, to_its_error, write_page
 
@@ -129,8 +129,10 @@ def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
 
 
 def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict]:
-    """A block of modes that move, where they are known all along a structure; none elsewhere."""
-    if rig.structure is None or not isinstance(rig.modes.domain, Interval):
+    """A block of modes that move, where they are known all over a structure or at points with positions."""
+    domain = rig.modes.domain
+    placed = isinstance(domain, NamedPoints) and domain.positions is not None and len(set(domain.nodes)) > 2
+    if not placed and (rig.structure is None or isinstance(domain, NamedPoints)):
         return []
     return [block(mode_motion(modes, actuators=rig.actuators, sensors=rig.sensors), MOVING)]
 

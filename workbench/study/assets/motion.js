@@ -50,8 +50,40 @@ workbench.move = function (root, spec) {
   if (!modes) reach = largest();
 
   var X, Y, height = 240;
+  // a net: spots of a plate or a frame, moved in the plane of the picture
+  var net = spec.net;
+  function spun(track, phase) {
+    var c = Math.cos(phase), moves = track.moves[mode];
+    return moves ? net.rest.map(function (p, i) { return [p[0] + c * moves[i][0], p[1] + c * moves[i][1]]; }) : null;
+  }
+  function joined(spots) {
+    return net.lines.map(function (l) { return "M" + X(spots[l[0]][0]).toFixed(1) + "," + Y(spots[l[0]][1]).toFixed(1) + "L" + X(spots[l[1]][0]).toFixed(1) + "," + Y(spots[l[1]][1]).toFixed(1); }).join("");
+  }
+  function drawnNet(width) {
+    var u = net.rest.map(function (p) { return p[0]; }), v = net.rest.map(function (p) { return p[1]; });
+    var low = [Math.min.apply(null, u), Math.min.apply(null, v)], high = [Math.max.apply(null, u), Math.max.apply(null, v)];
+    var margin = 0.18 * Math.max(high[0] - low[0], high[1] - low[1]);
+    height = Math.max(200, Math.min(380, width * (high[1] - low[1] + 2 * margin) / (high[0] - low[0] + 2 * margin)));
+    var unit = Math.min(width / (high[0] - low[0] + 2 * margin), height / (high[1] - low[1] + 2 * margin));
+    X = function (x) { return 0.5 * width + unit * (x - 0.5 * (low[0] + high[0])); };
+    Y = function (y) { return 0.5 * height - unit * (y - 0.5 * (low[1] + high[1])); };
+    picture.setAttribute("viewBox", "0 0 " + width + " " + height);
+    picture.setAttribute("height", height);
+    svg("path", { d: joined(net.rest), fill: "none", stroke: "var(--line)", "stroke-width": 1 }, picture);
+    tracks.forEach(function (t) { t.line = svg("path", { class: "track", fill: "none", stroke: t.colour, "stroke-width": 1.6 }, picture); });
+    (spec.sensors || []).forEach(function (s) {
+      svg("title", {}, svg("circle", { cx: X(s.at[0]), cy: Y(s.at[1]), r: 3.5, fill: "var(--paper)", stroke: "var(--ink)" }, picture), "sensor " + s.name);
+    });
+    (spec.actuators || []).forEach(function (a) {
+      var g = svg("g", { transform: "translate(" + X(a.at[0]) + "," + (Y(a.at[1]) + 9) + ")" }, picture);
+      svg("path", { d: "M0,-9L6,3H-6Z", fill: "var(--bad)" }, g);
+      svg("title", {}, g, "actuator " + a.name);
+    });
+    show();
+  }
   function measure() {
     var width = picture.clientWidth || 600;
+    if (net) { while (picture.firstChild) picture.removeChild(picture.firstChild); drawnNet(width); return; }
     height = Math.max(170, Math.min(270, 0.36 * width));
     picture.setAttribute("viewBox", "0 0 " + width + " " + height);
     picture.setAttribute("height", height);
@@ -82,7 +114,14 @@ workbench.move = function (root, spec) {
   function show() {
     if (!X) return;
     var frame = modes ? 0 : Math.round((clock % spec.seconds) / spec.seconds * (spec.time.length - 1)), words = [];
-    tracks.forEach(function (t) {
+    if (net) tracks.forEach(function (t) {
+      var spots = spun(t.spec, Math.PI * clock);
+      t.line.setAttribute("visibility", t.on && spots ? "visible" : "hidden");
+      if (!spots) return;
+      t.line.setAttribute("d", joined(spots));
+      words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " Hz, ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
+    });
+    else tracks.forEach(function (t) {
       var x = t.spec.x || spec.x, w = modes ? swung(t.spec, Math.PI * clock) : displaced(t.spec, frame);
       t.line.setAttribute("visibility", t.on && w ? "visible" : "hidden");
       t.ghost.setAttribute("visibility", modes && t.on && w ? "visible" : "hidden");

@@ -1,0 +1,48 @@
+"""What a page moves: nets of plates and frames, whose spots move as the modes say."""
+
+import numpy as np
+import pytest
+
+from workbench.draw.motion import SWAY, mode_motion
+from workbench.rig.actuators import Actuator
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
+from workbench.structure.plate import Plate
+
+
+def test_a_plate_is_a_net_that_moves_up_and_down_as_its_modes():
+    plate = Plate(length=(2.0, 1.0), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="clamped")
+    modes = plate.modes(2)
+    shown = mode_motion({"nominal": modes}, actuators=[Actuator("F", (1.0, 0.0))])
+    rest, moves = np.array(shown["net"]["rest"]), np.array(shown["tracks"][0]["moves"])
+    assert moves.shape == (2, len(rest), 2) and (moves[..., 0] == 0).all()
+    # what lies at the front is seen where it is, and the back rises to the right
+    assert shown["actuators"] == [{"name": "F", "at": [1.0, 0.0]}]
+    assert rest.min(axis=0) == pytest.approx([0.0, 0.0]) and rest.max(axis=0) == pytest.approx([2.4, 0.45])
+    # the second mode of a long plate has a node half way along, and the larger sway of each is the same
+    half = np.abs(rest[:, 0] - 0.4 * rest[:, 1] / 0.45 - 1.0) < 1e-6
+    assert half.any() and np.abs(moves[1, half, 1]).max() < 1e-3 * np.abs(moves[1]).max()
+    assert np.abs(moves).max(axis=(1, 2)) == pytest.approx([SWAY * 2.4] * 2, rel=1e-4)
+
+
+def test_a_frame_moves_each_node_in_its_directions_and_closes_its_loop():
+    # a square of four nodes, the last without a direction y
+    corners = {"a": (0, 0, 0), "b": (1, 0, 0), "c": (1, 1, 0), "d": (0, 1, 0)}
+    named = [(n, d) for n in "abc" for d in "xy"] + [("d", "x")]
+    points = NamedPoints(
+        tuple(f"{n}.{d}" for n, d in named),
+        np.array([corners[n] for n, _ in named], float),
+        tuple(d for _, d in named),
+        tuple(n for n, _ in named),
+    )
+    shapes = np.array([[0, 0, 0, 0, 1.0, 0.5, 1.0]]).T
+    modes = Modes([10.0], [0.01], PointShapes(shapes), points)
+    opposite = Modes([11.0], [0.01], PointShapes(-shapes), points)
+    shown = mode_motion({"nominal": modes, "corrected": opposite})
+    assert sorted(shown["net"]["lines"]) == [[0, 1], [0, 3], [1, 2], [2, 3]]
+    moves = np.array(shown["tracks"][0]["moves"])[0]
+    np.testing.assert_allclose(moves, SWAY * np.array([[0, 0], [0, 0], [1, 0.5], [1, 0]]), atol=1e-6)
+    # two sets of modes move together, whatever the sign of each
+    np.testing.assert_allclose(np.array(shown["tracks"][1]["moves"])[0], moves)
+    with pytest.raises(ValueError, match="positions are known"):
+        mode_motion({"nominal": Modes([10.0], [0.01], PointShapes([[1.0], [2.0]]), NamedPoints(("p", "q")))})
