@@ -2,8 +2,6 @@
 
 from collections.abc import Callable, Sequence
 
-from threadpoolctl import threadpool_limits
-
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -20,6 +18,7 @@ from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, opened
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
+from workbench.threads import one_blas_thread
 
 RIVAL = 0.01  # probability from which a rival is worth an experiment
 TOLERANCE = 0.01  # of the signal: a gap that is worth no cause
@@ -27,6 +26,7 @@ HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left be
 BESIDE_ERRORS = 0.8  # likewise where the model itself is a little off: 4 % of the gap's power may be left
 
 
+@one_blas_thread
 def diagnose(
     rig: Rig,
     records: Sequence[Record],
@@ -71,44 +71,40 @@ def diagnose(
     check_kept_apart(records, validation)
     faults = () if settle else wiring(rig, records)
     sharing = Workers.at_hand() if workers is None else Workers(workers)
-    # the threads of the search and those of the linear algebra would wait for one another
-    with threadpool_limits(1, user_api="blas"):
-        report("looking for the missing force", 0.02)
-        found = opened(rig, records, settle=settle, workers=sharing)
-        nominal = found.nominal
-        with (
-            sharing.aside(lambda: placed(nominal.without(_faulty(found.seen)))) as place,
-            sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
-        ):
-            attribution = attribute(
-                found, catalogue=catalogue, report=report, free_nominal=free_nominal, tolerance=tolerance
-            )
-            corrected = apply_all(rig, attribution.best.effects)
-            shrinkage = measure(rig, corrected, validation, settle=settle)
-            outcome = _outcome(attribution, shrinkage)
-            errors = next((e for e in attribution.best.effects if e.kind is NOMINAL_ERRORS), None)
-            named = tuple(e for e in attribution.best.effects if e is not errors)
-            effects = named if outcome in ("none", "explained") else ()
-            faulty = _faulty(attribution.best.effects)
-            as_seen = faulty == _faulty(found.seen)
-            budget = budget_of(
-                rig, effects, errors, validation or records, noise_found=attribution.noise, settle=settle
-            )
-            return Verdict(
-                case=name,
-                outcome=outcome,
-                effects=attribution.best.effects,
-                alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in attribution.rivals),
-                where=locate(nominal, effects, place() if as_seen else placed(nominal.without(faulty))),
-                shrinkage=shrinkage,
-                corrected=corrected,
-                nominal=rig,
-                attribution=attribution,
-                readiness=ready(),
-                budget=budget,
-                experiment=_next(rig, attribution, sharing),
-                notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome, budget)),
-            )
+    report("looking for the missing force", 0.02)
+    found = opened(rig, records, settle=settle, workers=sharing)
+    nominal = found.nominal
+    with (
+        sharing.aside(lambda: placed(nominal.without(_faulty(found.seen)))) as place,
+        sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
+    ):
+        attribution = attribute(
+            found, catalogue=catalogue, report=report, free_nominal=free_nominal, tolerance=tolerance
+        )
+        corrected = apply_all(rig, attribution.best.effects)
+        shrinkage = measure(rig, corrected, validation, settle=settle)
+        outcome = _outcome(attribution, shrinkage)
+        errors = next((e for e in attribution.best.effects if e.kind is NOMINAL_ERRORS), None)
+        named = tuple(e for e in attribution.best.effects if e is not errors)
+        effects = named if outcome in ("none", "explained") else ()
+        faulty = _faulty(attribution.best.effects)
+        as_seen = faulty == _faulty(found.seen)
+        budget = budget_of(rig, effects, errors, validation or records, noise_found=attribution.noise, settle=settle)
+        return Verdict(
+            case=name,
+            outcome=outcome,
+            effects=attribution.best.effects,
+            alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in attribution.rivals),
+            where=locate(nominal, effects, place() if as_seen else placed(nominal.without(faulty))),
+            shrinkage=shrinkage,
+            corrected=corrected,
+            nominal=rig,
+            attribution=attribution,
+            readiness=ready(),
+            budget=budget,
+            experiment=_next(rig, attribution, sharing),
+            notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome, budget)),
+        )
 
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:

@@ -179,6 +179,12 @@ class Effect:
             if p.neutral is not None
         )
 
+    def stands_out(self, rig: Rig) -> bool:
+        """Whether any number is; true of an effect without such numbers, and of errors of the nominal model."""
+        tested = [p for p in self.parameters(rig) if p.neutral is not None and self.deviations.get(p.name, 0.0) > 0]
+        off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
+        return off or not tested or self.kind.first
+
     def stated(self, rig: Rig) -> dict[str, Any]:
         """The numbers that a verdict states, by name."""
         return self.numbers if self.kind.numbers is None else self.kind.numbers(self, rig)

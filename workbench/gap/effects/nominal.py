@@ -106,8 +106,9 @@ def _off_profiles(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Ri
     stiffness, mass = _numbered(values, "stiffness"), _numbered(values, "mass")
     structure, modes = rig.structure, rig.modes
     if not isinstance(structure, Structure):
-        factor = float(np.exp(-0.5 * mass[0])) if mass.any() else 1.0
-        return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, factor))) if mass.any() else rig
+        if not mass.any():
+            return rig
+        return replace(rig, modes=replace(modes, shapes=_scaled(modes.shapes, float(np.exp(-0.5 * mass[0])))))
     profiles = {stiffness_name(structure): stiffness, "mass_per_length": mass}
     changed: dict[str, Any] = {
         name: _varied(getattr(structure, name), amplitudes, structure.length)

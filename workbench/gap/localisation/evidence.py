@@ -80,9 +80,7 @@ class Evidence:
     def of(cls, rig: Rig, data: FitData, n_places: int = PLACES, workers: Workers = ALONE) -> "Evidence":
         """Simulate the rig on the fit records."""
         motions = data.motions(rig)
-        predictions = data.predictions(rig)
-        residuals = tuple(r.outputs - p for r, p in zip(data.counted, predictions, strict=True))
-        return cls(rig, data, motions, residuals, n_places, workers=workers)
+        return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers)
 
     def without(self, names: Collection[str]) -> "Evidence":
         """The same evidence without some of the sensors; with all of them where none would be left."""

@@ -148,12 +148,12 @@ class FitData:
         if self.whitener is not None:
             return np.concatenate([whiten(self.whitener, r).ravel() for r in self.left_beside(rig, follower)])
         if follower is None:
-            return np.concatenate([(r / self.noise[:, None]).ravel() for r in self._whole(rig)])
+            return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
         if is_stepped(rig) or steps_exactly(rig):
             substeps = self.substeps if is_stepped(rig) else 1
             ahead = [follower.errors(rig, record, substeps) for record in self.records]
         else:
-            dt, whole = self.records[0].sample_time, self._from_the_first_sample._whole(rig)
+            dt, whole = self.records[0].sample_time, self._from_the_first_sample.differences(rig)
             ahead = [follower.errors_of_linear(rig, left, dt, self.substeps) for left in whole]
         return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
 
@@ -164,10 +164,11 @@ class FitData:
     def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
         """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
         if follower is None or not is_stepped(rig) or rig.stiffness_rate:
-            return self._whole(rig)
+            return self.differences(rig)
         return [follower.left(rig, record, self.substeps)[:, self.lead :] for record in self.records]
 
-    def _whole(self, rig: Rig) -> list[np.ndarray]:
+    def differences(self, rig: Rig) -> list[np.ndarray]:
+        """Measured less predicted on whole records (n_outputs, n_samples), one a record, in the sensors' units."""
         both = zip(self.counted, self.predictions(rig), strict=True)
         return [record.outputs - prediction for record, prediction in both]
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -29,6 +28,7 @@ from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
+from workbench.threads import one_blas_thread
 
 FINALISTS = 8  # single effects that are fitted to whole records
 BRIEFLY = 2  # iterations, where there may be no effect at all
@@ -80,8 +80,7 @@ class Attribution:
         def on_all(candidate: Fit) -> Fit:
             return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ALIKE)
 
-        with threadpool_limits(1, user_api="blas"):
-            fitted = self.search.workers.map(on_all, others)
+        fitted = one_blas_thread(self.search.workers.map)(on_all, others)
         return tuple(sorted((*self.tried, *fitted), key=lambda f: f.cost))
 
 
@@ -193,9 +192,11 @@ def attribute(
     if random is None:
         best = with_intervals(search.rig, best, search.data, workers)
         if outcome == "explained":
-            standing = tuple(e for e in best.effects if e in seen or _stands_out(e, search.rig))
+            standing = tuple(e for e in best.effects if e in seen or e.stands_out(search.rig))
             best = best.only(search.rig, standing)
             outcome = outcome if any(not e.kind.first for e in standing) else "none"
+    if noise is None:
+        noise = noise_of(search, best) if random is None else search.data.noise
     report("done", 1.0)
     return Attribution(
         outcome=outcome,
@@ -207,7 +208,7 @@ def attribute(
         ahead=tuple(ahead),
         evidence=found.nominal,
         search=search,
-        noise=noise_of(search, best) if noise is None and random is None else _stated(search, noise),
+        noise=noise,
     )
 
 
@@ -221,23 +222,9 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
     return tolerance > 0
 
 
-def _stated(search: Search, noise: np.ndarray | None) -> np.ndarray:
-    return search.data.noise if noise is None else noise
-
-
-def _stands_out(effect: Effect, rig: Rig) -> bool:
-    """Whether any number of an effect is farther from where it changes nothing than its standard deviation."""
-    if effect.kind.first:
-        return True
-    tested = [p for p in effect.parameters(rig) if p.neutral is not None and effect.deviations.get(p.name, 0.0) > 0]
-    return not tested or any(abs(effect.values[p.name] - p.neutral) > effect.deviations[p.name] for p in tested)
-
-
 def noise_of(search: Search, best: Fit) -> np.ndarray:
     """Standard deviation of each sensor's noise (n_outputs,), by what a set leaves."""
-    rig = apply_all(search.rig, best.effects)
-    both = zip(search.data.counted, search.data.predictions(rig), strict=True)
-    return noise_found([record.outputs - predicted for record, predicted in both])
+    return noise_found(search.data.differences(apply_all(search.rig, best.effects)))
 
 
 def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:

@@ -202,12 +202,7 @@ def fit_jointly(
         )
         *effects, errors = found.effects
         errors = _resized(errors)
-    residuals = [
-        record.outputs - predicted
-        for record, predicted in zip(
-            whole.counted, whole.predictions(apply_all(search.rig, (*effects, errors))), strict=True
-        )
-    ]
+    residuals = whole.differences(apply_all(search.rig, (*effects, errors)))
     by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
     step = replace(found, effects=(*effects, errors), cost=float(by_channel.mean()), cost_by_channel=by_channel)
     sensor_noise = np.minimum(noise_found(residuals) / whole.noise, SETTINGS.credible) ** 2
