@@ -81,7 +81,8 @@ class BetweenSamples:
         n_intervals = self.start.shape[2]
         back = delay / self.sample_time
         whole = int(np.ceil(round(back, 9)))
-        within = self.sample_time * (whole - back)
+        ahead = round(whole - back, 9)  # a span of next to nothing would be divided by
+        within = self.sample_time * ahead
         interval = np.arange(n_intervals) - whole
         read = self._at(order, shape, within)[np.clip(interval, 0, n_intervals - 1)]
         early = np.flatnonzero(interval < 0)

@@ -18,6 +18,7 @@ FEW = 9  # cosines that may be as large as one another; of more, those beyond SM
 SMOOTH = 3  # as those of any function do that has a slope at its ends
 PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
 MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
+JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a jump
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
 
 
@@ -31,6 +32,8 @@ class NominalPrior:
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
         sample_time: s.
+        late, early: names of the sensors whose delay is positive, or at most zero: where inputs are held, acceleration
+            jumps at each sample, and no small step leads from one side to the other.
         waves: cosines of a smooth variation along the structure, the constant among them.
     """
 
@@ -40,6 +43,8 @@ class NominalPrior:
     damping: float = 0.0
     delay: float = 0.0
     sample_time: float = 1.0
+    late: tuple[str, ...] = ()
+    early: tuple[str, ...] = ()
     waves: int = 9
 
     @property
@@ -68,9 +73,10 @@ def _parameters(rig: Rig, prior: NominalPrior) -> tuple[Parameter, ...]:
 
 
 def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
-    def believed(name: str, std: float, unit: float, most: float = np.inf) -> Parameter:
-        reach, unit = min(WIDEST * max(std, unit), most), unit * weight_of(name, prior)
-        return Parameter(name, "", -reach, reach, scale=unit, prior_std=max(std * weight_of(name, prior) / unit, 1e-6))
+    def believed(name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf) -> Parameter:
+        reach, unit = WIDEST * max(std, unit), unit * weight_of(name, prior)
+        prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
+        return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std)
 
     along = isinstance(rig.structure, Structure)
     waves = prior.waves if along else 1
@@ -84,7 +90,10 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
     if prior.damping:
         yield from (believed(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
     if prior.delay:
-        yield from (believed(f"delay_{s.name}", prior.delay, DELAY_UNIT, MOST_AHEAD) for s in rig.sensors)
+        for sensor in rig.sensors:
+            low = JUST_LATE if sensor.name in prior.late else -MOST_AHEAD
+            high = 0.0 if sensor.name in prior.early else MOST_AHEAD
+            yield believed(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high)
 
 
 def _varied(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
@@ -171,7 +180,8 @@ def nominal_errors(rig: Rig, prior: NominalPrior, start: Mapping[str, float] | N
         start: errors to start from; all others are zero.
     """
     start = {} if start is None else start
-    return Effect(NOMINAL_ERRORS, prior, {p.name: start.get(p.name, 0.0) for p in _parameters(rig, prior)})
+    values = {p.name: float(np.clip(start.get(p.name, 0.0), p.low, p.high)) for p in _parameters(rig, prior)}
+    return Effect(NOMINAL_ERRORS, prior, values)
 
 
 NOMINAL_ERRORS = Kind(

@@ -31,8 +31,9 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
     under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
     # what is as strong in two records of unequal level is noise, of whatever colour
-    alike = whole[1] < ALIKE * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
-    return np.sqrt(np.where(alike | (under > LOUD * whole[0]), whole[0], under))
+    quiet = whole < ALIKE * whole[0]
+    noise = np.where(quiet, whole, 0.0).sum(axis=0) / quiet.sum(axis=0)
+    return np.sqrt(np.where((quiet.sum(axis=0) > 1) | (under > LOUD * whole[0]), noise, under))
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:

@@ -34,6 +34,7 @@ FINALISTS = 8  # single effects that are fitted to whole records
 BRIEFLY = 2  # iterations, where there may be no effect at all
 SHOWN = 7  # others that are, where they are to be shown beside them
 A_TENTH = 1.1**2 - 1.0  # of the noise by amplitude, as a share of its power
+VERY_NEAR = 0.01  # of the gap's power: what is left by an effect that explains all but louder noise
 ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
 
 
@@ -172,7 +173,7 @@ def attribute(
     if not seen and _is_small(found.nominal, tolerance):
         decision = Decision("none", start)
     elif free_nominal and not search.explains(start):
-        decision = _beside_nominal_errors(search)
+        decision = _beside_nominal_errors(search, tolerance)
     elif not search.explains(start) and not _of_one_sensor(start):
         decision, singles = decide_on_random(search, evidence)
     if decision is None:
@@ -184,7 +185,7 @@ def attribute(
         alone = decide(search, start, singles)
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
-        decision = decision or _with_a_second(search, start, singles, weighed, evidence)
+        decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
     outcome, best, random, rivals, noise = decision
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
@@ -249,10 +250,13 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
 
 
 def _with_a_second(
-    search: Search, start: Fit, singles: Sequence[Fit], weighed: Weighed, evidence: Evidence
+    search: Search, start: Fit, singles: Sequence[Fit], weighed: Weighed, evidence: Evidence, tolerance: float
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
-    beside = Stepwise(search)
+    beside = Stepwise(search, tolerance)
+    alone = _by_noise_found(search, start, singles, beside)
+    if alone is not None:
+        return alone
     if beside.is_enough:
         return beside.decision()
     if beside.last.fit.cost < min(f.cost for f in (start, *singles)):
@@ -260,6 +264,8 @@ def _with_a_second(
         decision = beside.decision()
         if decision.outcome == "explained":
             return decision
+        if decision.outcome == "none" and np.median(beside.last.sensor_noise) > 1.0 + A_TENTH:
+            return decision  # no pair leaves less than the noise, which is louder than stated
     law = one_law(search, evidence)
     pairs = Pairs(search)
     explained = pairs.at_once(weighed)
@@ -275,8 +281,31 @@ def _with_a_second(
     return decision
 
 
-def _beside_nominal_errors(search: Search) -> Decision:
+def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:
+    """A single effect that leaves only noise, where noise is louder than stated; None where none does.
+
+    One effect says the same with fewer numbers than errors of the nominal model that stand in for it.
+    """
+    stated, best = search.data.noise, singles[0] if singles else start
+    under_errors = np.sqrt(beside.last.sensor_noise) * stated
+    noise = np.clip(noise_of(search, best), stated, (1.0 + A_TENTH) ** 0.5 * under_errors)
+    if np.median(noise / stated) ** 2 < 1.0 + A_TENTH:
+        return None
+    louder = search.with_noise(noise)
+
+    def heard(candidate: Fit) -> Fit:
+        by_channel = candidate.cost_by_channel * (stated / noise) ** 2
+        return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
+
+    hopeful = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, VERY_NEAR)]
+    decision = decide(louder, heard(start), hopeful) if hopeful else None
+    if decision is None or decision.outcome != "explained":
+        return None
+    return decision._replace(noise=noise)
+
+
+def _beside_nominal_errors(search: Search, tolerance: float) -> Decision:
     """What holds beside errors of the nominal model."""
-    beside = Stepwise(search)
+    beside = Stepwise(search, tolerance)
     beside.run()
     return beside.decision()

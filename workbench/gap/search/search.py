@@ -95,6 +95,12 @@ class Search:
         """Whether at most this share of the gap's power is left."""
         return candidate.cost - 1.0 < share * (self.nominal.mean() - 1.0)
 
+    def with_noise(self, noise: np.ndarray) -> "Search":
+        """The same search with other standard deviations of the sensors' noise (n_outputs,)."""
+        data, quick, first = (data.with_noise(noise) for data in (self.data, self.quick, self.first))
+        nominal = self.nominal * (self.data.noise / noise) ** 2
+        return replace(self, data=data, quick=quick, first=first, nominal=nominal)
+
     def through(self, whitener: ForceFilter, follower: Follower) -> "Search":
         """The same search beside a random force."""
         data, quick, first = (data.through(whitener, follower) for data in (self.data, self.quick, self.first))

@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import simpler_sets
-from workbench.gap.effects.nominal import NominalPrior, group_of, nominal_errors, weight_of
+from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import logging_noise, noise_found
@@ -34,7 +34,7 @@ class StepwiseSettings:
         last_waves: cosines of a variation in the last fit, so that intervals allow for what fewer cannot follow.
         narrowest: smallest, as a share of the widest: what is learnt to be none stays differentiable.
         rounds: of learning the sizes, at most.
-        settled: share of what is left that the next round must be likely to take away.
+        settled, last_settled: share of what is left that a round must have taken away for another; in the last fit.
         iterations, tolerance: of the fit in each round.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
         candidates: sets fitted on whole records at each step.
@@ -54,6 +54,7 @@ class StepwiseSettings:
         in_part: likewise, for effects that are named although something else is there.
         credible: times the stated noise that noise found may be; more is a gap.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
+        jump: times the power of the change over the span before a sample that the change after it has at a jump.
         damping, stiffness: common to all modes or all along, logarithm, from which on it is an effect of its own.
     """
 
@@ -78,6 +79,7 @@ class StepwiseSettings:
     narrowest: float = 1e-3
     rounds: int = 4
     settled: float = 0.02
+    last_settled: float = 1e-3
     iterations: int = 4
     tolerance: float = 1e-4
     last_iterations: int = 6
@@ -98,6 +100,7 @@ class StepwiseSettings:
     in_part: float = 0.2
     credible: float = 3.0
     no_gap: float = 0.15
+    jump: float = 10.0
     damping: float = 0.5
     stiffness: float = 0.05
 
@@ -177,8 +180,10 @@ def fit_jointly(
         to_the_end: until no step lowers the cost, by fine steps of time where a law needs them.
     """
     substeps = FINE if to_the_end else 4
-    if to_the_end and errors.target.waves < SETTINGS.last_waves:
-        errors = nominal_errors(search.rig, replace(errors.target, waves=SETTINGS.last_waves), errors.values)
+    if to_the_end:
+        errors = replace(errors, target=replace(errors.target, waves=SETTINGS.last_waves))
+    if known is None:
+        errors = _opened(search, errors)
     whole, before = search.data.stepped(substeps), np.inf
     for i in range(rounds):
         # the two most telling records lead the way
@@ -186,7 +191,7 @@ def fit_jointly(
         data = search.quick.stepped(substeps) if quickly else whole
         left = data.residual(apply_all(search.rig, (*effects, errors)))
         level = max(float(left @ left) / left.size, 1.0)
-        if level > (1.0 - SETTINGS.settled) * before and not to_the_end:
+        if level > (1.0 - (SETTINGS.last_settled if to_the_end else SETTINGS.settled)) * before:
             break
         before = level if known is not None or not quickly else np.inf
         tempered = data.with_noise(data.noise * np.sqrt(level))
@@ -198,12 +203,13 @@ def fit_jointly(
             tolerance=SETTINGS.last_tolerance if to_the_end else SETTINGS.tolerance,
             workers=search.workers,
             known=None if known is None else known / np.sqrt(level),
-            chord=not to_the_end,
+            chord=True,
         )
         *effects, errors = found.effects
         errors = _resized(errors)
     residuals = whole.differences(apply_all(search.rig, (*effects, errors)))
     by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+    errors = errors if to_the_end else _closed(errors)
     step = replace(found, effects=(*effects, errors), cost=float(by_channel.mean()), cost_by_channel=by_channel)
     sensor_noise = np.minimum(noise_found(residuals) / whole.noise, SETTINGS.credible) ** 2
     per_unit = search.logging_noise
@@ -229,6 +235,23 @@ def _resized(errors: Effect) -> Effect:
     return replace(errors, target=replace(prior, **sizes))
 
 
+def _closed(errors: Effect) -> Effect:
+    """The errors without the groups that were learnt to be none: what is not there costs no time."""
+    none = [g for g, widest in SETTINGS.widest if getattr(errors.target, g) <= 1.01 * SETTINGS.narrowest * widest]
+    none = [group for group in none if group != "delay" or not errors.target.late]
+    kept = {name: value for name, value in errors.values.items() if group_of(name) not in none}
+    deviations = {name: errors.deviations[name] for name in kept if name in errors.deviations}
+    target = replace(errors.target, **dict.fromkeys(none, 0.0))
+    return replace(errors, target=target, values=kept, deviations=deviations)
+
+
+def _opened(search: Search, errors: Effect) -> Effect:
+    """The errors with all groups, those that were closed at none and with the sizes they had before any record."""
+    before = prior_of(search)
+    closed = {g: getattr(before, g) for g, _ in SETTINGS.widest if not getattr(errors.target, g)}
+    return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
+
+
 def prior_of(search: Search) -> NominalPrior:
     """What a nominal model may be off by before any record is seen."""
     structured = isinstance(search.rig.structure, Structure)
@@ -242,18 +265,43 @@ def prior_of(search: Search) -> NominalPrior:
     )
 
 
+def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
+    """The errors with each accelerometer on that side of the jumps at the samples which the records show it to read."""
+    jumping = tuple(sensor.name for sensor in search.rig.sensors if sensor.quantity == "acceleration")
+    if not jumping or not errors.target.delay:
+        return errors
+    none = {**errors.values, **{f"delay_{name}": 0.0 for name in jumping}}
+
+    def left(delay: float) -> np.ndarray:
+        tried = nominal_errors(search.rig, replace(errors.target, late=(), early=()), none)
+        tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in jumping}})
+        return search.data.residual(apply_all(search.rig, (*effects, tried)))
+
+    before, at, after = (left(delay) for delay in (-JUST_LATE, 0.0, JUST_LATE))
+    step, smooth = (search.data.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
+    gain = (search.data.by_channel(at) - search.data.by_channel(after)).sum(axis=0)
+    rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > SETTINGS.jump * smooth[j]]
+    late = tuple(search.rig.sensors[j].name for j in rows if gain[j] > 0)
+    early = tuple(search.rig.sensors[j].name for j in rows if gain[j] <= 0)
+    return nominal_errors(search.rig, replace(errors.target, late=late, early=early), errors.values)
+
+
 class Stepwise:
     """Stepwise selection of effects beside nominal errors, with going back.
 
     Attributes:
         search: what it works on.
+        tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
         steps: the sets found, each with one effect more or one less than the last.
     """
 
-    def __init__(self, search: Search):
-        self.search = search
+    def __init__(self, search: Search, tolerance: float = 0.0):
+        self.search, self.tolerance = search, tolerance
         search.report("small errors of the nominal model", 0.4)
-        self.steps = [fit_jointly(search, (), nominal_errors(search.rig, prior_of(search)))]
+        self.steps = [fit_jointly(search, (), on_their_sides(search, nominal_errors(search.rig, prior_of(search))))]
+        again = on_their_sides(search, _opened(search, self.last.errors))
+        if again.target.late != self.last.errors.target.late:  # what errors had hidden at first
+            self.steps = [fit_jointly(search, (), again)]
 
     @property
     def last(self) -> Step:
@@ -262,11 +310,13 @@ class Stepwise:
     def run(self) -> None:
         """Add effects as long as each takes most of what is left above the noise."""
         while len(self.last.effects) < SETTINGS.most and not self.is_enough:
-            step = self._with_one_more(self.last)
+            before = self.last
+            step = self._with_one_more(before)
             if step is None:
                 break
-            self.steps.append(step)
-            self.steps.append(self._without_needless(step))
+            self.steps += [step, self._without_needless(step)]
+            if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
+                break
         self.steps.append(self._promoted(self.last))
         if self.last.effects:
             self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
@@ -331,6 +381,8 @@ class Stepwise:
 
     def _is_worth(self, best: Step, step: Step) -> bool:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
+        if not self._matters(best):
+            return False
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
         worth, least = (SETTINGS.further_excess, SETTINGS.least) if step.effects else (SETTINGS.excess, 0.0)
@@ -338,6 +390,19 @@ class Stepwise:
             return True
         saved = step.description(noise) - best.description(noise)
         return not step.is_plausible and saved > SETTINGS.shorter
+
+    def _matters(self, step: Step) -> bool:
+        """Whether each effect of a set alters what the sensors read by more than the tolerance, in some record."""
+        data, rig = self.search.data, self.search.rig
+        scales = [record.outputs.std(axis=1, keepdims=True) for record in data.counted]
+        whole = data.predictions(apply_all(rig, step.fit.effects))
+
+        def altered(effects: tuple[Effect, ...]) -> float:
+            without = data.predictions(apply_all(rig, (*effects, step.errors)))
+            each = zip(whole, without, scales, strict=True)
+            return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
+
+        return all(altered(effects) > self.tolerance for effects in _each_left_out(step.effects))
 
     def _slopes(self, step: Step) -> np.ndarray:
         """Sensitivities (n_values, n_errors) to errors beside the effects of a step, on the most telling records."""
@@ -351,13 +416,20 @@ class Stepwise:
         )
 
     def _whole(self, step: Step) -> Step:
-        """The step fitted to all records."""
-        return fit_jointly(self.search, step.effects, step.errors, rounds=2)
+        """The step fitted to all records.
+
+        Errors that were fitted before an effect was there have bent to it, and may be in another valley, so they start
+        from none; and only where that does not explain the records, from what they were, too.
+        """
+        none = on_their_sides(self.search, nominal_errors(self.search.rig, prior_of(self.search)), step.effects)
+        fresh = fit_jointly(self.search, step.effects, none)
+        if self.explains(fresh):
+            return fresh
+        return min(fresh, fit_jointly(self.search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)
 
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best, or a set that it comes to at bounds of its parameters, where that leaves hardly more."""
-        keys = {step.fit.key for step in tried}
-        fresh = [e for e in simpler_sets(best.effects, self.search.rig) if _key(e, best) not in keys]
+        fresh = list(simpler_sets(best.effects, self.search.rig))
         enough = (1.0 + SETTINGS.simpler) * max(best.excess(best.sensor_noise), SETTINGS.simpler)
         fewer = [
             step
@@ -368,7 +440,7 @@ class Stepwise:
 
     def _without_needless(self, step: Step) -> Step:
         """The set without effects that a later one has made needless."""
-        if len(step.effects) < 2:
+        if not step.effects:
             return step
         fewer = self._fitted(list(_each_left_out(step.effects)), step, self._slopes(step))
         best = min(fewer, key=lambda s: s.fit.cost)
@@ -391,10 +463,6 @@ class Stepwise:
         if not added:
             return step
         return fit_jointly(self.search, (*step.effects, *added), replace(step.errors, values=reset), rounds=2)
-
-
-def _key(effects: Sequence[Effect], step: Step) -> tuple[str, ...]:
-    return tuple(sorted(effect.label for effect in (*effects, step.errors)))
 
 
 def _each_left_out(effects: tuple[Effect, ...]) -> Iterator[tuple[Effect, ...]]:
