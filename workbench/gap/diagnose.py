@@ -89,7 +89,15 @@ def diagnose(
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
         as_seen = faulty == _faulty(found.seen)
-        budget = budget_of(rig, effects, errors, validation or records, noise_found=attribution.noise, settle=settle)
+        budget = budget_of(
+            rig,
+            effects,
+            errors,
+            validation or records,
+            noise_found=attribution.noise,
+            logged=attribution.logged,
+            settle=settle,
+        )
         return Verdict(
             case=name,
             outcome=outcome,

@@ -151,7 +151,7 @@ def _case(
         record = _record(bench, test, _logged(sent, real.plant.logging_noise, rng), measured)
         (validation if test == "validate" else fit).append(record)
         figures[test] = {
-            "gap": _gap(measured, _predicted(nominal, sent, bench)),
+            "gap": _gap(measured, _predicted(nominal, record.inputs, bench)),
             "noise_floor": _gap(np.array([[s.noise_std] for s in real.plant.sensors]), 0.0, measured),
             # without random forces the motion is what the exact model predicts
             "true_model": _gap(

@@ -14,7 +14,7 @@ MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
 REACH, QUIET = 5, 0.25  # bands to either side, and their quantile: modes leave a quarter of them free of peaks
 LOWER = 0.67  # deviations by which that quantile lies below the mean
-ALIKE = 1.3  # times the power of the quietest record
+ALIKE, SAME = 1.3, 1.1  # times the power of the quietest record; what differs from it by chance alone
 LOUD = 0.5  # of the mean square: peaks that hold less are not worth leaving out
 
 
@@ -31,9 +31,10 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
     under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
     # what is as strong in two records of unequal level is noise, of whatever colour
-    quiet = whole < ALIKE * whole[0]
-    noise = np.where(quiet, whole, 0.0).sum(axis=0) / quiet.sum(axis=0)
-    return np.sqrt(np.where((quiet.sum(axis=0) > 1) | (under > LOUD * whole[0]), noise, under))
+    alike = whole[1] < ALIKE * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
+    same = whole < SAME * whole[0]
+    noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
+    return np.sqrt(np.where(alike | (under > LOUD * whole[0]), noise, under))
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
@@ -57,14 +58,20 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
 
 
 def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np.ndarray) -> float:
-    """Noise of the logged inputs as a share of their rms: what accounts for the median of what exceeds the sensors'.
+    """Noise of the logged inputs as a share of their rms.
+
+    It accounts for the median of what is left beyond what the record with the weakest inputs leaves.
 
     Args:
         by_channel: (n_records, n_outputs) mean squares of what is left, in units of the stated noise.
         sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
         per_unit: of `logging_noise_power`.
     """
-    share = np.median(np.maximum(by_channel - sensor_noise, 0.0) / np.maximum(per_unit, 1e-300))
+    rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
+    beyond, per = by_channel - sensor_noise, per_unit
+    if rows.any():  # the record with the weakest inputs tells the noise of the sensors itself
+        beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
+    share = np.median(np.maximum(beyond, 0.0) / np.maximum(per, 1e-300))
     return float(min(np.sqrt(share), MOST_LOGGED))
 
 

@@ -7,6 +7,8 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import group_of
+from workbench.gap.prediction.noise import logging_noise_power
+from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
@@ -23,11 +25,12 @@ class Budget:
 
     Attributes:
         effects: share that each named effect takes away, by label, in the order in which they count.
-        nominal: share that small errors of the nominal model take away beyond them.
+        nominal: share that small errors of the nominal model take away beyond them, and that noise of the logged inputs
+            leaves.
         unexplained: share that is left and is not noise.
         noise: share of the sensors' noise.
         by_record: the same four shares (n_shares,) of each record by name, effects first.
-        errors: root mean squares of the small errors: "frequencies_percent", "delays_ms" and so on.
+        errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on.
         noise_stated, noise_found: (n_outputs,) standard deviation of each sensor's noise, in its unit.
         sensors: (n_outputs,) names.
     """
@@ -76,6 +79,7 @@ def budget_of(
     records: Sequence[Record],
     *,
     noise_found: np.ndarray,
+    logged: float = 0.0,
     settle: float = 0.0,
     substeps: int = 8,
 ) -> Budget:
@@ -91,6 +95,7 @@ def budget_of(
         errors: of the nominal model, where they were fitted.
         records: held out of the fit, or those fitted where none were.
         noise_found: (n_outputs,).
+        logged: noise of the logged inputs, as a share of their rms.
         settle: seconds at the start of each record that do not count.
         substeps: of a sample, where the rig is not linear.
     """
@@ -111,6 +116,8 @@ def budget_of(
     order = [effects[i] for i in by_size]
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
+    by_inputs = np.minimum(logged**2 * _power_of_inputs(rig, records, settle), rest) if logged else np.zeros_like(left)
+    rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
     for i, effect in enumerate(order):  # what no model can predict is theirs
         if effect.kind.remainder:
             rows[i], rest = rows[i] + rest, np.zeros_like(rest)
@@ -124,7 +131,7 @@ def budget_of(
         unexplained=float(whole[-2]),
         noise=float(whole[-1]),
         by_record=by_record,
-        errors=sizes_of(errors),
+        errors={**sizes_of(errors), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
         noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
         noise_found=tuple(noise_found.tolist()),
         sensors=tuple(s.name for s in rig.sensors),
@@ -143,6 +150,14 @@ def _mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> floa
 def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
     measured = record.outputs[:, round(settle / record.sample_time) :]
     return float(((noise[:, None] / _scale(measured)) ** 2).mean())
+
+
+def _power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
+    """Mean square (n_records,) that noise of the logged inputs leaves, were it as strong as they are."""
+    lead = round(settle / records[0].sample_time)
+    powers = logging_noise_power(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))
+    scales = np.array([_scale(record.outputs[:, lead:])[:, 0] for record in records])
+    return np.asarray((powers / scales**2).mean(axis=1))
 
 
 def _scale(measured: np.ndarray) -> np.ndarray:

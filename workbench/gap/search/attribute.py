@@ -11,7 +11,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
-from workbench.gap.prediction.noise import noise_found
+from workbench.gap.prediction.noise import logging_noise, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -54,6 +54,7 @@ class Attribution:
         evidence: of the nominal rig.
         search: what was searched in, the records with the noise of rounded sensors among it.
         noise: (n_outputs,) standard deviation of each sensor's noise as it was found, in its unit.
+        logged: noise of the logged inputs, as a share of their rms, as what is left shows it.
     """
 
     outcome: str
@@ -66,6 +67,7 @@ class Attribution:
     evidence: Evidence
     search: Search
     noise: np.ndarray
+    logged: float
 
     @property
     def noise_ratio(self) -> float:
@@ -210,6 +212,7 @@ def attribute(
         evidence=found.nominal,
         search=search,
         noise=noise,
+        logged=_logged(search, best, noise) if random is None else 0.0,
     )
 
 
@@ -221,6 +224,14 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
         if float(((residual / scale) ** 2).mean()) - floor > max(tolerance**2, A_TENTH * floor):
             return False
     return tolerance > 0
+
+
+def _logged(search: Search, best: Fit, noise: np.ndarray) -> float:
+    """Noise of the logged inputs, as a share of their rms, by what a set leaves above the noise of the sensors."""
+    left = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
+    if (left.mean(axis=1) < (1.0 + A_TENTH) * ((noise / search.data.noise) ** 2).mean()).all():
+        return 0.0
+    return logging_noise(left, (noise / search.data.noise) ** 2, search.logging_noise)
 
 
 def noise_of(search: Search, best: Fit) -> np.ndarray:
@@ -264,8 +275,8 @@ def _with_a_second(
         decision = beside.decision()
         if decision.outcome == "explained":
             return decision
-        if decision.outcome == "none" and np.median(beside.last.sensor_noise) > 1.0 + A_TENTH:
-            return decision  # no pair leaves less than the noise, which is louder than stated
+        if decision.outcome == "none" and beside.is_quiet:
+            return decision
     law = one_law(search, evidence)
     pairs = Pairs(search)
     explained = pairs.at_once(weighed)

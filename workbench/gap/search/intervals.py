@@ -22,8 +22,8 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
         cov = A⁻¹ (Σ_b J_bᵀ r_b r_bᵀ J_b + s² P) A⁻¹,    A = Jᵀ J + s² P,    s² = max(|r|² / n, 1)
 
     over blocks b of each record (White, Econometrica 48 (1980) 817; blocks after Liang & Zeger, Biometrika 73 (1986)
-    13), or s² A⁻¹ where that is larger. The joint covariance is no smaller than either in any direction. Beside errors of
-    the nominal model no number of an effect is told to better than a part in ten thousand.
+    13), or s² A⁻¹ where that is larger. The joint covariance is no smaller than either in any direction. Beside errors
+    of the nominal model no number of an effect is told to better than a part in ten thousand.
 
     Args:
         rig: nominal.
@@ -37,7 +37,7 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
     parameters = parameters_of(rig, found.effects)
     least = np.zeros(len(parameters))
     if any(p.prior_std is not None for _, p in parameters):
-        least = np.array([_least(found.effects[i], p, rig.modes.domain.extent) for i, p in parameters])
+        least = np.array([_least(found.effects[i], p) for i, p in parameters])
     level = max(float(residual @ residual) / residual.size, 1.0)
     priors = np.array([0.0 if p.prior_std is None else 1.0 / p.prior_std**2 for _, p in parameters])
     scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
@@ -56,14 +56,14 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
     return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(least**2))
 
 
-def _least(effect: Effect, parameter: Parameter, extent: float) -> float:
+def _least(effect: Effect, parameter: Parameter) -> float:
     """Standard deviation of a free coordinate that two good models of one structure differ by; none of their errors."""
     if parameter.prior_std is not None:
         return 0.0
     if parameter.logarithmic:
         return ALIKE
     value = effect.values[parameter.name]
-    size = extent if parameter.name in COORDINATES else abs(value - (parameter.neutral or 0.0))
+    size = parameter.high if parameter.name in COORDINATES else abs(value - (parameter.neutral or 0.0))
     return ALIKE * size / parameter.scale
 
 

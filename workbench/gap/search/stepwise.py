@@ -18,6 +18,9 @@ from workbench.gap.search.pursuit import FINE, one_more
 from workbench.gap.search.search import Search, most_telling, spread_over_kinds
 from workbench.structure.member import Structure
 
+TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
+COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
+
 
 @dataclass(frozen=True)
 class StepwiseSettings:
@@ -36,6 +39,7 @@ class StepwiseSettings:
         rounds: of learning the sizes, at most.
         settled, last_settled: share of what is left that a round must have taken away for another; in the last fit.
         iterations, tolerance: of the fit in each round.
+        plainly: iterations of a fit without errors.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
         candidates: sets fitted on whole records at each step.
         finalists, near: how many of them are fitted to all records, and times the least cost of what may come first.
@@ -82,6 +86,7 @@ class StepwiseSettings:
     last_settled: float = 1e-3
     iterations: int = 4
     tolerance: float = 1e-4
+    plainly: int = 8
     last_iterations: int = 6
     last_tolerance: float = 1e-7
     candidates: int = 4
@@ -293,10 +298,13 @@ class Stepwise:
         search: what it works on.
         tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
         steps: the sets found, each with one effect more or one less than the last.
+        plain: the effects of the last without errors of the nominal model, where they explain the records as well.
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0):
-        self.search, self.tolerance = search, tolerance
+        catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
+        self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
+        self.plain: Fit | None = None
         search.report("small errors of the nominal model", 0.4)
         self.steps = [fit_jointly(search, (), on_their_sides(search, nominal_errors(search.rig, prior_of(search))))]
         again = on_their_sides(search, _opened(search, self.last.errors))
@@ -317,6 +325,9 @@ class Stepwise:
             self.steps += [step, self._without_needless(step)]
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
                 break
+        self.plain = self._without_errors(self.last)
+        if self.plain is not None:
+            return
         self.steps.append(self._promoted(self.last))
         if self.last.effects:
             self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
@@ -340,12 +351,18 @@ class Stepwise:
     def _gap(self) -> float:
         return max(float(np.maximum(self.search.nominal - self.last.noise_power, 0.0).mean()), 1e-12)
 
+    @property
+    def is_quiet(self) -> bool:
+        """Whether next to nothing is left but noise of sensors and logged inputs."""
+        return self.last.excess(self.last.noise_power) < SETTINGS.no_gap * float(self.last.noise_power.mean())
+
     def decision(self) -> Decision:
         """What the effects of the last set explain."""
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
-        quiet = self.last.excess(self.last.noise_power) < SETTINGS.no_gap * float(self.last.noise_power.mean())
-        enough = quiet or left < SETTINGS.explained
+        if self.plain is not None:
+            return Decision("explained", self.plain, noise=noise)
+        enough = self.is_quiet or left < SETTINGS.explained
         if effects and (enough or (len(effects) > 1 and left < SETTINGS.in_part)):
             return Decision("explained", self.last.fit, noise=noise)
         if enough:
@@ -374,7 +391,9 @@ class Stepwise:
         enough = left - SETTINGS.promising * (left - ahead[0].cost)
         chosen = [f for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
         tried = self._fitted([candidate.effects for candidate in chosen], step, self._slopes(step))
-        tried.sort(key=lambda s: s.fit.cost)
+        tried = sorted((s for s in tried if not self._is_timing(s)), key=lambda s: s.fit.cost)
+        if not tried:
+            return step
         near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
         whole = sorted((self._whole(s) for s in near), key=lambda s: s.fit.cost)
         return self._simplest(whole[0], whole[1:])
@@ -403,6 +422,11 @@ class Stepwise:
             return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
 
         return all(altered(effects) > self.tolerance for effects in _each_left_out(step.effects))
+
+    def _is_timing(self, step: Step) -> bool:
+        """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
+        least = dict(SETTINGS.widest)["delay"] * self.search.data.records[0].sample_time
+        return any(effect.values[TIMING[e]] < least for effect in step.effects if (e := effect.kind.name) in TIMING)
 
     def _slopes(self, step: Step) -> np.ndarray:
         """Sensitivities (n_values, n_errors) to errors beside the effects of a step, on the most telling records."""
@@ -446,6 +470,22 @@ class Stepwise:
         best = min(fewer, key=lambda s: s.fit.cost)
         enough = (1.0 + SETTINGS.needless) * max(step.excess(step.sensor_noise), SETTINGS.simpler)
         return self._without_needless(best) if best.excess(step.sensor_noise) < enough else step
+
+    def _without_errors(self, step: Step) -> Fit | None:
+        """The effects, or these and one error common to all modes or all along, where only noise is left beside them.
+
+        They say the same with fewer numbers than errors of their own for every mode and wave.
+        """
+        if not step.effects or not self.explains(step):
+            return None
+        search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
+        common = [Effect(kind, None, {"factor": 1.0}) for kind in COMMON]
+        named = {effect.kind for effect in step.effects}
+        for extra in ((), *((effect,) for effect in common if effect.kind not in named)):
+            found = fit(search.rig, (*step.effects, *extra), search.data.stepped(FINE), iterations=SETTINGS.plainly)
+            if search.explains(found):
+                return found
+        return None
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small, and common to all, as effects of their own."""
