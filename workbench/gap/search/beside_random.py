@@ -81,19 +81,6 @@ def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
     return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RIVAL]
 
 
-def decide_with_random(search: Search, given: Fit, evidence: Evidence) -> Decision | None:
-    """The given effects beside a random disturbance, where one holds.
-
-    Args:
-        evidence: of the rig with the given effects.
-    """
-    search, evidence = _heard(search, given.effects, evidence)
-    evidence = _by_laws_on_measured_motion(search, evidence)
-    if not looks_random(evidence):
-        return None
-    return _likeliest(search, [with_random(search, given, evidence), with_random(search, _nothing(search))])
-
-
 def _nothing(search: Search) -> Fit:
     left = search.data.by_channel(search.data.residual(search.rig))
     return Fit((), float(left.mean()), left, 0, "nothing added")

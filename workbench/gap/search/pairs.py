@@ -2,24 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import chain, zip_longest
 
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.search.beside_random import NEAR, decide_with_random
+from workbench.gap.search.beside_random import NEAR
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
-from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.outcome import Decision, unexplained
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import Search, apart, in_one_valley, spread_over_kinds
+from workbench.gap.search.search import Search, in_one_valley
 from workbench.structure.domain import Between
 
-FAR = 10.0  # times the cost of the best single effect: what is left by one that is no half of a pair
-SINGLES = 8  # that are fitted to whole records before they are gone through
-FIRSTS = 4  # single effects that a second one is looked for beside
 FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
 ASTRAY = 1e4  # times the gap's power
 MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
@@ -79,49 +75,11 @@ class Pairs:
                 break
         return self._from_elsewhere(VERY_NEAR)
 
-    def beside(self, effect: Effect, evidence: Evidence | None = None) -> bool:
-        """Whether a pair with this effect explains the records.
-
-        Args:
-            evidence: of the rig with the effect, where it is at hand.
-        """
+    def beside(self, effect: Effect) -> bool:
+        """Whether a pair with this effect explains the records."""
         self.search.report(f"{effect.kind.words} and another", 0.55 + 0.05 * min(len(self.given), 8))
         self.given.append(effect)
-        evidence = evidence or _evidence(self.search, effect)
-        return self._explained_by(one_more(self.search, (effect,), evidence))
-
-    def one_by_one(self, start: Fit, ahead: Sequence[Fit]) -> Decision:
-        """The best few single effects, each with a second one or a random disturbance, until a pair explains.
-
-        In a near miss the right half has nearly its right numbers, better ones than it had alone: as soon as there is
-        one, the other half is looked for anew beside either.
-
-        Args:
-            start: what is there with no effect.
-            ahead: every kind's best fit alone, to predictions one sample ahead.
-        """
-        for first in _firsts(self.search, ahead, on_whole_records(self.search, ahead, SINGLES)):
-            (effect,) = first.effects
-            if any(_alike(effect, half, self.search) for pair in self.missed for half in pair.effects):
-                continue
-            evidence = _evidence(self.search, effect)
-            if evidence.rig is not self.search.rig:
-                on_all = fit(self.search.rig, first.effects, self.search.data, iterations=0)
-                beside = decide_with_random(self.search, on_all, evidence)
-                if beside is not None:
-                    return beside
-            if any(_alike(effect, other, self.search) for other in self.given):
-                continue
-            if self.beside(effect, evidence):
-                break
-            if not self.missed and self._near() and (self._by_halves() or self._from_elsewhere()):
-                break
-        else:
-            if not self.found:
-                self._add(on_whole_records(self.search, self.ahead, 1))
-            if self.found:
-                self._from_elsewhere()
-        return self.decision(start)
+        return self._explained_by(one_more(self.search, (effect,), _evidence(self.search, effect)))
 
     def decision(self, start: Fit) -> Decision:
         """What the pairs say.
@@ -181,16 +139,6 @@ class Pairs:
         self.found = sorted((*pairs, *self.found), key=lambda f: f.cost)
 
 
-def _firsts(search: Search, *rankings: Sequence[Fit]) -> list[Fit]:
-    """The single effects that a second one is looked for beside: the best of either ranking by turns."""
-    hopeful = ([f for f in spread_over_kinds(fits, 2) if f.cost < FAR * fits[0].cost] for fits in rankings)
-    firsts: list[Fit] = []
-    for first in filter(None, chain.from_iterable(zip_longest(*hopeful))):
-        if not any(_alike(first.effects[0], other.effects[0], search) for other in firsts):
-            firsts.append(first)
-    return firsts[:FIRSTS]
-
-
 def _evidence(search: Search, effect: Effect) -> Evidence:
     """Of the rig with the effect; without it where the motion of whole records would run away with it alone."""
     astray = cost_of(search.rig, (effect,), search.data) > ASTRAY * search.nominal.mean()
@@ -205,13 +153,6 @@ def _weightiest_first(search: Search, pair: Fit) -> list[Effect]:
         return cost_of(search.rig, (*(e for e in pair.effects if e is not effect), *search.held), search.ahead)
 
     return sorted(pair.effects, key=left_without, reverse=True)
-
-
-def _alike(one: Effect, other: Effect, search: Search) -> bool:
-    """Whether two effects are the same but for their numbers."""
-    if one.label != other.label:
-        return False
-    return one.at is None or not apart(one, other, search.rig.modes.domain)
 
 
 def _unmoved(one: Effect, other: Effect) -> bool:
