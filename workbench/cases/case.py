@@ -118,7 +118,7 @@ def read_rig(path: str | Path) -> Rig:
     return _rig(table_of(path), path)
 
 
-def _rig(table: dict, path: Path) -> Rig:
+def _rig(table: dict[str, Any], path: Path) -> Rig:
     check_keys(table, TABLES, str(path))
     inputs, outputs = tables(table, "input", path), tables(table, "output", path)
     names = [entry["name"] for entry in (*inputs, *outputs)]
@@ -143,7 +143,7 @@ def _rig(table: dict, path: Path) -> Rig:
 # --- rigs
 
 
-def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     kind = table.get("kind")
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
@@ -171,7 +171,7 @@ def _member_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     return Rig(modes, actuators, sensors, structure=structure)
 
 
-def _plate_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     check_keys(table, PLATE, "[structure]")
     _check_ports(inputs, outputs, "at")
     edges = table.get("edges")
@@ -189,7 +189,7 @@ def _plate_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     )
     modes = structure.modes(count(table, "modes", MOST_MODES))
 
-    def pair(entry: dict, where: str) -> Place:
+    def pair(entry: dict[str, Any], where: str) -> Place:
         x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2)
         modes.domain.locate((x, y))
         return (float(x), float(y))
@@ -198,7 +198,7 @@ def _plate_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     return Rig(modes, actuators, tuple(_sensor(e, pair(e, "[[output]]")) for e in outputs), structure=structure)
 
 
-def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
+def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
     single = "mass" in table
     check_keys(table, SINGLE if single else MODAL, "[structure]")
@@ -228,7 +228,9 @@ def _modal_rig(table: dict, inputs: list[dict], outputs: list[dict]) -> Rig:
     return Rig(modes, tuple(_actuator(e, e["name"]) for e in inputs), tuple(_sensor(e, e["name"]) for e in outputs))
 
 
-def _rig_at_points(table: dict, inputs: list[dict], outputs: list[dict], path: Path) -> Rig:
+def _rig_at_points(
+    table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], path: Path
+) -> Rig:
     """Modal data at named points, which a table beside the case file lists."""
     check_keys(table, MODAL, "[structure]")
     _check_ports(inputs, outputs, "point")
@@ -238,7 +240,7 @@ def _rig_at_points(table: dict, inputs: list[dict], outputs: list[dict], path: P
     points, values = read_points(file, omega.size)
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
 
-    def point(entry: dict, where: str) -> str:
+    def point(entry: dict[str, Any], where: str) -> str:
         name = text(entry, "point", f"{where} {entry['name']!r}")
         points.locate(name)
         return name
@@ -247,7 +249,7 @@ def _rig_at_points(table: dict, inputs: list[dict], outputs: list[dict], path: P
     return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]")) for e in outputs))
 
 
-def _modal_damping(table: dict, omega: np.ndarray) -> np.ndarray:
+def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
     """Coefficients c_rs (n_modes, n_modes), 1/s: 2 ζ_r ω_r, and for rigid modes what the table gives, or none."""
     rates = 2.0 * numbers(table, "damping_ratios", "[structure]", omega.size) * omega
     if "rigid_damping" in table:
@@ -258,27 +260,27 @@ def _modal_damping(table: dict, omega: np.ndarray) -> np.ndarray:
     return np.diag(rates)
 
 
-def _check_ports(inputs: list[dict], outputs: list[dict], *places: str) -> None:
+def _check_ports(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], *places: str) -> None:
     for key, entries, keys in (("input", inputs, INPUT), ("output", outputs, OUTPUT)):
         for entry in entries:
             check_keys(entry, (*keys, *places), f"[[{key}]] {entry['name']!r}")
 
 
-def _place(entry: dict, length: float, where: str) -> float:
+def _place(entry: dict[str, Any], length: float, where: str) -> float:
     at = number(entry, "at", f"{where} {entry['name']!r}")
     if not 0 <= at <= length:
         raise CaseError(f"{where} {entry['name']!r}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
     return at
 
 
-def _actuator(entry: dict, at: Place) -> Actuator:
+def _actuator(entry: dict[str, Any], at: Place) -> Actuator:
     kind = entry.get("kind")
     if kind not in ("actuator", "hammer"):
         raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {shown(kind)}")
     return Actuator(entry["name"], at, direct=kind == "hammer")
 
 
-def _sensor(entry: dict, at: Place) -> Sensor:
+def _sensor(entry: dict[str, Any], at: Place) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
@@ -292,7 +294,7 @@ def _sensor(entry: dict, at: Place) -> Sensor:
 # --- records
 
 
-def _hold(table: dict, where: str) -> str:
+def _hold(table: dict[str, Any], where: str) -> str:
     """How inputs run between samples."""
     hold = table.get("input_hold", "zero")
     if hold not in HOLDS:
@@ -300,13 +302,14 @@ def _hold(table: dict, where: str) -> str:
     return str(hold)
 
 
-def _use(entry: dict, path: Path) -> str:
-    if entry.get("use") not in ("fit", "validate"):
-        raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {shown(entry.get('use'))}")
-    return entry["use"]
+def _use(entry: dict[str, Any], path: Path) -> str:
+    use = entry.get("use")
+    if use not in ("fit", "validate"):
+        raise CaseError(f"{path}: record {entry['name']!r}: use is fit or validate; got {shown(use)}")
+    return str(use)
 
 
-def _read_record(folder: Path, entry: dict, rig: Rig, path: Path) -> Record:
+def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> Record:
     name = entry["name"]
     where = f"{path}: record {name!r}"
     check_keys(entry, RECORD, where)

@@ -2,6 +2,7 @@
 
 import csv
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,7 +69,7 @@ def write_points(path: Path, points: NamedPoints, values: np.ndarray) -> None:
             writer.writerow([name, node, *map(repr, at.tolist()), direction, *map(repr, row.tolist())])
 
 
-def _number(path: Path, line: int, row: dict, column: str) -> float:
+def _number(path: Path, line: int, row: dict[str, Any], column: str) -> float:
     try:
         value = float(row[column])
     except (TypeError, ValueError):
@@ -79,7 +80,7 @@ def _number(path: Path, line: int, row: dict, column: str) -> float:
     return value
 
 
-def _text(path: Path, line: int, row: dict, column: str, *, may_be_empty: bool = False) -> str:
+def _text(path: Path, line: int, row: dict[str, Any], column: str, *, may_be_empty: bool = False) -> str:
     value = row[column]
     if value == "" and may_be_empty:
         return ""

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
 from reprlib import Repr
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ class CaseError(ValueError):
     """A case folder that is not one, or holds what a diagnosis cannot use."""
 
 
-def table_of(path: Path) -> dict:
+def table_of(path: Path) -> dict[str, Any]:
     """The table that a TOML file holds.
 
     Raises:
@@ -46,7 +47,7 @@ def table_of(path: Path) -> dict:
         raise CaseError(f"{path} cannot be read as TOML: {error}") from error
 
 
-def check_keys(entry: dict, allowed: Iterable[str], where: str) -> None:
+def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> None:
     """Refuse a key that nothing would read: a misspelt one would change the case unseen.
 
     Raises:
@@ -60,7 +61,7 @@ def check_keys(entry: dict, allowed: Iterable[str], where: str) -> None:
             raise CaseError(f"{where} has no key {shown(key)}; {meant}")
 
 
-def tables(table: dict, key: str, path: Path) -> list[dict]:
+def tables(table: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
     """The entries [[key]], each with a name of its own.
 
     Raises:
@@ -78,7 +79,7 @@ def tables(table: dict, key: str, path: Path) -> list[dict]:
     return entries
 
 
-def text(entry: dict, key: str, where: str) -> str:
+def text(entry: dict[str, Any], key: str, where: str) -> str:
     """A text of printable characters.
 
     Raises:
@@ -105,7 +106,7 @@ def inside(folder: Path, file: str, where: str) -> Path:
     return path
 
 
-def number(entry: dict, key: str, where: str, *, low: float = -np.inf) -> float:
+def number(entry: dict[str, Any], key: str, where: str, *, low: float = -np.inf) -> float:
     """A finite number, at least `low`.
 
     Raises:
@@ -122,7 +123,7 @@ def number(entry: dict, key: str, where: str, *, low: float = -np.inf) -> float:
     return as_float
 
 
-def numbers(entry: dict, key: str, where: str, length: int | None = None) -> np.ndarray:
+def numbers(entry: dict[str, Any], key: str, where: str, length: int | None = None) -> np.ndarray:
     """A list of finite numbers, `length` of them where given.
 
     Raises:
@@ -140,7 +141,7 @@ def numbers(entry: dict, key: str, where: str, length: int | None = None) -> np.
     return values
 
 
-def profile(entry: dict, key: str) -> float | tuple[np.ndarray, np.ndarray]:
+def profile(entry: dict[str, Any], key: str) -> float | tuple[np.ndarray, np.ndarray]:
     """A number, or points (x, value) with straight lines between.
 
     Raises:
@@ -153,7 +154,7 @@ def profile(entry: dict, key: str) -> float | tuple[np.ndarray, np.ndarray]:
     return number(entry, key, "[structure]", low=0.0)
 
 
-def count(entry: dict, key: str, most: int) -> int:
+def count(entry: dict[str, Any], key: str, most: int) -> int:
     """A whole number from 1 to `most`.
 
     Raises:

@@ -2,12 +2,20 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
 from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from workbench.arrays import Floats
+    from workbench.records.record import Record
+    from workbench.rig.rig import Rig
+    from workbench.robust.posterior import UncertainRig
 
 
 @guarded
@@ -93,13 +101,14 @@ def redesign(
     say(f"  page       {short(redesign_page(result, target, name=found.name, record=shown, folder=case))}")
 
 
-def _largest(records):
+def _largest(records: "Sequence[Record]") -> "Floats":
     import numpy as np
 
-    return np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
+    level: Floats = np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
+    return level
 
 
-def _read_verdict(path: Path, rig):
+def _read_verdict(path: Path, rig: "Rig") -> "UncertainRig":
     from workbench.robust.posterior import UncertainRig
 
     try:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -69,7 +69,7 @@ def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
     with progress_bar() as progress:
         cases = progress.add_task("cases", total=1.0, visible=False)
 
-        def track(items: Iterable, what: str) -> Iterator:
+        def track(items: Iterable[Any], what: str) -> Iterator[Any]:
             yield from progress.track(items, description=what)
 
         outcome = Outcome(

@@ -1,6 +1,7 @@
 """Pictures of how accurate an identification is: errors beside the bound, peers beside one another."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -11,7 +12,9 @@ from workbench.identification.shapes.bands import Bands
 from workbench.structure.modes import Modes
 
 
-def peers_errors(every: Mapping[float, Mapping[str, Sequence[Mapping]]], efficient: Mapping[float, float]) -> Figure:
+def peers_errors(
+    every: Mapping[float, Mapping[str, Sequence[Mapping[str, Any]]]], efficient: Mapping[float, float]
+) -> Figure:
     """Worst-mode errors of every method on every structure, a panel a level; scores as `identification_peers`."""
     figure, axes = new_figure(1, len(every), width=12.5, height=5.2, sharex=True, sharey=True)
     rng = np.random.default_rng(0)
@@ -90,7 +93,7 @@ def plot_bands(bands: Bands, exact: Modes | None = None, positions: Sequence[flo
     return figure
 
 
-def size_and_errors(rows: Sequence[Mapping], errors: np.ndarray) -> Figure:
+def size_and_errors(rows: Sequence[Mapping[str, Any]], errors: np.ndarray) -> Figure:
     """What a record costs to identify by its length, and errors (2, n_modes) of ω and ζ of the longest over the bound.
 
     Args:
@@ -125,7 +128,7 @@ def size_and_errors(rows: Sequence[Mapping], errors: np.ndarray) -> Figure:
     return figure
 
 
-def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mapping]) -> Figure:
+def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mapping[str, Any]]) -> Figure:
     """Errors of every figure by the kind of record, beside those of a method that attains the bound.
 
     Args:

@@ -1,6 +1,7 @@
 """Figures of control design: motion, work by mode, placements."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -107,7 +108,7 @@ def plot_filter_errors(counts: Sequence[int], errors: np.ndarray) -> Figure:
     return figure
 
 
-def plot_comparison(rows: Sequence[dict]) -> Figure:
+def plot_comparison(rows: Sequence[dict[str, Any]]) -> Figure:
     """Cost, effort and spillover of several designs as ratios to the first, on a logarithmic scale."""
     figure, ax = new_figure(1, 1, width=9, height=4)
     keys = ("cost", "effort", "W_R")
@@ -127,7 +128,7 @@ def plot_comparison(rows: Sequence[dict]) -> Figure:
     return figure
 
 
-def plot_designs(rows: Sequence[dict], figures: dict[str, str], title: str) -> Figure:
+def plot_designs(rows: Sequence[dict[str, Any]], figures: dict[str, str], title: str) -> Figure:
     """Designs in rows, one panel a figure of merit, one mark an estimator; infinite values are at the edge.
 
     Args:
@@ -258,7 +259,7 @@ def plot_scaling(times: dict[str, dict[int, float]], slopes: dict[str, float]) -
     return figure
 
 
-def plot_robustness(scales: Sequence[float], shares: dict, spreads: dict) -> Figure:
+def plot_robustness(scales: Sequence[float], shares: dict[str, Any], spreads: dict[str, Any]) -> Figure:
     """Share of perturbed models that stay stable, and median W_R with its 90 % interval, by the size of the errors."""
     figure, axes = new_figure(2, 1, width=9, height=7, sharex=True)
     for (name, values), colour, mark in zip(shares.items(), COLOURS, "osD^", strict=False):
@@ -273,7 +274,7 @@ def plot_robustness(scales: Sequence[float], shares: dict, spreads: dict) -> Fig
     return figure
 
 
-def plot_drift(rows: Sequence[dict]) -> Figure:
+def plot_drift(rows: Sequence[dict[str, Any]]) -> Figure:
     """Frequencies found in the loop over the true ones, and excess cost of the old law, as the stiffness drifts."""
     figure, axes = new_figure(1, 2, width=11, height=4.3)
     drift = [100 * (row["stiffness"] - 1) for row in rows]

@@ -1,6 +1,7 @@
 """Pictures of mass and stiffness found along a structure, and of losses placed."""
 
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -35,7 +36,7 @@ def stiffness_found(cases: Mapping[str, Case]) -> Figure:
     return figure
 
 
-def places_found(rows: Sequence[Mapping], *, within: float) -> Figure:
+def places_found(rows: Sequence[Mapping[str, Any]], *, within: float) -> Figure:
     """Error of the place of each loss over its true place, a colour a level of noise; crosses were not reported."""
     figure, ax = new_figure(width=8.5, height=4.4)
     levels = sorted({row["level_db"] for row in rows}, reverse=True)

@@ -6,9 +6,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.beyond import any_beyond
-from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
@@ -103,7 +104,7 @@ def plot_where(verdict: Verdict) -> Figure:
     return figure
 
 
-def _plot_places(ax, verdict: Verdict) -> None:
+def _plot_places(ax: Axes, verdict: Verdict) -> None:
     """How likely each place is for one missing force: a curve along the structure, or bars at named places."""
     place = verdict.where.place
     profile = place.profile
@@ -181,7 +182,7 @@ def plot_missing_force(verdict: Verdict) -> Figure:
     return figure
 
 
-def _law(chosen, series: np.ndarray, name: str):
+def _law(chosen: Sequence[Effect], series: Floats, name: str) -> tuple[Floats, Floats] | None:
     """The fitted law as a line over one variable, where it depends on that variable alone."""
     if not chosen:
         return None

@@ -1,6 +1,7 @@
 """Pictures of identification: eigenvalues, eigenfunctions, distributions, stabilisation, a measured structure."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,7 +16,7 @@ SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
 LABELS = ("printed in 1981", "two delays, as in 1981", "this project's default")
 
 
-def eigenvalue_errors(errors: Mapping, sensors: Sequence[int]) -> Figure:
+def eigenvalue_errors(errors: Mapping[tuple[int, str], Any], sensors: Sequence[int]) -> Figure:
     """Relative errors mode by mode, a column a number of sensors; errors[m, "omega" or "zeta"] are three arrays."""
     figure, axes = new_figure(2, len(sensors), width=11, height=6, sharex=True, sharey=True)
     for column, m in enumerate(sensors):
@@ -51,7 +52,9 @@ def eigenfunction(found: Modes, exact: Modes, *, mode: int, positions: np.ndarra
     return figure
 
 
-def distribution_errors(x: np.ndarray, curves: Mapping, sensors: Sequence[int], *, terms: int) -> Figure:
+def distribution_errors(
+    x: np.ndarray, curves: Mapping[tuple[int, int, str], Any], sensors: Sequence[int], *, terms: int
+) -> Figure:
     """Errors of mass and stiffness along x; curves[m, terms, what] are (printed, cubic splines, default splines)."""
     figure, axes = new_figure(2, len(sensors), width=11, height=6, sharex=True, sharey=True)
     labels = ("printed in 1981", "cubic splines", "this project's default")
@@ -120,7 +123,7 @@ def measured_modes(bending: SampledModes, others: SampledModes, pairing: ModePai
     return figure
 
 
-def placement_on_shapes(modes: Modes, placements: Mapping, *, n_controlled: int) -> Figure:
+def placement_on_shapes(modes: Modes, placements: Mapping[str, Any], *, n_controlled: int) -> Figure:
     """Where actuators stand on the mode shapes, and what each placement leaves in the residual modes."""
     figure, (left, right) = new_figure(1, 2, width=12, height=4.5, width_ratios=(3, 2))
     x = np.linspace(0.0, modes.length, 300)
@@ -156,7 +159,7 @@ def placement_on_shapes(modes: Modes, placements: Mapping, *, n_controlled: int)
     return figure
 
 
-def order_found(rows: Sequence[Mapping]) -> Figure:
+def order_found(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Modes identified, missed and falsely reported over the signal-to-noise ratio; rows as `identification_order`."""
     figure, ax = new_figure(width=8, height=4.2)
     level = np.array([row["level_db"] for row in rows])

@@ -6,7 +6,10 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.cbook import GrouperView
 from matplotlib.collections import LineCollection, PathCollection, PolyCollection, QuadMesh
 from matplotlib.colors import to_hex, to_rgba
 from matplotlib.container import BarContainer
@@ -16,6 +19,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon, Rectangle
 from matplotlib.text import Annotation, Text
 from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
+from numpy.typing import ArrayLike
+
+from workbench.arrays import Floats
 
 MOST_POINTS = 4000
 MOST_CELLS = (160, 320)
@@ -28,7 +34,7 @@ class Undescribed(TypeError):
     """A figure that holds what only matplotlib can draw."""
 
 
-def drawable(figure: Figure) -> dict:
+def drawable(figure: Figure) -> dict[str, Any]:
     """What a page draws of a figure: its description as "figure", or a "picture" (PNG in base64) where it has none."""
     try:
         return {"figure": described(figure)}
@@ -38,7 +44,7 @@ def drawable(figure: Figure) -> dict:
         return {"picture": base64.b64encode(buffer.getvalue()).decode()}
 
 
-def described(figure: Figure) -> dict:
+def described(figure: Figure) -> dict[str, Any]:
     """The panels of a figure, what is drawn in each, and how: lists, numbers and texts only.
 
     Raises:
@@ -56,7 +62,7 @@ def described(figure: Figure) -> dict:
     }
 
 
-def _panel(ax: Axes, axes: list[Axes], height: float) -> dict:
+def _panel(ax: Axes, axes: list[Axes], height: float) -> dict[str, Any]:
     marks = [mark for artist in _artists(ax) for mark in _described(ax, artist)]
     return {
         "title": _text(ax.get_title("left") or ax.get_title()),
@@ -68,7 +74,9 @@ def _panel(ax: Axes, axes: list[Axes], height: float) -> dict:
     }
 
 
-def _axis(ax: Axes, axis, limits, scale: str, shared, axes: list[Axes]) -> dict:
+def _axis(
+    ax: Axes, axis: Axis, limits: tuple[float, float], scale: str, shared: "GrouperView[Axes]", axes: list[Axes]
+) -> dict[str, Any]:
     if scale not in ("linear", "log"):
         raise Undescribed(f"an axis with scale {scale!r}")
     found = {
@@ -85,18 +93,18 @@ def _axis(ax: Axes, axis, limits, scale: str, shared, axes: list[Axes]) -> dict:
     return found
 
 
-def _artists(ax: Axes) -> list:
+def _artists(ax: Axes) -> list[Artist | BarContainer]:
     bars = [c for c in ax.containers if isinstance(c, BarContainer) and c.patches]
     of_bars = {id(patch) for c in bars for patch in c.patches}
     alone = [a for a in (*ax.collections, *ax.images, *ax.patches, *ax.lines, *ax.texts) if a.get_visible()]
     return sorted([*bars, *(a for a in alone if id(a) not in of_bars)], key=_height)
 
 
-def _height(artist) -> float:
+def _height(artist: Artist | BarContainer) -> float:
     return artist.patches[0].get_zorder() if isinstance(artist, BarContainer) else artist.get_zorder()
 
 
-def _described(ax: Axes, artist) -> list[dict]:
+def _described(ax: Axes, artist: Artist | BarContainer) -> list[dict[str, Any]]:
     if isinstance(artist, BarContainer):
         boxes = [_box(ax, patch) for patch in artist.patches]
         colours = [_colour(patch.get_facecolor()) for patch in artist.patches]
@@ -107,7 +115,7 @@ def _described(ax: Axes, artist) -> list[dict]:
     raise Undescribed(f"a {type(artist).__name__}")
 
 
-def _line(ax: Axes, line: Line2D) -> list[dict]:
+def _line(ax: Axes, line: Line2D) -> list[dict[str, Any]]:
     style = {"colour": _colour(line.get_color()), "label": _label(line), "alpha": _alpha(line)}
     style |= {"width": round(line.get_linewidth() * POINTS, 2), "dash": DASHES.get(str(line.get_linestyle()), "")}
     for transform, axis, values in (
@@ -131,7 +139,7 @@ def _line(ax: Axes, line: Line2D) -> list[dict]:
     return [{"kind": "line", **_thinned(x, y), **style}]
 
 
-def _thinned(x: np.ndarray, y: np.ndarray) -> dict:
+def _thinned(x: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     """At most MOST_POINTS points that look the same: along rising x, the least and the largest of each stretch."""
     if x.size > MOST_POINTS:
         if (np.diff(x) >= 0).all():
@@ -154,7 +162,7 @@ def _box(ax: Axes, patch: Rectangle) -> list[float | None]:
     return _numbers([x0, x1, y0, y1])
 
 
-def _rectangle(ax: Axes, patch: Rectangle) -> list[dict]:
+def _rectangle(ax: Axes, patch: Rectangle) -> list[dict[str, Any]]:
     faint = to_rgba(patch.get_facecolor())
     look = {"colours": [_colour(faint)], "alpha": float(faint[3]), "label": _label(patch)}
     if faint[3] == 0:
@@ -162,7 +170,7 @@ def _rectangle(ax: Axes, patch: Rectangle) -> list[dict]:
     return [{"kind": "bars", "boxes": [_box(ax, patch)], **look}]
 
 
-def _points(ax: Axes, points: PathCollection) -> list[dict]:
+def _points(ax: Axes, points: PathCollection) -> list[dict[str, Any]]:
     places = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float)
     x, y = places[:, 0], places[:, 1]
     faces, sizes = np.atleast_2d(points.get_facecolor()), points.get_sizes()
@@ -173,7 +181,7 @@ def _points(ax: Axes, points: PathCollection) -> list[dict]:
              "label": _label(points), "alpha": _alpha(points)}]  # fmt: skip
 
 
-def _polygons(ax: Axes, areas: PolyCollection) -> list[dict]:
+def _polygons(ax: Axes, areas: PolyCollection) -> list[dict[str, Any]]:
     face = np.atleast_2d(areas.get_facecolor())
     if len(face) == 0:
         raise Undescribed("areas without a colour")
@@ -184,7 +192,7 @@ def _polygons(ax: Axes, areas: PolyCollection) -> list[dict]:
     ]  # fmt: skip
 
 
-def _polygon(ax: Axes, patch: Polygon) -> list[dict]:
+def _polygon(ax: Axes, patch: Polygon) -> list[dict[str, Any]]:
     face = to_rgba(patch.get_facecolor())
     corners = np.asarray(patch.get_xy())
     x, y = corners[:, 0], corners[:, 1]
@@ -192,7 +200,7 @@ def _polygon(ax: Axes, patch: Polygon) -> list[dict]:
              "label": _label(patch)}]  # fmt: skip
 
 
-def _segments(ax: Axes, lines: LineCollection) -> list[dict]:
+def _segments(ax: Axes, lines: LineCollection) -> list[dict[str, Any]]:
     gap = np.full((1, 2), np.nan)
     points = np.concatenate([part for segment in lines.get_segments() for part in (np.asarray(segment), gap)])
     x, y = points[:, 0], points[:, 1]
@@ -201,7 +209,7 @@ def _segments(ax: Axes, lines: LineCollection) -> list[dict]:
              "alpha": _alpha(lines)}]  # fmt: skip
 
 
-def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict]:
+def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict[str, Any]]:
     corners = np.asarray(mesh.get_coordinates(), float)
     x, y = corners[0, :, 0], corners[:, 0, 1]
     if not (np.allclose(corners[..., 0], x) and np.allclose(corners[..., 1].T, y)):
@@ -210,7 +218,7 @@ def _mesh(ax: Axes, mesh: QuadMesh) -> list[dict]:
     return [_field(mesh, values.reshape(values.shape[-2:]), (x[0], x[-1]), (y[0], y[-1]))]
 
 
-def _image(ax: Axes, image: AxesImage) -> list[dict]:
+def _image(ax: Axes, image: AxesImage) -> list[dict[str, Any]]:
     values = np.ma.filled(np.ma.asarray(image.get_array()).astype(float), np.nan)
     if values.ndim != 2:
         raise Undescribed("a picture of colours")
@@ -218,7 +226,7 @@ def _image(ax: Axes, image: AxesImage) -> list[dict]:
     return [_field(image, values if image.origin == "lower" else values[::-1], (left, right), (bottom, top))]
 
 
-def _field(artist, values: np.ndarray, x, y) -> dict:
+def _field(artist: QuadMesh | AxesImage, values: Floats, x: ArrayLike, y: ArrayLike) -> dict[str, Any]:
     """Values over a grid, in 255 steps of its colours; 255 means none."""
     every = [max(1, -(-n // most)) for n, most in zip(values.shape, MOST_CELLS)]
     values = values[:: every[0], :: every[1]]
@@ -238,11 +246,11 @@ def _field(artist, values: np.ndarray, x, y) -> dict:
     }
 
 
-def _words(ax: Axes, text) -> list[dict]:
+def _words(ax: Axes, text: Text) -> list[dict[str, Any]]:
     if not text.get_text().strip():
         return []
     shift, at = (0.0, 0.0), text.get_position()
-    transform = text.get_transform()
+    transform: Any = text.get_transform()
     if isinstance(text, Annotation):
         at = text.xy
         if text.anncoords == "offset points":
@@ -250,19 +258,20 @@ def _words(ax: Axes, text) -> list[dict]:
             transform = text.xycoords
         elif text.anncoords != "data":
             raise Undescribed("a note away from what it notes")
-    at = [float(v) for v in (ax.convert_xunits(at[0]), ax.convert_yunits(at[1]))]
+    x, y = float(ax.convert_xunits(at[0])), float(ax.convert_yunits(at[1]))
     if transform in ("axes fraction", ax.transAxes):
         frame = "axes"
     elif transform in ("data", ax.transData) or isinstance(text, Annotation):
         frame = "data"
     else:
         raise Undescribed("a text that is not in the axes' coordinates")
-    return [{"kind": "text", "x": at[0], "y": at[1], "frame": frame, "text": _text(text.get_text()),
+    return [{"kind": "text", "x": x, "y": y, "frame": frame, "text": _text(text.get_text()),
              "shift": [shift[0] * POINTS, -shift[1] * POINTS], "colour": _colour(text.get_color()),
-             "across": text.get_ha(), "up": text.get_va(), "size": round(text.get_fontsize() * POINTS, 1)}]  # fmt: skip
+             "across": text.get_horizontalalignment(), "up": text.get_verticalalignment(),
+             "size": round(float(text.get_fontsize()) * POINTS, 1)}]  # fmt: skip
 
 
-KINDS: dict[type, Callable[[Axes, Any], list[dict]]] = {
+KINDS: dict[type, Callable[[Axes, Any], list[dict[str, Any]]]] = {
     Line2D: _line,
     Rectangle: _rectangle,
     Polygon: _polygon,
@@ -275,19 +284,20 @@ KINDS: dict[type, Callable[[Axes, Any], list[dict]]] = {
 }
 
 
-def _numbers(values) -> list[float | None]:
+def _numbers(values: ArrayLike) -> list[float | None]:
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, float)]
 
 
-def _colour(colour) -> str:
+def _colour(colour: Any) -> str:
     return to_hex(colour)
 
 
-def _alpha(artist) -> float:
-    return 1.0 if artist.get_alpha() is None else float(artist.get_alpha())
+def _alpha(artist: Artist) -> float:
+    alpha = artist.get_alpha()
+    return 1.0 if alpha is None else float(alpha)
 
 
-def _label(artist) -> str:
+def _label(artist: Artist | BarContainer) -> str:
     label = str(artist.get_label() or "")
     return "" if label.startswith("_") else _text(label)
 

@@ -1,6 +1,7 @@
 """Figures of many cases."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 from workbench.draw.style import new_figure
 
 
-def plot_cases(rows: Sequence[dict], *, x: str, y: str, by: str) -> Figure:
+def plot_cases(rows: Sequence[dict[str, Any]], *, x: str, y: str, by: str) -> Figure:
     """One quantity over another, a line for each value of a third; y is logarithmic where all of it is positive."""
     values = sorted({row[by] for row in rows})
     figure, ax = new_figure(width=9, height=4.5)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from workbench.design.loop.closed_loop import Response
 from workbench.rig.actuators import Actuator
@@ -22,7 +23,7 @@ SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 def response_motion(
     responses: Mapping[str, Response], *, actuators: Sequence[Actuator] = (), sensors: Sequence[Sensor] = ()
-) -> dict:
+) -> dict[str, Any]:
     """Responses of one structure, moving on one picture.
 
     Args:
@@ -60,7 +61,7 @@ def mode_motion(
     *,
     actuators: Sequence[Actuator] = (),
     sensors: Sequence[Sensor] = (),
-) -> dict:
+) -> dict[str, Any]:
     """Mode shapes in motion, one mode at a time; several sets of modes over each other, each scaled to one.
 
     Sampled modes are shown at their sensors, with the phase that each sensor has. A plate is a net of lines and a frame
@@ -74,7 +75,7 @@ def mode_motion(
         return _net_motion(
             {name: found for name, found in modes.items() if isinstance(found, Modes)}, actuators, sensors
         )
-    tracks: list[dict] = []
+    tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
             placed = np.isfinite(found.positions).all()
@@ -104,11 +105,11 @@ def mode_motion(
     return {"kind": "modes", "x": tracks[0]["x"], "tracks": tracks, **_places(actuators, sensors)}
 
 
-def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict:
+def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
     first = next(iter(modes.values()))
     spots = _plate_net(first.domain) if isinstance(first.domain, Rectangle) else _frame_net(first.domain)
     size = np.ptp(spots.rest, axis=0).max()
-    tracks: list[dict] = []
+    tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         moves = spots.moves(found)
         moves = moves * SWAY * size / np.maximum(np.abs(moves).max(axis=(0, 1)), 1e-300)
@@ -212,14 +213,14 @@ def _neighbours(at: np.ndarray) -> list[list[int]]:
     return pairs
 
 
-def _places(actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict:
+def _places(actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
     return {
         "actuators": [{"name": a.name, "at": float(cast(float, a.at))} for a in actuators],
         "sensors": [{"name": s.name, "at": float(cast(float, s.at))} for s in sensors],
     }
 
 
-def _numbers(values) -> list:
+def _numbers(values: ArrayLike) -> list[Any]:
     values = np.asarray(values, float)
     if values.ndim > 1:
         return [_numbers(row) for row in values]

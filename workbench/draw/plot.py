@@ -3,6 +3,7 @@
 from functools import singledispatch
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workbench.design.estimation.modal_filter import ModalFilter
@@ -34,7 +35,7 @@ MOST_PANELS = 12
 
 
 @singledispatch
-def plot(result) -> Figure:
+def plot(result: object) -> Figure:
     """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
     `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion`, `Verdict` or `Redesign`.
 
@@ -169,7 +170,7 @@ def _(result: Redesign) -> Figure:
     return plot_redesign(result)
 
 
-def _panels(count: int):
+def _panels(count: int) -> tuple[Figure, list[Axes]]:
     columns = min(count, 3)
     rows = -(-count // columns)
     figure, axes = new_figure(rows, columns, width=10, height=0.6 + 2.1 * rows, squeeze=False, sharex=True)

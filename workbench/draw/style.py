@@ -33,8 +33,10 @@ SETTINGS: Any = {
 matplotlib.rcParams.update(SETTINGS)
 
 
-def new_figure(rows: int = 1, cols: int = 1, *, width: float = 9.0, height: float = 4.5, **options):
-    """A figure in the house style and its axes, as `Figure.subplots` gives them."""
+def new_figure(
+    rows: int = 1, cols: int = 1, *, width: float = 9.0, height: float = 4.5, **options: Any
+) -> tuple[Figure, Any]:
+    """A figure in the house style and its axes, as `Figure.subplots` gives them: one, or an array."""
     figure = Figure(figsize=(width, height), layout="constrained")
     return figure, figure.subplots(rows, cols, **options)
 

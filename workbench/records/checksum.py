@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterable, Mapping
+from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 KEY = "crc32"
 
 
-def checksum(description: Mapping, signals: Iterable[np.ndarray]) -> int:
+def checksum(description: Mapping[str, Any], signals: Iterable[np.ndarray]) -> int:
     """CRC-32 of a record's description, without the sum itself, and of its signals."""
     told = json.dumps({key: value for key, value in description.items() if key != KEY}, sort_keys=True)
     total = crc32(told.encode())

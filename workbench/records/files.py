@@ -5,15 +5,18 @@ an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF.
 changed since. Files of other programs have none of it: their signals are all outputs, named as the file names them.
 """
 
+from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 
+from workbench.arrays import Floats
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
 from workbench.records.assembly import legible, record_of
 from workbench.records.checksum import KEY, checksum
 from workbench.records.file_error import RecordFileError, unreadable
 from workbench.records.limits import DEFAULT, Limits, check_size
 from workbench.records.named_arrays import signals_of
-from workbench.records.record import Record
+from workbench.records.record import Channel, Record
 from workbench.records.transfer_assembly import complex_columns, holds_transfer, transfer_of
 from workbench.records.transfer_functions import TransferFunctions
 
@@ -131,13 +134,13 @@ def write_record(record: Record, path: str | Path) -> Path:
     return path
 
 
-def _format(path: Path):
+def _format(path: Path) -> ModuleType:
     if path.suffix.lower() not in FORMATS:
         raise RecordFileError(f"{path}: the ending {path.suffix!r} names no format; use one of {', '.join(FORMATS)}")
     return FORMATS[path.suffix.lower()]
 
 
-def _rows(record: Record):
+def _rows(record: Record) -> Iterator[tuple[str, Channel, Floats]]:
     for channel, row in zip(record.input_channels, record.inputs, strict=True):
         yield "input", channel, row
     for channel, row in zip(record.output_channels, record.outputs, strict=True):

@@ -49,7 +49,7 @@ def _is_numeric(dataset: Any) -> bool:
 def _numbers(dataset: Any) -> int:
     """Numbers in a dataset, each of whose elements may be an array."""
     size = int(dataset.size or 0)
-    return max(size, -(-size * dataset.dtype.itemsize // (2 * BYTES_PER_NUMBER)))
+    return max(size, -(-size * int(dataset.dtype.itemsize) // (2 * BYTES_PER_NUMBER)))
 
 
 def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:

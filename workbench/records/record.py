@@ -142,15 +142,15 @@ class Record(Printed):
 
     @property
     def n_samples(self) -> int:
-        return self.outputs.shape[1]
+        return int(self.outputs.shape[1])
 
     @property
     def n_outputs(self) -> int:
-        return self.outputs.shape[0]
+        return len(self.outputs)
 
     @property
     def n_inputs(self) -> int:
-        return self.inputs.shape[0]
+        return len(self.inputs)
 
     @property
     def time(self) -> np.ndarray:

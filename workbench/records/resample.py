@@ -31,7 +31,8 @@ def decimate(record: Record, factor: int) -> Record:
         )
 
     def reduced(signals: np.ndarray) -> np.ndarray:
-        return oaconvolve(signals, taps[None], axes=1)[:, taps.size : record.n_samples : factor]
+        filtered: np.ndarray = oaconvolve(signals, taps[None], axes=1)
+        return filtered[:, taps.size : record.n_samples : factor]
 
     return Record(
         sample_time=factor * record.sample_time,

@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,7 @@ def transfer_of(
         raise RecordFileError(f"{path}: {error}") from error
 
 
-def _lines(path: Path, arrays: Mapping, found: Mapping, sample_rate_hz: float | None) -> np.ndarray:
+def _lines(path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], sample_rate_hz: float | None) -> np.ndarray:
     """Hz."""
     real = {
         name: np.ravel(v) for name, v in arrays.items() if v.dtype.kind in "fiu" and max(v.shape, default=1) == v.size
@@ -118,7 +119,9 @@ def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> 
     return np.moveaxis(values, along[0], -1)
 
 
-def _points(path: Path, arrays: Mapping, names: list[str], n_references: int):
+def _points(
+    path: Path, arrays: Mapping[str, Any], names: list[str], n_references: int
+) -> tuple[tuple[Channel, ...], tuple[str, ...]]:
     """Channels and references: as the file tells them, else numbered."""
     if TOLD in arrays:
         try:

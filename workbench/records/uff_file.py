@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyuff
@@ -64,7 +65,7 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     return arrays | {HEADER: np.array(json.dumps(header))}
 
 
-def _transfer(path: Path, sets: list[dict]) -> dict[str, np.ndarray]:
+def _transfer(path: Path, sets: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     """All pairs of response and reference as one array, with their lines and names."""
     lines = np.asarray(sets[0]["x"], float)
     found: dict[tuple[str, str], np.ndarray] = {}
@@ -96,7 +97,7 @@ def as_stored(values: np.ndarray) -> np.ndarray:
     return np.array(("%.11e " * values.size % tuple(values)).split(), float)
 
 
-def _facts(where: str, entry: dict) -> dict:
+def _facts(where: str, entry: dict[str, Any]) -> dict[str, Any]:
     """Our own description out of the five text lines, or what the data set itself says."""
     text = "".join(str(entry.get(f"id{i}", "")) for i in range(1, 6))
     if not any(sign in text for sign in OURS):
@@ -109,7 +110,7 @@ def _facts(where: str, entry: dict) -> dict:
         raise RecordFileError(f"{where}: its description is damaged: {error}") from error
 
 
-def write(path: Path, time: np.ndarray, signals: dict, header: dict) -> None:
+def write(path: Path, time: np.ndarray, signals: dict[str, Any], header: dict[str, Any]) -> None:
     """Write one data set a signal, in double precision.
 
     Raises:

@@ -6,20 +6,12 @@ or `Between` two: w is then the displacement of the first less that of the secon
 
 from dataclasses import dataclass
 
-from workbench.structure.domain import Where, same_place
-
-
-class _AtPlace:
-    """What stands at a place, or between two: kept as a float, a pair or a name, whatever it was given as."""
-
-    at: Where
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "at", same_place(self.at))
+from workbench.structure.domain import Where
+from workbench.structure.supports import AtPlace
 
 
 @dataclass(frozen=True)
-class LinearSpring(_AtPlace):
+class LinearSpring(AtPlace):
     """-k w at x, k in N/m; in the rig rather than in the structure, so the modes stay what they are."""
 
     at: Where
@@ -27,7 +19,7 @@ class LinearSpring(_AtPlace):
 
 
 @dataclass(frozen=True)
-class LinearDamper(_AtPlace):
+class LinearDamper(AtPlace):
     """-c v at x, c in N s/m."""
 
     at: Where
@@ -35,7 +27,7 @@ class LinearDamper(_AtPlace):
 
 
 @dataclass(frozen=True)
-class CubicSpring(_AtPlace):
+class CubicSpring(AtPlace):
     """-k w³ at x, k in N/m³; negative softens."""
 
     at: Where
@@ -43,7 +35,7 @@ class CubicSpring(_AtPlace):
 
 
 @dataclass(frozen=True)
-class PowerSpring(_AtPlace):
+class PowerSpring(AtPlace):
     """-F |w / w_r|^p in the direction of w, at x: F (N), negative to soften, at the displacement w_r (m); p ≥ 1."""
 
     at: Where
@@ -53,7 +45,7 @@ class PowerSpring(_AtPlace):
 
 
 @dataclass(frozen=True)
-class EvenSpring(_AtPlace):
+class EvenSpring(AtPlace):
     """-F |w / w_r|^p to one side, whichever way w points, at x: F (N) at the displacement w_r (m), p at least 1."""
 
     at: Where
@@ -63,7 +55,7 @@ class EvenSpring(_AtPlace):
 
 
 @dataclass(frozen=True)
-class PowerDamper(_AtPlace):
+class PowerDamper(AtPlace):
     """-F |v / v_r|^p in the direction of v, at x: F (N) at the velocity v_r (m/s), p at least 1."""
 
     at: Where
@@ -73,7 +65,7 @@ class PowerDamper(_AtPlace):
 
 
 @dataclass(frozen=True)
-class Clearance(_AtPlace):
+class Clearance(AtPlace):
     """Springs k (N/m) that touch at w > gap and at w < -gap (m)."""
 
     at: Where
@@ -82,7 +74,7 @@ class Clearance(_AtPlace):
 
 
 @dataclass(frozen=True)
-class OneSidedStop(_AtPlace):
+class OneSidedStop(AtPlace):
     """A spring k (N/m) that touches at w > gap (m)."""
 
     at: Where
@@ -91,7 +83,7 @@ class OneSidedStop(_AtPlace):
 
 
 @dataclass(frozen=True)
-class CoulombFriction(_AtPlace):
+class CoulombFriction(AtPlace):
     """-F tanh(v / v_s) - F_0 at x: force F and offset F_0 in N, smoothing speed v_s in m/s.
 
     Friction of two directions, F_+ forward and F_- backward, has F = (F_+ + F_-) / 2 and F_0 = (F_+ - F_-) / 2.
@@ -104,7 +96,7 @@ class CoulombFriction(_AtPlace):
 
 
 @dataclass(frozen=True)
-class BoucWen(_AtPlace):
+class BoucWen(AtPlace):
     """A hysteretic spring -k z at x, z' = v - (|v| z + v |z|) / (2 z_y): k in N/m, yield displacement z_y in m."""
 
     at: Where
@@ -113,7 +105,7 @@ class BoucWen(_AtPlace):
 
 
 @dataclass(frozen=True)
-class UserLaw(_AtPlace):
+class UserLaw(AtPlace):
     """A force law of the user's own at x.
 
     Attributes:
@@ -142,7 +134,7 @@ class MidplaneStretching:
 
 
 @dataclass(frozen=True)
-class PeriodicForce(_AtPlace):
+class PeriodicForce(AtPlace):
     """amplitude sin(2π f t + phase) at x, t from the start of the record: N, Hz, rad."""
 
     at: Where
@@ -152,7 +144,7 @@ class PeriodicForce(_AtPlace):
 
 
 @dataclass(frozen=True)
-class RandomForce(_AtPlace):
+class RandomForce(AtPlace):
     """An unmeasured random force at x: rms in N. No prediction can hold it, only its statistics."""
 
     at: Where

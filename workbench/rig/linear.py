@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from workbench.arrays import Complexes, Floats
 from workbench.structure.modes import modal_state_matrix
 
 CLOSE = 1e-9  # of a lag's rate: nearer, a pole is as good as on it
@@ -49,7 +50,7 @@ def modal_poles(omega: np.ndarray, damping: np.ndarray) -> ModalPoles:
 
 
 @njit(cache=True, nogil=True)
-def _recursion(decay, drive, out):
+def _recursion(decay: Complexes, drive: Complexes, out: Complexes) -> None:
     """out[i, k + 1] = decay[i] out[i, k] + drive[i, k], out[:, 0] given."""
     for i in range(drive.shape[0]):
         s = out[i, 0]
@@ -182,7 +183,8 @@ class _StraightPieces:
         if span == 0:
             return np.zeros((poles.size, ends.shape[2]))
         level, rise = _growth(poles, span), _ramp_growth(poles, span)
-        return level[:, None] * (weights @ ends[0]) + rise[:, None] * (weights @ (ends[1] - ends[0]))
+        added: np.ndarray = level[:, None] * (weights @ ends[0]) + rise[:, None] * (weights @ (ends[1] - ends[0]))
+        return added
 
 
 def sinusoid_response(
@@ -208,8 +210,11 @@ def modal_motion(system: ModalPoles, response: np.ndarray) -> tuple[np.ndarray, 
     return _real_product(system.shapes, response), _real_product(rates, response)
 
 
-def _real_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return a.real @ np.ascontiguousarray(b.real) - (a.imag @ np.ascontiguousarray(b.imag) if np.iscomplexobj(a) else 0)
+def _real_product(a: np.ndarray, b: np.ndarray) -> Floats:
+    product: Floats = a.real @ np.ascontiguousarray(b.real)
+    if np.iscomplexobj(a):
+        product = product - a.imag @ np.ascontiguousarray(b.imag)
+    return product
 
 
 def _growth(poles: np.ndarray, span: float) -> np.ndarray:
@@ -228,12 +233,13 @@ def _ramp_growth(poles: np.ndarray, span: float) -> np.ndarray:
     return span * np.where(small, series, (np.expm1(z) - z) / np.where(small, 1.0, z) ** 2)
 
 
-def _faded_growth(poles: np.ndarray, rate: float, span: float) -> np.ndarray:
+def _faded_growth(poles: Complexes, rate: float, span: float) -> Complexes:
     """∫_0^span e^{λ (span - t)} e^{-rate t} dt."""
     total = (poles + rate) * span
     near = np.abs(total) < 1.0
     difference = np.exp(poles * span) - np.exp(-rate * span)
-    return np.where(near, np.exp(-rate * span) * np.expm1(np.where(near, total, 0.0)), difference) / (poles + rate)
+    grown: Complexes = np.where(near, np.exp(-rate * span) * np.expm1(np.where(near, total, 0.0)), difference)
+    return grown / (poles + rate)
 
 
 def _shifted(values: np.ndarray, samples: int) -> np.ndarray:

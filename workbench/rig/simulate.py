@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
+from workbench.arrays import Floats, Integers
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.between_samples import BetweenSamples
@@ -80,11 +81,11 @@ class Motion:
         held: whether the forces stay as they are from sample to sample.
     """
 
-    displacement: np.ndarray
-    velocity: np.ndarray
-    forces: np.ndarray
-    stiffness: np.ndarray
-    damping: np.ndarray
+    displacement: Floats
+    velocity: Floats
+    forces: Floats
+    stiffness: Floats
+    damping: Floats
     held: bool = False
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
@@ -93,10 +94,11 @@ class Motion:
             q, v, forces = self.displacement, self.velocity, self.forces
             found = BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time, held=self.held)
             object.__setattr__(self, "_between_samples", found)
-        return self.__dict__["_between_samples"]
+        known: BetweenSamples = self.__dict__["_between_samples"]
+        return known
 
     @cached_property
-    def acceleration(self) -> np.ndarray:
+    def acceleration(self) -> Floats:
         """(n_modes, n_samples) of the modal coordinates."""
         return self.forces - self.stiffness * self.displacement - self.damping @ self.velocity
 
@@ -407,7 +409,9 @@ def _step(
     return participation, at_samples
 
 
-def _left_to_motion(rig: Rig, outputs: np.ndarray, reading, orders, participation, at_samples) -> np.ndarray:
+def _left_to_motion(
+    rig: Rig, outputs: Floats, reading: Floats, orders: Integers, participation: Floats, at_samples: Floats
+) -> Floats:
     """Outputs (n_sensors, n_samples) without biases, drifts, and the accelerations under the actuators' own forces."""
     known = outputs.copy()
     for j, sensor in enumerate(rig.sensors):
@@ -420,7 +424,7 @@ def _left_to_motion(rig: Rig, outputs: np.ndarray, reading, orders, participatio
 
 
 @cache
-def _stepper(laws: tuple[Callable, ...]):
+def _stepper(laws: tuple[Callable[[float, float, Floats], float], ...]) -> Callable[..., None]:
     if not laws:
         return step_record
     if len(set(laws)) > 1:
@@ -428,13 +432,13 @@ def _stepper(laws: tuple[Callable, ...]):
     return make_stepper(laws[0])
 
 
-def along(rig: Rig, derivative: int) -> tuple[np.ndarray, np.ndarray]:
+def along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:
     """Shapes and weights at Gauss points along the structure, fine enough for products of four of its shapes."""
     points, weights = rig.modes.domain.quadrature(max(3 * rig.modes.n_modes + 12, 30))
     return rig.modes.phi(points, derivative), weights
 
 
-def stretching_of(rig: Rig) -> np.ndarray:
+def stretching_of(rig: Rig) -> Floats:
     """∫ φ_r' φ_s' dx, (n_modes, n_modes)."""
     slopes, weights = along(rig, 1)
     return slopes.T @ (weights[:, None] * slopes)
@@ -518,7 +522,7 @@ def _lagged(truth: np.ndarray, time_constant: float, sample_time: float, *, sett
     new = 1.0 - (1.0 - fade) / ratio
     old = (1.0 - fade) / ratio - fade
     first = truth[0] if settled else 0.0
-    filtered, _ = lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])
+    filtered: np.ndarray = lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0]
     return filtered
 
 

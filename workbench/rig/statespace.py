@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import control
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.modes import Modes
@@ -73,7 +74,9 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     )
 
 
-def _with_actuator_lags(a, b, c, d, states, actuators):
+def _with_actuator_lags(
+    a: Floats, b: Floats, c: Floats, d: Floats, states: list[str], actuators: Sequence[Actuator]
+) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
     for j, actuator in enumerate(actuators):
         if actuator.time_constant > 0:
             rate = 1.0 / actuator.time_constant
@@ -89,7 +92,9 @@ def _with_actuator_lags(a, b, c, d, states, actuators):
     return a, b, c, d, states
 
 
-def _with_sensor_lags(a, b, c, d, states, sensors):
+def _with_sensor_lags(
+    a: Floats, b: Floats, c: Floats, d: Floats, states: list[str], sensors: Sequence[Sensor]
+) -> tuple[Floats, Floats, Floats, Floats, list[str]]:
     for j, sensor in enumerate(sensors):
         if sensor.time_constant > 0:
             rate = 1.0 / sensor.time_constant

@@ -6,10 +6,13 @@ the end of the substep (Newton, safeguarded by bisection), so stiff contacts and
 """
 
 import math
+from collections.abc import Callable
 from types import FunctionType
 
 import numpy as np
 from numba import njit
+
+from workbench.arrays import Floats, Integers
 
 LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = range(6)
 CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
@@ -19,13 +22,13 @@ LANES = 8  # modes that are worked on at once; a number of them that is no multi
 
 
 @njit(cache=True, nogil=True)
-def user_law(w, v, p):
+def user_law(w: float, v: float, p: Floats) -> float:
     """Stands for the law of the user's own, until `make_stepper` puts one in its place."""
     return 0.0
 
 
 @njit(cache=True, nogil=True)
-def propagators(omega, c, h, out):
+def propagators(omega: Floats, c: Floats, h: float, out: Floats) -> None:
     """Fill out (2, 4, n_modes): q and q' after h from (q, q', force at start, force at end), force linear between."""
     for r in range(omega.size):
         w = omega[r]
@@ -50,7 +53,7 @@ def propagators(omega, c, h, out):
 
 
 @njit(cache=True, nogil=True)
-def _moments(pole, h, e):
+def _moments(pole: complex, h: float, e: complex) -> tuple[complex, complex]:
     z = pole * h
     if abs(z) < 0.05:
         p = h * (1 + z / 2 * (1 + z / 3 * (1 + z / 4 * (1 + z / 5 * (1 + z / 6 * (1 + z / 7))))))
@@ -61,7 +64,7 @@ def _moments(pole, h, e):
 
 
 @njit(cache=True, nogil=True)
-def yield_update(z, dw, limit):
+def yield_update(z: float, dw: float, limit: float) -> tuple[float, float]:
     """Bouc-Wen z after a monotone travel dw, and dz/d(dw): exact, since the law does not depend on the speed."""
     s = 1.0 if dw >= 0 else -1.0
     left = abs(dw)
@@ -76,7 +79,7 @@ def yield_update(z, dw, limit):
 
 
 @njit(cache=True, nogil=True)
-def hysteresis(path, limit):
+def hysteresis(path: Floats, limit: float) -> Floats:
     """Bouc-Wen z (n_samples,) along a path (n_samples,) that is monotone between its samples, from 0."""
     z = np.zeros_like(path)
     for k in range(1, path.size):
@@ -85,7 +88,7 @@ def hysteresis(path, limit):
 
 
 @njit(cache=True, nogil=True)
-def ramped(targets, most):
+def ramped(targets: Floats, most: float) -> tuple[Floats, Floats]:
     """Mean over each step, and value at its start, of what heads for targets (n_steps,) by at most `most` a step."""
     mean, start = np.empty_like(targets), np.empty_like(targets)
     value = 0.0
@@ -102,7 +105,7 @@ def ramped(targets, most):
 
 
 @njit(cache=True, nogil=True)
-def _power(w, p):
+def _power(w: float, p: Floats) -> tuple[float, float]:
     """-F |w / w_r|^e against w, with (F, w_r, e) = p, and its slope."""
     level = abs(w) / p[1]
     less = p[0] * level ** (p[2] - 1.0) / p[1]
@@ -110,7 +113,9 @@ def _power(w, p):
 
 
 @njit(cache=True, nogil=True)
-def element_force(kind, parameters, i, w, v, z, w_old):
+def element_force(
+    kind: int, parameters: Floats, i: int, w: float, v: float, z: float, w_old: float
+) -> tuple[float, float, float]:
     """The force of element i, and its derivatives with respect to w and v."""
     a, b = parameters[i, 0], parameters[i, 1]
     if kind == LINEAR_SPRING:
@@ -149,7 +154,18 @@ def element_force(kind, parameters, i, w, v, z, w_old):
 
 
 @njit(cache=True, nogil=True)
-def solve_element(kind, parameters, i, w0, v0, aw, av, z, w_old, start):
+def solve_element(
+    kind: int,
+    parameters: Floats,
+    i: int,
+    w0: float,
+    v0: float,
+    aw: float,
+    av: float,
+    z: float,
+    w_old: float,
+    start: float,
+) -> float:
     """The force f of element i with f = law(w0 + aw f, v0 + av f): Newton, safeguarded by bisection."""
     f = start
     low, high = -math.inf, math.inf
@@ -176,7 +192,18 @@ def solve_element(kind, parameters, i, w0, v0, aw, av, z, w_old, start):
 
 
 @njit(cache=True, nogil=True)
-def solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, f, g):
+def solve_pair(
+    kinds: Integers,
+    parameters: Floats,
+    w_free: Floats,
+    v_free: Floats,
+    aw: Floats,
+    av: Floats,
+    z: Floats,
+    w_old: Floats,
+    f: float,
+    g: float,
+) -> tuple[float, float, bool]:
     """The forces f and g of two elements that obey their laws, by Newton from f and g, and whether it settled."""
     for _ in range(6):
         w, v = w_free[0] + aw[0, 0] * f + aw[0, 1] * g, v_free[0] + av[0, 0] * f + av[0, 1] * g
@@ -198,12 +225,22 @@ def solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, f, g):
 
 
 @njit(cache=True, nogil=True)
-def _close(one, other):
+def _close(one: float, other: float) -> float:
     return SETTLED * (abs(one) + abs(other)) + 1e-300
 
 
 @njit(cache=True, nogil=True)
-def solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, force):
+def solve_in_turn(
+    kinds: Integers,
+    parameters: Floats,
+    w_free: Floats,
+    v_free: Floats,
+    aw: Floats,
+    av: Floats,
+    z: Floats,
+    w_old: Floats,
+    force: Floats,
+) -> None:
     """Fill the forces of all elements from what they are, one after the other until none moves."""
     for _ in range(12):
         largest = 0.0
@@ -221,7 +258,17 @@ def solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, force):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, out):
+def spread_forces(
+    q: Floats,
+    v: Floats,
+    stretch: float,
+    stretching: Floats,
+    drag_shapes: Floats,
+    drag_weights: Floats,
+    push: Floats,
+    coupling: Floats,
+    out: Floats,
+) -> None:
     """Fill the modal forces (n_modes,) of what acts all along, or couples the modes; push is a work array."""
     n = q.size
     out[:] = 0.0
@@ -250,21 +297,21 @@ def spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, co
 
 
 @njit(cache=True, nogil=True)
-def _widened(values, n, rest):
+def _widened(values: Floats, n: int, rest: float) -> Floats:
     wide = np.full(n, rest)
     wide[: values.size] = values
     return wide
 
 
 @njit(cache=True, nogil=True)
-def _widened_rows(values, n):
+def _widened_rows(values: Floats, n: int) -> Floats:
     wide = np.zeros((n, values.shape[1]))
     wide[: values.shape[0]] = values
     return wide
 
 
 @njit(cache=True, nogil=True)
-def _widened_square(values, n):
+def _widened_square(values: Floats, n: int) -> Floats:
     if values.size == 0:
         return values
     wide = np.zeros((n, n))
@@ -274,31 +321,31 @@ def _widened_square(values, n):
 
 @njit(cache=True, nogil=True, fastmath=FAST)
 def step_record(
-    omega,
-    c,
-    coupling,
-    dt,
-    n_sub,
-    rate,
-    starts,
-    ends,
-    participation,
-    stretch,
-    stretching,
-    drag_shapes,
-    drag_weights,
-    kinds,
-    shapes,
-    parameters,
-    measured,
-    orders,
-    reading,
-    gain,
-    q_out,
-    v_out,
-    f_out,
-    error_out,
-):
+    omega: Floats,
+    c: Floats,
+    coupling: Floats,
+    dt: float,
+    n_sub: int,
+    rate: float,
+    starts: Floats,
+    ends: Floats,
+    participation: Floats,
+    stretch: float,
+    stretching: Floats,
+    drag_shapes: Floats,
+    drag_weights: Floats,
+    kinds: Integers,
+    shapes: Floats,
+    parameters: Floats,
+    measured: Floats,
+    orders: Integers,
+    reading: Floats,
+    gain: Floats,
+    q_out: Floats,
+    v_out: Floats,
+    f_out: Floats,
+    error_out: Floats,
+) -> None:
     """Fill q_out, v_out and the element forces f_out, each (n_modes, n_samples), from rest; or error_out.
 
     starts, ends (n_inputs, n_samples * n_sub) of forces that run straight over each substep; participation
@@ -437,9 +484,10 @@ def step_record(
                 w_old[i] = w
 
 
-def make_stepper(law):
+def make_stepper(law: Callable[[float, float, Floats], float]) -> Callable[..., None]:
     """`step_record` with force(w, v, parameters) = `law` for the elements of kind USER, compiled for it."""
     scope = dict(globals(), user_law=njit(nogil=True)(law))
     for name in ("element_force", "solve_element", "solve_pair", "solve_in_turn", "step_record"):
         scope[name] = njit(nogil=True)(FunctionType(globals()[name].py_func.__code__, scope, name))
-    return scope["step_record"]
+    stepper: Callable[..., None] = scope["step_record"]
+    return stepper

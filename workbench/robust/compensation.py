@@ -11,16 +11,18 @@ and slow sensors are told by what they read of each mode at its frequency, H_j(i
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
 
+from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays
 from workbench.design.estimation.observers import observed_plant
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.rig_loop import named
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
@@ -123,13 +125,13 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
         DesignError: a rate too slow for the modes.
     """
     check_rate(loop.modes, loop.law.controlled, sample_time)
-    actuators = [_named(rig.actuators, a.name) for a in loop.law.actuators]
-    sensors = [_named(rig.sensors, s.name) for s in loop.controller.sensors]
+    actuators = [named(rig.actuators, a.name) for a in loop.law.actuators]
+    sensors = [named(rig.sensors, s.name) for s in loop.controller.sensors]
     aware = "delay" in steps
     model = _model(loop, actuators, sample_time, aware)
     a, b, c, d, e = _matrices(model, loop, sensors, aware, "sensors" in steps)
     gains = np.array([x.gain for x in actuators])
-    parts: dict = {}
+    parts: dict[str, Any] = {}
     if "dead zone" in steps:
         parts["dead_zone"] = np.array([x.dead_zone for x in actuators]) / np.abs(gains)
         parts["bias"] = np.array([x.bias for x in actuators]) / gains
@@ -149,10 +151,6 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
         parts["friction"] = _friction(rig, loop, model, a, b, d)
     names = tuple(s.name for s in sensors), tuple(x.name for x in actuators)
     return DigitalController(sample_time, *names, a, b, c, d, e, **parts, name=loop.controller.name)
-
-
-def _named(parts: Sequence, name: str):
-    return next(part for part in parts if part.name == name)
 
 
 def _model(loop: Loop, actuators: Sequence[Actuator], sample_time: float, aware: bool) -> _Model:
@@ -253,7 +251,8 @@ def _wanted(model: _Model, loop: Loop) -> np.ndarray:
         return rows
     gain = np.zeros((law.gain.shape[0], len(model.a)))
     gain[:, :n] = law.gain
-    return -(gain + model.lags[:, None] * (gain @ model.a))
+    wanted: Floats = -(gain + model.lags[:, None] * (gain @ model.a))
+    return wanted
 
 
 def _as_read(loop: Loop, sensors: Sequence[Sensor], held: float, aware: bool, recalibrated: bool) -> np.ndarray:
@@ -293,7 +292,7 @@ def _crosstalk(sensors: Sequence[Sensor]) -> np.ndarray:
     return mixed
 
 
-def _friction(rig: Rig, loop: Loop, model: _Model, a, b, d) -> FrictionForward | None:
+def _friction(rig: Rig, loop: Loop, model: _Model, a: Floats, b: Floats, d: Floats) -> FrictionForward | None:
     """Commands that oppose the friction of the rig on the controlled modes."""
     found = [element for element in rig.elements if isinstance(element, CoulombFriction)]
     if not found or isinstance(loop.law, OnOffLaw):
@@ -320,5 +319,7 @@ def _into(loop: Loop) -> np.ndarray:
 
 def without(sensors: Sequence[Sensor]) -> tuple[Sensor, ...]:
     """The sensors without the faults that a step takes out: what the estimator is designed for."""
-    clean = {"gain": 1.0, "bias": 0.0, "drift": 0.0, "delay": 0.0, "time_constant": 0.0, "crosstalk": ()}
-    return tuple(replace(s, **clean, limit=np.inf, step=0.0) for s in sensors)
+    return tuple(
+        replace(s, gain=1.0, bias=0.0, drift=0.0, delay=0.0, time_constant=0.0, crosstalk=(), limit=np.inf, step=0.0)
+        for s in sensors
+    )

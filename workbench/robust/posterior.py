@@ -223,7 +223,8 @@ def _effect_json(effect: Effect) -> dict[str, Any]:
 def _effect(kind: Kind, told: Mapping[str, Any]) -> Effect:
     target = told["target"]
     if isinstance(target, Mapping):
-        target = NominalPrior(**{n: tuple(v) if isinstance(v, list) else v for n, v in target["prior"].items()})
+        prior: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in target["prior"].items()}
+        target = NominalPrior(**prior)
     elif isinstance(target, list):
         target = tuple(target)
     values = {n: Between(*v["between"]) if isinstance(v, Mapping) else v for n, v in told["values"].items()}

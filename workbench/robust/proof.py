@@ -2,8 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, run_loop, run_loops
@@ -78,7 +80,7 @@ class Proof:
         """W_R (n_draws,)."""
         return np.asarray(self.work.sum(axis=1) - self.controlled_work)
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Median and 95 % interval of each figure, as plain numbers; null where a figure is not finite."""
         figures = {
             "worst_damping": self.worst_damping,
@@ -194,7 +196,7 @@ def _band(energies: Sequence[np.ndarray]) -> np.ndarray:
     return np.asarray(np.quantile(energies, (0.5, outer, 1.0 - outer), axis=0, method="nearest"))
 
 
-def _finite(values) -> np.ndarray:
+def _finite(values: ArrayLike) -> np.ndarray:
     values = np.asarray(values, float)
     return np.where(np.isfinite(values), values, np.inf)
 

@@ -14,10 +14,11 @@ from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.rig_loop import LoopRun, LoopTest, run_loop
+from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loop
 from workbench.design.placement.task import PlacementTask
 from workbench.gap.report.verdict import Verdict
 from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
@@ -246,7 +247,8 @@ def _level(verdict: Verdict | UncertainRig) -> np.ndarray | None:
     """The largest reading of each sensor in the records (n_outputs,)."""
     if isinstance(verdict, UncertainRig):
         return None
-    return np.max([np.abs(r.outputs).max(axis=1) for r in verdict.attribution.search.data.records], axis=0)
+    level: np.ndarray = np.max([np.abs(r.outputs).max(axis=1) for r in verdict.attribution.search.data.records], axis=0)
+    return level
 
 
 def impulse_test(
@@ -414,7 +416,7 @@ def _present(rig: Rig, loop: Loop, sample_time: float) -> DigitalController:
 
 def _silent(controller: DigitalController) -> DigitalController:
     """A controller that commands nothing."""
-    nothing = {"c": np.zeros_like(controller.c), "d": np.zeros_like(controller.d), "friction": None}
+    nothing: dict[str, Any] = {"c": np.zeros_like(controller.c), "d": np.zeros_like(controller.d), "friction": None}
     n_u = len(controller.actuators)
     if controller.relays is not None:
         nothing |= {
@@ -422,8 +424,7 @@ def _silent(controller: DigitalController) -> DigitalController:
             "d": np.zeros((n_u, len(controller.sensors))),
             "relays": None,
         }
-    rest = {"dead_zone": np.zeros(n_u), "bias": np.zeros(n_u)}
-    return replace(controller, **nothing, **rest)
+    return replace(controller, **nothing, dead_zone=np.zeros(n_u), bias=np.zeros(n_u))
 
 
 def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
@@ -439,13 +440,13 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
         DesignError: modes that cannot be controlled or seen on that rig.
     """
     controlled = paired(loop.modes, modes, loop.law.controlled)
-    actuators = [next(a for a in rig.actuators if a.name == old.name) for old in loop.law.actuators]
+    actuators = [named(rig.actuators, old.name) for old in loop.law.actuators]
     assert loop.law.designed_by is not None and loop.controller.designed_by is not None
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
     law = loop.law.designed_by(modes, controlled=controlled, actuators=actuators)  # type: ignore[call-arg]
     linear = law if isinstance(law, Law) else _without_gain(law)
-    sensors = [next(s for s in rig.sensors if s.name == old.name) for old in loop.controller.sensors]
+    sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
     controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
     return Loop(modes, law, controller)
 
@@ -456,6 +457,7 @@ def _estimated(
     assert old.designed_by is not None
     kept = [i for i, s in enumerate(sensors) if s.name not in removed]
     design: Any = old.designed_by
+    anew: Controller
     if removed and np.ndim(noise := getattr(design, "keywords", {}).get("noise", 0.0)):
         chosen = np.asarray(noise)[kept] if np.ndim(noise) == 1 else np.asarray(noise)[np.ix_(kept, kept)]
         anew = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
@@ -532,7 +534,7 @@ def _vibration(run: LoopRun) -> float:
 def _losses(rig: Rig, loop: Loop, step: str) -> str:
     """What a step takes out, in words; empty where there is nothing."""
     words = []
-    for a in (next(x for x in rig.actuators if x.name == one.name) for one in loop.law.actuators):
+    for a in (named(rig.actuators, one.name) for one in loop.law.actuators):
         if step == "delay" and (a.delay or a.time_constant):
             late = [f"delay {1e3 * a.delay:.3g} ms"] * (a.delay > 0) + [f"lag {1e3 * a.time_constant:.3g} ms"] * (
                 a.time_constant > 0
@@ -546,7 +548,7 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
                 + (f", rate {a.rate_limit:.3g} N/s" if np.isfinite(a.rate_limit) else "")
             )
     if step == "sensors":
-        for s in (next(x for x in rig.sensors if x.name == one.name) for one in loop.controller.sensors):
+        for s in (named(rig.sensors, one.name) for one in loop.controller.sensors):
             faults = [
                 *([f"gain {s.gain:.3g}"] if s.gain != 1 else []),
                 *([f"offset {s.bias:.3g}"] if s.bias else []),
@@ -557,9 +559,7 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
                 words.append(f"{s.name}: {', '.join(faults)}")
     if step == "friction":
         words += [
-            f"{e.force:.3g} N at {rig.modes.domain.text(e.at)}"
-            for e in rig.elements
-            if type(e).__name__ == "CoulombFriction"
+            f"{e.force:.3g} N at {rig.modes.domain.text(e.at)}" for e in rig.elements if isinstance(e, CoulombFriction)
         ]
     return "; ".join(words)
 

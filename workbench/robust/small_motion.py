@@ -7,7 +7,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from workbench.design.estimation.digital import DigitalController
-from workbench.design.loop.rig_loop import LoopRun
+from workbench.design.loop.rig_loop import LoopRun, named
 from workbench.rig.elements import PointElement
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
@@ -94,8 +94,8 @@ def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.n
 def _plant(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A, B, C from commands to readings over a sample: modes, lags, and commands on their way."""
     dt = controller.sample_time
-    actuators = [next(a for a in rig.actuators if a.name == name) for name in controller.actuators]
-    sensors = [next(s for s in rig.sensors if s.name == name) for name in controller.sensors]
+    actuators = [named(rig.actuators, name) for name in controller.actuators]
+    sensors = [named(rig.sensors, name) for name in controller.sensors]
     n, n_u = modes.n_modes, len(actuators)
     into = participation_of(Rig(modes, tuple(actuators), ())) * np.array([a.gain for a in actuators])
     slow = [j for j, a in enumerate(actuators) if a.time_constant > 0]
@@ -122,7 +122,7 @@ def _plant(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.nd
         _, late = _step(a, b[:, columns], (1.0 - share) * dt)
         _, early = _step(a, b[:, columns], share * dt)
         after = expm(a * (1.0 - share) * dt) if share else np.eye(size)
-        for k, j in enumerate(columns):
+        for k, j in enumerate(columns.tolist()):
             for age, effect in ((whole[j], late[:, k]), (whole[j] + 1, after @ early[:, k] if share else None)):
                 if effect is None:
                     continue
@@ -130,7 +130,7 @@ def _plant(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.nd
                     entering[:size, j] += effect
                 else:
                     wide[:size, starts[j] + age - 1] += effect
-    for j in np.flatnonzero(memory):
+    for j in np.flatnonzero(memory).tolist():
         entering[starts[j], j] = 1.0
         for k in range(1, memory[j]):
             wide[starts[j] + k, starts[j] + k - 1] = 1.0

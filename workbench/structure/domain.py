@@ -12,6 +12,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from workbench.arrays import Floats
+
 SLACK = 1e-9  # of the extent: how far outside a place may lie by rounding
 
 Place = float | tuple[float, float] | str
@@ -80,7 +82,8 @@ class Interval:
         outside = (x < -slack) | (x > self.length + slack) | ~np.isfinite(x)
         if outside.any():
             raise PlaceError(f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}")
-        return np.clip(x, 0.0, self.length)
+        inside: Floats = np.clip(x, 0.0, self.length)
+        return inside
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Places, derivative along x and sign of a displacement (derivative 0), slope (1) and so on."""
@@ -160,7 +163,8 @@ class Rectangle:
             x, y = xy[outside][0]
             a, b = self.length
             raise PlaceError(f"(x, y) = ({x:g}, {y:g}) lies outside the structure, 0 to {a:g} by 0 to {b:g}")
-        return np.clip(xy, 0.0, extent)
+        inside: Floats = np.clip(xy, 0.0, extent)
+        return inside
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Places, derivatives along x and y and sign of a displacement, a slope about an axis, or (i, j) as it is."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
+from workbench.arrays import Floats
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import Interval, position
 from workbench.structure.modes import Modes
@@ -108,8 +109,8 @@ class _Member(Printed):
         points = nodes[:-1, None] + np.diff(nodes)[:, None] * INSIDE
         softness = self.mass_per_length(points.ravel()) / stiffness(points.ravel())
         density = softness.reshape(points.shape) ** (0.5 / (continuity + 1))
-        waves = np.diff(nodes) * density.mean(axis=1)
-        return waves / waves.sum()
+        waves: Floats = np.diff(nodes) * density.mean(axis=1)
+        return waves / float(waves.sum())
 
     def _graded(self, at: float, stiffness: Profile) -> list[float]:
         """Nodes that crowd towards an attachment beside an end that is a tip: the motion there is all but singular."""
@@ -156,7 +157,8 @@ class _Member(Printed):
                 break
 
         def shapes(x: np.ndarray, derivative: int) -> np.ndarray:
-            return segments.evaluation(x, derivative) @ coefficients
+            found: Floats = segments.evaluation(x, derivative) @ coefficients
+            return found
 
         return Modes(
             omega=omega,
@@ -166,7 +168,9 @@ class _Member(Printed):
             essential=essential,
         )
 
-    def _eigenpairs(self, segments: Segments, n_modes: int, stiffness: Profile, tension: float):
+    def _eigenpairs(
+        self, segments: Segments, n_modes: int, stiffness: Profile, tension: float
+    ) -> tuple[Floats, Floats, tuple[tuple[float, int], ...]]:
         order = segments.continuity + 1
         mass = segments.assemble(self.mass_per_length, 0)
         rigidity = segments.assemble(stiffness, order)
@@ -244,7 +248,7 @@ class _Member(Printed):
     def _damping_matrix(self, omega: np.ndarray, segments: Segments, coefficients: np.ndarray) -> np.ndarray:
         if isinstance(self.damping, ViscousDamping):
             profile = as_profile(self.damping.coefficient_per_length)
-            matrix = coefficients.T @ segments.assemble(profile, 0) @ coefficients
+            matrix: Floats = coefficients.T @ segments.assemble(profile, 0) @ coefficients
         else:
             matrix = self.damping.matrix(omega)
         for part in self.attachments:

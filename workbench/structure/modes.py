@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Complexes, Floats, Integers
 from workbench.structure.domain import Between, Derivative, Domain, Interval, NamedPoints, Where, as_domain
 from workbench.structure.printed import Printed, counted
 
@@ -16,11 +17,11 @@ Shapes = Callable[[np.ndarray, Any], np.ndarray]
 HELD = 1e-9  # of the largest motion anywhere: what moves less is held by a support
 
 
-def frozen(array: ArrayLike, dtype=float) -> np.ndarray:
+def frozen(array: ArrayLike, dtype: type = float) -> np.ndarray:
     """A read-only copy, as the fields of every frozen type hold it; the array itself where it is read-only already."""
     if type(array) is np.ndarray and array.dtype == dtype and array.base is None and not array.flags.writeable:
         return array
-    copy = np.array(array, dtype=dtype)
+    copy: np.ndarray = np.array(array, dtype=dtype)
     copy.flags.writeable = False
     return copy
 
@@ -140,7 +141,7 @@ class Modes(Printed):
             raise AttributeError("only modes along an interval have a length; see domain.size")
         return self.domain.length
 
-    def phi(self, places: Any, derivative: Derivative = 0, *, direction: str | None = None) -> np.ndarray:
+    def phi(self, places: Any, derivative: Derivative = 0, *, direction: str | None = None) -> Floats:
         """Mode shapes at places, or their slopes: (n_places, n_modes).
 
         Args:
@@ -156,12 +157,14 @@ class Modes(Printed):
         found = np.asarray(self.shapes(self.domain.locate(places), derivative), float)
         return found if sign == 1.0 else sign * found
 
-    def phi_at(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> np.ndarray:
+    def phi_at(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> Floats:
         """Mode shapes (n_modes,) at one place, or at the first of two less those at the second."""
         if isinstance(where, Between):
             first, second = (self.phi(place, derivative, direction=direction)[0] for place in where)
-            return first - second
-        return self.phi(where, derivative, direction=direction)[0]
+            difference: Floats = first - second
+            return difference
+        shape: Floats = self.phi(where, derivative, direction=direction)[0]
+        return shape
 
     def is_held(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> bool:
         """Whether a support holds the displacement, or the slope, at a place, so that no mode moves it."""
@@ -222,10 +225,10 @@ class PointShapes:
         values: (n_points, n_modes), mass-normalised, in the order of the points.
     """
 
-    def __init__(self, values: ArrayLike):
-        self.values = frozen(np.atleast_2d(values))
+    def __init__(self, values: ArrayLike) -> None:
+        self.values: Floats = frozen(np.atleast_2d(values))
 
-    def __call__(self, index: np.ndarray, derivative: int = 0) -> np.ndarray:
+    def __call__(self, index: Integers, derivative: int = 0) -> Floats:
         return self.values[index]
 
 
@@ -240,10 +243,10 @@ class SampledModes(Printed):
         positions: (n_outputs,) places of the sensors, m (nan where unknown).
     """
 
-    omega: np.ndarray
-    zeta: np.ndarray
-    shapes: np.ndarray
-    positions: np.ndarray
+    omega: Floats
+    zeta: Floats
+    shapes: Complexes
+    positions: Floats
 
     def __post_init__(self) -> None:
         for name, dtype in (("omega", float), ("zeta", float), ("shapes", complex), ("positions", float)):
@@ -272,7 +275,7 @@ class SampledModes(Printed):
         return self.omega / (2.0 * np.pi)
 
     @property
-    def poles(self) -> np.ndarray:
+    def poles(self) -> Complexes:
         """Upper-half-plane poles (n_modes,): -ζω + iω√(1-ζ²), rad/s."""
         return -self.zeta * self.omega + 1j * self.omega * np.sqrt(np.maximum(1.0 - self.zeta**2, 0.0))
 
@@ -282,18 +285,18 @@ class SampledModes(Printed):
         return SampledModes(self.omega[index], self.zeta[index], self.shapes[:, index], self.positions)
 
     @property
-    def phase_collinearity(self) -> np.ndarray:
+    def phase_collinearity(self) -> Floats:
         """Modal phase collinearity MPC (n_modes,): 1 for a real shape, towards 0 for a travelling one.
 
         Pappa, Elliott & Schenk, NASA TM-102664 (1990).
         """
         x, y = self.shapes.real, self.shapes.imag
         sxx, syy, sxy = (x * x).sum(0), (y * y).sum(0), (x * y).sum(0)
-        spread = np.hypot(sxx - syy, 2.0 * sxy)
-        return (spread / np.maximum(sxx + syy, 1e-300)) ** 2
+        spread: Floats = np.hypot(sxx - syy, 2.0 * sxy) / np.maximum(sxx + syy, 1e-300)
+        return spread**2
 
 
-def mac(first: ArrayLike, second: ArrayLike) -> np.ndarray:
+def mac(first: ArrayLike, second: ArrayLike) -> Floats:
     """Modal assurance criterion between two sets of shapes at the same places.
 
     MAC_rs = |φ_r^H ψ_s|² / (φ_r^H φ_r · ψ_s^H ψ_s) (Allemang & Brown 1982).
@@ -310,7 +313,8 @@ def mac(first: ArrayLike, second: ArrayLike) -> np.ndarray:
     if a.shape[0] != b.shape[0]:
         raise ValueError(f"MAC compares shapes at the same places; got {a.shape[0]} and {b.shape[0]} of them")
     norms = np.outer((np.abs(a) ** 2).sum(0), (np.abs(b) ** 2).sum(0))
-    return np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300)
+    values: Floats = np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300)
+    return values
 
 
 def _range_hz(frequencies: np.ndarray) -> str:

@@ -6,6 +6,7 @@ identity, and round-off stays near machine precision at any degree. Low-order el
 accuracy would lose it to the condition number, which grows with the fourth power of their count.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 
@@ -13,6 +14,8 @@ import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 from scipy.special import eval_legendre
+
+from workbench.arrays import Floats
 
 
 @cache
@@ -122,7 +125,7 @@ class Segments:
         table = tables[derivative] * self.scales(segment) * (2.0 / h) ** derivative
         return self.nodes[segment] + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
 
-    def assemble(self, weight, derivative: int) -> np.ndarray:
+    def assemble(self, weight: Callable[[Floats], Floats], derivative: int) -> Floats:
         """Integral of weight(x) times the products of the functions' derivatives: (n_functions, n_functions)."""
         matrix = np.zeros((self.n_functions, self.n_functions))
         for s in range(self.n_segments):
@@ -131,7 +134,7 @@ class Segments:
             matrix[np.ix_(indices, indices)] += table.T @ ((weights * weight(x))[:, None] * table)
         return matrix
 
-    def form(self, weight, derivative: int, coefficients: np.ndarray) -> np.ndarray:
+    def form(self, weight: Callable[[Floats], Floats], derivative: int, coefficients: Floats) -> Floats:
         """Integral of weight(x) times the squared derivative of each column of coefficients: (n_columns,)."""
         total = np.zeros(coefficients.shape[1])
         for s in range(self.n_segments):

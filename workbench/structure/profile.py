@@ -7,6 +7,8 @@ from numbers import Real
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats
+
 
 @dataclass(frozen=True, eq=False)
 class Profile:
@@ -54,14 +56,15 @@ class Profile:
         pieces = [i for i in range(x.size - 1) if x[i + 1] > x[i]]
         starts = x[pieces]
 
-        def piecewise_linear(at: np.ndarray) -> np.ndarray:
+        def piecewise_linear(at: Floats) -> Floats:
             piece = np.asarray(pieces)[np.clip(np.searchsorted(starts, at, side="right") - 1, 0, None)]
             share = (at - x[piece]) / (x[piece + 1] - x[piece])
-            return value[piece] + share * (value[piece + 1] - value[piece])
+            values: Floats = value[piece] + share * (value[piece + 1] - value[piece])
+            return values
 
         return cls(piecewise_linear, tuple(np.unique(x)))
 
-    def __call__(self, x: ArrayLike) -> np.ndarray:
+    def __call__(self, x: ArrayLike) -> Floats:
         """The values at positions x, in the shape of x."""
         x = np.asarray(x, float)
         values = np.asarray(self.function(np.atleast_1d(x)), float)
@@ -72,8 +75,9 @@ class Profile:
         if start is None or stop is None:
             return Profile(lambda x: factor * self.function(x), self.breaks)
 
-        def changed(x: np.ndarray) -> np.ndarray:
-            return np.where((x > start) & (x < stop), factor, 1.0) * self.function(x)
+        def changed(x: Floats) -> Floats:
+            factors: Floats = np.where((x > start) & (x < stop), factor, 1.0)
+            return factors * self(x)
 
         return Profile(changed, tuple(sorted({*self.breaks, float(start), float(stop)})))
 

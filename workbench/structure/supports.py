@@ -87,8 +87,8 @@ def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str
     return found
 
 
-class _AtPlace:
-    """What stands at a place: kept as a float, a pair or a name, whatever it was given as."""
+class AtPlace:
+    """What stands at a place, or between two: kept as a float, a pair or a name, whatever it was given as."""
 
     at: Where
 
@@ -97,7 +97,7 @@ class _AtPlace:
 
 
 @dataclass(frozen=True)
-class PointMass(_AtPlace):
+class PointMass(AtPlace):
     """A rigid body attached at a point: mass (kg) and rotary inertia (kg m²) about that point."""
 
     at: Where
@@ -106,7 +106,7 @@ class PointMass(_AtPlace):
 
 
 @dataclass(frozen=True)
-class PointSpring(_AtPlace):
+class PointSpring(AtPlace):
     """A linear spring from a point to ground: against translation (N/m) and rotation (N m/rad)."""
 
     at: Where
@@ -115,7 +115,7 @@ class PointSpring(_AtPlace):
 
 
 @dataclass(frozen=True)
-class PointDamper(_AtPlace):
+class PointDamper(AtPlace):
     """A viscous damper from a point to ground: against translation (N s/m) and rotation (N m s/rad)."""
 
     at: Where

@@ -5,6 +5,8 @@ from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socket import socket
+from typing import Any
 
 from jinja2 import Environment
 
@@ -53,7 +55,7 @@ class _Server(ThreadingHTTPServer):
 
     request_queue_size, daemon_threads = MOST_WAITING, True
 
-    def handle_error(self, request, client_address) -> None:
+    def handle_error(self, request: socket | tuple[bytes, socket], client_address: object) -> None:
         """Say nothing of a client that went away: only the command prints."""
 
 
@@ -64,7 +66,7 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = CLIENT_SECONDS
     wbufsize, disable_nagle_algorithm = -1, True  # an answer leaves whole and at once
 
-    def __init__(self, rig: Rig, structure: str, folder: Path, page: bytes, *arguments):
+    def __init__(self, rig: Rig, structure: str, folder: Path, page: bytes, *arguments: Any) -> None:
         self.rig, self.structure, self.folder, self.page = rig, structure, folder, page
         super().__init__(*arguments)
 
@@ -88,16 +90,16 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._answer(HTTPStatus.OK, answer)
 
-    def _try(self, content: dict) -> dict:
+    def _try(self, content: dict[str, Any]) -> dict[str, Any]:
         return shown(self.rig, asked(content))
 
-    def _save(self, content: dict) -> dict:
+    def _save(self, content: dict[str, Any]) -> dict[str, Any]:
         if not isinstance(content, dict) or not isinstance(content.get("name"), str):
             raise StudyError("a design is saved under a name")
         path = save(self.rig, self.structure, asked(content.get("design", {})), content["name"], self.folder)
         return {"saved": str(path)}
 
-    def _content(self):
+    def _content(self) -> Any:
         length = self.headers.get("Content-Length", "")
         if not length.isdecimal() or int(length) > MOST_BYTES:
             self.close_connection = True
@@ -113,7 +115,7 @@ class _Handler(BaseHTTPRequestHandler):
         origin = self.headers.get("Origin")
         return self.headers.get("Host") in own and (origin is None or origin.removeprefix("http://") in own)
 
-    def _answer(self, status: HTTPStatus, content: dict) -> None:
+    def _answer(self, status: HTTPStatus, content: dict[str, Any]) -> None:
         if status in (HTTPStatus.FORBIDDEN, HTTPStatus.NOT_FOUND):
             self.close_connection = True  # what was sent along has not been read
         self._send(status, "application/json", json.dumps(content, allow_nan=False).encode())
@@ -131,5 +133,5 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, *arguments) -> None:
+    def log_message(self, *arguments: object) -> None:
         """Say nothing: only the command prints."""

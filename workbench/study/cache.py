@@ -4,6 +4,7 @@ import base64
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ ARRAY, COMPLEX = "__array__", "__complex__"
 KINDS = "biufc"  # of arrays: booleans, integers, floats, complex numbers
 
 
-def encoded(value, where: str = "the result"):
+def encoded(value: object, where: str = "the result") -> Any:
     """A result as JSON holds it, arrays bit for bit.
 
     Raises:
@@ -38,7 +39,7 @@ def encoded(value, where: str = "the result"):
     raise TypeError(f"{where} is a {type(value).__name__}; return numbers, texts, arrays, lists and dicts of them")
 
 
-def decoded(value):
+def decoded(value: Any) -> Any:
     """What `encoded` was given; tuples come back as lists."""
     if isinstance(value, list):
         return [decoded(item) for item in value]
@@ -52,22 +53,24 @@ def decoded(value):
     return {name: decoded(item) for name, item in value.items()}
 
 
-def write_record(path: Path, record: dict) -> None:
+def write_record(path: Path, record: dict[str, Any]) -> None:
     """Put a record in its place at once: a reader, or a run that resumes, sees all of it or nothing."""
     text = _text(record)
     write_whole(path, json.dumps({"sha256": _sum(text), "record": text}))
 
 
-def read_record(path: Path) -> dict | None:
+def read_record(path: Path) -> dict[str, Any] | None:
     """A record; None where there is none, or where the disk has lost part of it."""
     try:
         outer = json.loads(path.read_text(encoding="utf-8"))
-        return json.loads(outer["record"]) if outer["sha256"] == _sum(outer["record"]) else None
+        whole = outer["sha256"] == _sum(outer["record"])
+        record: dict[str, Any] | None = json.loads(outer["record"]) if whole else None
+        return record
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
 
-def _text(record: dict) -> str:
+def _text(record: dict[str, Any]) -> str:
     return json.dumps(record, separators=(",", ":"))
 
 

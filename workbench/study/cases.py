@@ -5,6 +5,7 @@ import json
 from collections.abc import Iterable, Mapping
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,13 +16,13 @@ class StudyError(ValueError):
     """A study that is not there, lacks what it needs, or asks for what cannot be run."""
 
 
-def grid(**axes: Iterable) -> list[dict]:
+def grid(**axes: Iterable[Any]) -> list[dict[str, Any]]:
     """Every combination of the axes' values, the last axis fastest: `grid(weight=(1, 10), at=np.arange(3))`."""
     values = [list(axis) for axis in axes.values()]
     return [dict(zip(axes, combination)) for combination in product(*values)]
 
 
-def samples(n: int, /, *, seed: int = 0, **ranges: tuple[float, float]) -> list[dict]:
+def samples(n: int, /, *, seed: int = 0, **ranges: tuple[float, float]) -> list[dict[str, Any]]:
     """n points of a Latin hypercube between (low, high) of each parameter: `samples(100, at=(0.5, 9.5))`.
 
     Raises:
@@ -39,7 +40,7 @@ def samples(n: int, /, *, seed: int = 0, **ranges: tuple[float, float]) -> list[
     return [dict(zip(ranges, map(float, point))) for point in low + unit * (high - low)]
 
 
-def checked(case: Mapping, number: int) -> dict:
+def checked(case: Mapping[str, Any], number: int) -> dict[str, Any]:
     """A case as plain Python values, so that it means the same in every process and on disk.
 
     Raises:
@@ -53,7 +54,7 @@ def checked(case: Mapping, number: int) -> dict:
     return {name: _plain(value, f"case {number}, parameter {name!r}") for name, value in case.items()}
 
 
-def _plain(value, where: str):
+def _plain(value: Any, where: str) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
     if value is None or isinstance(value, bool | int | float | str | Path):
@@ -68,7 +69,7 @@ def _plain(value, where: str):
     )
 
 
-def key_of(case: Mapping, fingerprint: str, seed: int | None) -> str:
+def key_of(case: Mapping[str, Any], fingerprint: str, seed: int | None) -> str:
     """The name of a case's result: of the same function, versions, parameters and seed, and of no other.
 
     A `Path` counts with what lies there, so that a changed file is a changed case.
@@ -77,7 +78,7 @@ def key_of(case: Mapping, fingerprint: str, seed: int | None) -> str:
     return hashlib.sha256(content.encode()).hexdigest()[:40]
 
 
-def _content(value):
+def _content(value: object) -> Any:
     if isinstance(value, dict):
         return [[name, _content(item)] for name, item in sorted(value.items())]
     if isinstance(value, list):
@@ -91,7 +92,7 @@ def _content(value):
     return [type(value).__name__, value]
 
 
-def seed_of(case: Mapping, root: int) -> int:
+def seed_of(case: Mapping[str, Any], root: int) -> int:
     """A seed of this case's own, whatever the order of the cases and the others among them."""
     text = json.dumps([root, _content({n: str(v) if isinstance(v, Path) else v for n, v in case.items()})])
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:6])

@@ -5,9 +5,10 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import cloudpickle
 from joblib import Parallel, delayed, parallel_config
@@ -17,6 +18,9 @@ from workbench.study.cache import encoded, read_record, write_record
 from workbench.study.cases import RESERVED, StudyError
 from workbench.study.fingerprint import is_own
 from workbench.study.versions import own_source
+
+if TYPE_CHECKING:
+    from distributed import Future
 
 DIED = "its process died: out of memory, killed, or crashed in compiled code"
 CONNECT_SECONDS = 10.0
@@ -34,16 +38,16 @@ class Job:
     """
 
     key: str
-    arguments: Mapping
+    arguments: Mapping[str, Any]
     file: Path | None = None
 
 
-def work(function: Callable, job: Job, running: Path | None = None) -> dict:
+def work(function: Callable[..., Any], job: Job, running: Path | None = None) -> dict[str, Any]:
     """Work one case; an error is part of the record, never raised."""
     if running is not None:
         (running / job.key).touch()
     start = time.perf_counter()
-    record: dict = {"result": None, "error": None, "trace": None, "workbench": own_source()}
+    record: dict[str, Any] = {"result": None, "error": None, "trace": None, "workbench": own_source()}
     try:
         found = function(**job.arguments)
         found = found if isinstance(found, dict) else {"result": found}
@@ -64,7 +68,7 @@ def work(function: Callable, job: Job, running: Path | None = None) -> dict:
     return record
 
 
-def keep(file: Path, record: dict) -> str | None:
+def keep(file: Path, record: dict[str, Any]) -> str | None:
     """Put a result away unless it is an error; why it could not be, where the disk refuses."""
     if record["error"] is not None:
         return None
@@ -75,7 +79,7 @@ def keep(file: Path, record: dict) -> str | None:
     return None
 
 
-def packed(function: Callable) -> bytes:
+def packed(function: Callable[..., Any]) -> bytes:
     """A function on its way to another process of this run, with the user's own modules that it needs."""
     own = [
         module
@@ -88,25 +92,27 @@ def packed(function: Callable) -> bytes:
     for module in own:
         cloudpickle.register_pickle_by_value(module)
     try:
-        return cloudpickle.dumps(function)
+        content: bytes = cloudpickle.dumps(function)
+        return content
     finally:
         for module in own:
             cloudpickle.unregister_pickle_by_value(module)
 
 
 @functools.lru_cache(maxsize=4)
-def unpacked(function: bytes) -> Callable:
+def unpacked(function: bytes) -> Callable[..., Any]:
     """The function of `packed`, once a process."""
-    return cloudpickle.loads(function)
+    found: Callable[..., Any] = cloudpickle.loads(function)
+    return found
 
 
-def here(function: Callable, jobs: list[Job]) -> Iterator[tuple[str, dict]]:
+def here(function: Callable[..., Any], jobs: list[Job]) -> Iterator[tuple[str, dict[str, Any]]]:
     """One after the other, in this process."""
     for job in jobs:
         yield job.key, work(function, job)
 
 
-def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tuple[str, dict]]:
+def processes(function: Callable[..., Any], jobs: list[Job], workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """In processes of this machine, in the order in which they end.
 
     A case whose process dies takes the others' processes with it. Those that were running then are computed again, each
@@ -143,23 +149,25 @@ def processes(function: Callable, jobs: list[Job], workers: int) -> Iterator[tup
                     ) from None
 
 
-def _already_kept(jobs) -> list[tuple[str, dict]]:
+def _already_kept(jobs: Iterable[Job]) -> list[tuple[str, dict[str, Any]]]:
     """Results that a process had put away before it could hand them over."""
     records = [(job.key, read_record(job.file)) for job in jobs if job.file is not None]
     return [(key, record) for key, record in records if record is not None]
 
 
-def _parallel(function: bytes, jobs, workers: int, running: Path) -> Iterator[tuple[str, dict]]:
+def _parallel(
+    function: bytes, jobs: Iterable[Job], workers: int, running: Path
+) -> Iterator[tuple[str, dict[str, Any]]]:
     with parallel_config(backend="loky", inner_max_num_threads=1):
         pool = Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
         yield from pool(delayed(_keyed)(function, job, running) for job in list(jobs))
 
 
-def _keyed(function: bytes, job: Job, running: Path) -> tuple[str, dict]:
+def _keyed(function: bytes, job: Job, running: Path) -> tuple[str, dict[str, Any]]:
     return job.key, work(unpacked(function), job, running)
 
 
-def _alone(function: bytes, job: Job, running: Path) -> dict:
+def _alone(function: bytes, job: Job, running: Path) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         # two processes, of which one idles: with one, joblib would work the case in this very process
@@ -169,7 +177,7 @@ def _alone(function: bytes, job: Job, running: Path) -> dict:
     return record
 
 
-def cluster(function: Callable, jobs: list[Job], address: str) -> Iterator[tuple[str, dict]]:
+def cluster(function: Callable[..., Any], jobs: list[Job], address: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """On the workers of a Dask scheduler, in the order in which they end.
 
     Dask works a case again whose worker is lost, and gives it up after the scheduler's `allowed-failures`.
@@ -201,13 +209,13 @@ def cluster(function: Callable, jobs: list[Job], address: str) -> Iterator[tuple
             future.release()
 
 
-def _on_worker(job: Job, function: bytes) -> dict:
+def _on_worker(job: Job, function: bytes) -> dict[str, Any]:
     return work(unpacked(function), job)
 
 
-def _gathered(future) -> dict:
+def _gathered(future: "Future[dict[str, Any]]") -> dict[str, Any]:
     try:
-        record = future.result()
+        record: dict[str, Any] = future.result()
     except Exception as error:
         return {"result": None, "error": f"{type(error).__name__}: {error}", "trace": None, "seconds": 0.0}
     if record["workbench"] != own_source():

@@ -6,9 +6,11 @@ import functools
 import hashlib
 import sys
 import sysconfig
+from collections.abc import Callable, Iterable, Iterator
 from importlib import metadata, util
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +22,7 @@ PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), rang
 OF_CLASS = {"__dict__", "__weakref__", "__module__", "__doc__", "__annotations__", "__firstlineno__"}
 
 
-def fingerprint(function) -> str:
+def fingerprint(function: Callable[..., Any]) -> str:
     """A digest that changes whenever the function's result could: 40 hex digits.
 
     Hashed are its byte code (so that comments do not count), defaults, what its closure holds, the globals it reads,
@@ -39,16 +41,16 @@ def fingerprint(function) -> str:
 class _Walk:
     """Visits what a function reaches, each thing once, and hashes it on the way."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.digest = hashlib.sha256()
-        self.seen: dict[int, tuple] = {}  # the things are kept, so that no identity is given twice
+        self.seen: dict[int, tuple[int, object]] = {}  # the things are kept, so that no identity is given twice
 
-    def add(self, *words) -> None:
+    def add(self, *words: object) -> None:
         for word in words:
             word = word if isinstance(word, bytes) else str(word).encode()
             self.digest.update(f"{len(word)}:".encode() + word)
 
-    def visit(self, value, where: str) -> None:
+    def visit(self, value: Any, where: str) -> None:
         if isinstance(value, PLAIN) and type(value).__module__ == "builtins":
             return self.add(type(value).__name__, repr(value))
         if id(value) in self.seen:
@@ -83,7 +85,7 @@ class _Walk:
             return self.visit(getattr(value, "__wrapped__", None) or value.py_func, where)
         return self._state(value, where)
 
-    def _each(self, values, where: str) -> None:
+    def _each(self, values: Iterable[object], where: str) -> None:
         for value in values:
             self.visit(value, where)
 
@@ -163,7 +165,7 @@ class _Walk:
         if not known and file and Path(file).is_file():
             self.add(Path(file).read_bytes())
 
-    def _state(self, value, where: str) -> None:
+    def _state(self, value: object, where: str) -> None:
         """Any other object: its class, and the state that a copy of it would be built from."""
         if isinstance(value, np.random.Generator | np.random.RandomState):
             raise StudyError(
@@ -210,7 +212,7 @@ def _version(top: str) -> str:
         return str(getattr(sys.modules.get(top), "__version__", ""))
 
 
-def _codes(code: CodeType):
+def _codes(code: CodeType) -> Iterator[CodeType]:
     yield code
     for constant in code.co_consts:
         if isinstance(constant, CodeType):

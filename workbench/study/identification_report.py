@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -36,7 +37,7 @@ class IdentificationReport:
     heading: str
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[str, ...]
-    content: dict
+    content: dict[str, Any]
 
 
 def identification_report(
@@ -204,7 +205,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
 
 
 def _report(
-    records: Sequence[Record], found: ModalEstimates, lines: Sequence[str], content: dict
+    records: Sequence[Record], found: ModalEstimates, lines: Sequence[str], content: dict[str, Any]
 ) -> IdentificationReport:
     first = records[0]
     samples = sum(record.n_samples for record in records)
@@ -219,7 +220,7 @@ def _counted(number: int, what: str) -> str:
     return f"{number} {what}{'s' * (number > 1)}"
 
 
-def _content(channels: Sequence[Channel], found) -> dict:
+def _content(channels: Sequence[Channel], found: ModalEstimates) -> dict[str, Any]:
     modes = found.modes
     return {
         "sensors": [channel.name for channel in channels],
@@ -247,7 +248,7 @@ def _proportional(fit: ProportionalFit | None) -> list[str]:
     return [f"damping may be proportional: g1 = {g1} ± {g1_std} s, g2 = {g2} ± {g2_std} 1/s"]
 
 
-def _by_amplitude(decay: RingDown) -> tuple[list[str], dict]:
+def _by_amplitude(decay: RingDown) -> tuple[list[str], dict[str, Any]]:
     """The modes that depend on amplitude, segment by segment."""
     segments, lines, content = decay.by_amplitude, [], {}
     for r in np.flatnonzero(segments.depends):

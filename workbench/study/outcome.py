@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,6 +15,9 @@ from workbench.study.runner import CACHE, run
 from workbench.study.whole_file import write_whole
 
 DIGITS = 10
+
+T = TypeVar("T")
+Shown = Figure | Mapping[str, Any]  # on a page: a figure, or the motion that `draw.motion` describes
 
 
 @dataclass
@@ -34,15 +38,15 @@ class Outcome:
     title: str = ""
     figures_folder: Path = Path("figures")
     on_say: Callable[[str], None] | None = None
-    on_track: Callable[[Iterable, str], Iterator] | None = None
+    on_track: Callable[[Iterable[Any], str], Iterator[Any]] | None = None
     on_report: Callable[[str, float], None] | None = None
     cache: Path = CACHE
     scheduler: str | None = None
     lines: list[str] = field(default_factory=list)
-    tables: dict = field(default_factory=dict)
-    checks: list[dict] = field(default_factory=list)
+    tables: dict[str, Any] = field(default_factory=dict)
+    checks: list[dict[str, Any]] = field(default_factory=list)
     figures: list[tuple[str, Path, str]] = field(default_factory=list)
-    shown: list[tuple[object, str]] = field(default_factory=list)
+    shown: list[tuple[Shown, str]] = field(default_factory=list)
     runs: dict[str, Results] = field(default_factory=dict)
 
     def say(self, text: str) -> None:
@@ -51,7 +55,7 @@ class Outcome:
         if self.on_say is not None:
             self.on_say(text)
 
-    def table(self, name: str, values) -> None:
+    def table(self, name: str, values: object) -> None:
         """A table under its name: anything of numbers, texts, lists and dicts."""
         self.tables[name] = plain(values)
 
@@ -70,15 +74,17 @@ class Outcome:
         self.figures.append((name, path, caption))
         self.shown.append((figure, caption))
 
-    def motion(self, motion: Mapping, caption: str) -> None:
+    def motion(self, motion: Mapping[str, Any], caption: str) -> None:
         """Show motion on the page, as `draw.motion` describes it."""
         self.shown.append((motion, caption))
 
-    def track(self, iterable: Iterable, what: str) -> Iterator:
+    def track(self, iterable: Iterable[T], what: str) -> Iterator[T]:
         """The same iterable, with its progress shown."""
         return iter(iterable) if self.on_track is None else self.on_track(iterable, what)
 
-    def run(self, cases: Iterable[Mapping], function: Callable, name: str = "cases", **options) -> Results:
+    def run(
+        self, cases: Iterable[Mapping[str, Any]], function: Callable[..., Any], name: str = "cases", **options: Any
+    ) -> Results:
         """The function at every case, as `study.run` does it; the table is kept under its name."""
         options = {"cache": self.cache, "scheduler": self.scheduler, "report": self.on_report, **options}
         self.runs[name] = run(cases, function, **options)
@@ -88,7 +94,7 @@ class Outcome:
     def holds(self) -> bool:
         return all(check["holds"] for check in self.checks)
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Tables under their names, and `checks`."""
         return {**self.tables, "checks": self.checks, "found": self.lines}
 
@@ -102,7 +108,7 @@ class Outcome:
         return [found.write(folder / f"{self.name}-{name}.csv") for name, found in self.runs.items()]
 
 
-def plain(value):
+def plain(value: object) -> Any:
     """Numbers to ten digits, arrays to lists, keys to text: what JSON holds, the same from run to run."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}

@@ -5,13 +5,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from jinja2 import Environment
 from markupsafe import Markup
 
 from workbench.draw.interactive import drawable
 from workbench.study.cases import StudyError
-from workbench.study.outcome import Outcome
+from workbench.study.outcome import Outcome, Shown
 from workbench.study.versions import versions
 from workbench.study.whole_file import write_whole
 
@@ -20,6 +21,8 @@ SCRIPTS = ("figure.js", "motion.js", "table.js")
 FORMAT = "workbench page 1"
 MOST_ROWS = 2000
 STANDINGS = ("", "good", "part", "bad")
+
+Table = tuple[str, Sequence[str], Sequence[Sequence[object]]]  # title, heads, rows
 
 
 @dataclass(frozen=True)
@@ -39,19 +42,19 @@ class Story:
     title: str
     lead: str = ""
     lines: Sequence[str] = ()
-    blocks: Sequence[Mapping] = ()
-    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence]]] = ()
+    blocks: Sequence[Mapping[str, Any]] = ()
+    tables: Sequence[Table] = ()
     inputs: Mapping[str, str] = field(default_factory=dict)
     made_by: str = ""
     standing: str = ""
     versions: Mapping[str, str] = field(default_factory=versions)
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Plain JSON, marked by its "format"."""
         return {"format": FORMAT, **asdict(self)}
 
 
-def story_of(content: dict) -> Story:
+def story_of(content: dict[str, Any]) -> Story:
     """The story that `Story.to_json` wrote.
 
     Raises:
@@ -68,14 +71,14 @@ def story_of(content: dict) -> Story:
     return Story(**{name: content[name] for name in shape}, standing=standing if standing in STANDINGS else "")
 
 
-def _is_table(table) -> bool:
+def _is_table(table: object) -> bool:
     return (
         isinstance(table, list) and len(table) == 3 and isinstance(table[1], list) and isinstance(table[2], list)
         and all(isinstance(row, list) for row in table[2])
     )  # fmt: skip
 
 
-def block(shown, caption: str) -> dict:
+def block(shown: Shown, caption: str) -> dict[str, Any]:
     """A figure, or the motion that `draw.motion` describes, with its caption."""
     return {**({"motion": dict(shown)} if isinstance(shown, Mapping) else drawable(shown)), "caption": caption}
 
@@ -107,7 +110,7 @@ def asset(name: str) -> Markup:
     return Markup((ASSETS / name).read_text(encoding="utf-8"))
 
 
-def in_script(content) -> Markup:
+def in_script(content: object) -> Markup:
     """JSON that may stand in a script element: nothing in it can end the element."""
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)
     for sign in "<>&\u2028\u2029":
@@ -118,7 +121,7 @@ def in_script(content) -> Markup:
 def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | None = None, made_by: str = "") -> Path:
     """The page of a study: what it found, its figures, its checks, the tables of its runs."""
     checks = [
-        (c["name"], _cell(c["value"]), ("≥ " if c["at_least"] else "≤ ") + _cell(c["limit"]), c["holds"])
+        (c["name"], _cell(c["value"]), ("≥ " if c["at_least"] else "≤ ") + str(_cell(c["limit"])), c["holds"])
         for c in outcome.checks
     ]
     runs = [(name, *_table_of(found.rows())) for name, found in outcome.runs.items()]
@@ -137,7 +140,7 @@ def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | No
     return write_page(folder / f"{outcome.name}.html", story)
 
 
-def tables_of(content: Mapping) -> list[tuple]:
+def tables_of(content: Mapping[str, Any]) -> list[Table]:
     """Those tables that are rows of named figures; what else there is stays in the JSON."""
     return [
         (name.replace("_", " "), *_table_of(table))
@@ -146,16 +149,16 @@ def tables_of(content: Mapping) -> list[tuple]:
     ]
 
 
-def _table_of(rows: Sequence[Mapping]) -> tuple[tuple, list]:
+def _table_of(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[list[str | bool]]]:
     heads = tuple(dict.fromkeys(head for row in rows for head in row if head != "versions"))
     return heads, [[_shown(row.get(head)) for head in heads] for row in rows]
 
 
-def _shown(value):
+def _shown(value: object) -> str | bool:
     return "" if value is None else value if isinstance(value, bool) else _cell(value)
 
 
-def to_its_error(value, error) -> tuple[str, str]:
+def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:
     """A value and its standard error, both to the second digit of the error; "" where there is no error."""
     if not isinstance(value, int | float) or not isinstance(error, int | float) or not error > 0:
         return _cell(value), "" if error is None else _cell(error)
@@ -165,7 +168,7 @@ def to_its_error(value, error) -> tuple[str, str]:
     return f"{value:.{max(1, 2 + math.floor(math.log10(max(abs(value), error) / error)))}g}", f"{error:.2g}"
 
 
-def _cell(value):
+def _cell(value: object) -> str | bool:
     if isinstance(value, bool):
         return value
     if hasattr(value, "tolist"):

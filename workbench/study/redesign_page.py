@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.robust.proof import Proof, interval
 from workbench.robust.redesign import Redesign
-from workbench.structure.domain import Interval
-from workbench.study.page import Story, block, write_page
+from workbench.structure.domain import Interval, Where
+from workbench.study.outcome import Shown
+from workbench.study.page import Story, Table, block, write_page
 from workbench.study.verdict_page import case_inputs
 
 MOST = 3000  # samples of a record that are replayed
@@ -47,7 +49,7 @@ def redesign_page(
         ),
         block(plot_steps(found), "From the present controller to the redesigned one, one step after the other."),
     ]
-    tables: list[tuple[str, tuple[str, ...], list]] = [
+    tables: list[Table] = [
         ("On the same draws: median (95 %)", ("", "present", "redesigned"), _figures(found)),
         (
             "Steps",
@@ -69,18 +71,20 @@ def redesign_page(
     return write_page(path, story)
 
 
-def _figures(found: Redesign) -> list[tuple[str, str, str]]:
+def _figures(found: Redesign) -> list[tuple[str, ...]]:
     old, new = found.present_proof, found.proof
-    rows = [("stable draws", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
+    rows: list[tuple[str, ...]] = [("stable draws", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
         rows.append((f"damping of mode {r + 1} [%]", *(_told(100.0 * p.damping[:, r]) for p in (old, new))))
-    each = ("worst_damping", "worst damping of any mode [%]", 100.0), ("settling", "settling [s]", 1.0)
-    each += ("peak_force", "peak force [N]", 1.0), ("stroke", "largest displacement at an actuator [m]", 1.0)
-    each += (
+    each = (
+        ("worst_damping", "worst damping of any mode [%]", 100.0),
+        ("settling", "settling [s]", 1.0),
+        ("peak_force", "peak force [N]", 1.0),
+        ("stroke", "largest displacement at an actuator [m]", 1.0),
         ("controlled_work", "work in controlled modes, W_C [J]", 1.0),
         ("residual_work", "in residual modes, W_R [J]", 1.0),
+        ("effort", "effort, ∫ FᵀF dt", 1.0),
     )
-    each += (("effort", "effort, ∫ FᵀF dt", 1.0),)
     rows += [(words, *(_told(scale * getattr(p, name)) for p in (old, new))) for name, words, scale in each]
     rows.append(("error of all readings that the loop bears [%]", *(_margin(p) for p in (old, new))))
     return rows
@@ -95,7 +99,7 @@ def _margin(proof: Proof) -> str:
     return "no linear bound" if np.isnan(proof.margin) else f"{100.0 * proof.margin:.3g}"
 
 
-def _replayed(found: Redesign, record: Record) -> list[dict]:
+def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     """Both loops on the corrected rig under the inputs of a measured record, as forces at the same places."""
     rig = found.possible.rig
     step = found.test.sample_time
@@ -120,7 +124,7 @@ def _replayed(found: Redesign, record: Record) -> list[dict]:
     return shown
 
 
-def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict:
+def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict[str, Any]:
     scale = np.abs(new.modal[: new.modes.n_modes]).max()
     limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -1e3 * scale, 1e3 * scale))
     actuators = [a for a in found.possible.rig.actuators if a.name in found.redesigned.actuators]
@@ -129,14 +133,15 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
     return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.")
 
 
-def _readings(found: Redesign, record: Record, responses: dict[str, Response]):
+def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -> Shown:
     rig = found.possible.rig
     seen = [(i, s) for i, s in enumerate(rig.sensors) if s.quantity == "displacement"]
     figure, ax = new_figure(width=9, height=3.6)
     n = next(iter(responses.values())).time.size
     if seen:
         i, sensor = max(seen, key=lambda one: float(np.abs(record.outputs[one[0], :n]).max()))
-        at, name = sensor.at, sensor.name
+        at: Where = sensor.at
+        name = sensor.name
         ax.plot(
             record.time[:n], record.outputs[i, :n], color="#8a8a8a", linewidth=0.8, label="measured, without control"
         )

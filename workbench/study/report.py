@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_p
 from workbench.structure.modes import SampledModes, mac
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study, output_root
-from workbench.study.page import FORMAT, Story, block, story_of, tables_of, to_its_error
+from workbench.study.page import FORMAT, Story, Table, block, story_of, tables_of, to_its_error
 from workbench.study.verdict_page import STANDING_OF, case_inputs, moving_modes
 
 TURN = 2.0 * np.pi
@@ -106,19 +106,19 @@ def _finite(digits: str) -> float:
     return value if np.isfinite(value) else _refuse(digits)
 
 
-def _tables(content: Mapping) -> list[tuple]:
+def _tables(content: Mapping[str, Any]) -> list[Table]:
     single = {name: value for name, value in content.items() if isinstance(value, str | int | float | bool)}
     alone = [("Figures", ("name", "value"), [[name, value] for name, value in single.items()])] if single else []
     return [*alone, *tables_of(content)]
 
 
-def _words(lines: list) -> list[str]:
+def _words(lines: list[str]) -> list[str]:
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise TypeError(f"{lines!r:.60} is no list of texts")
     return lines
 
 
-def _verdict(content: dict) -> dict:
+def _verdict(content: dict[str, Any]) -> dict[str, Any]:
     """A verdict."""
     gap = {name: dict(values) for name, values in content["gap"].items()}
     effects = [
@@ -148,7 +148,7 @@ def _verdict(content: dict) -> dict:
     }
 
 
-def _identified(content: dict) -> dict:
+def _identified(content: dict[str, Any]) -> dict[str, Any]:
     """The modes of a record."""
     shapes = np.array(content["shapes_real"], float) + 1j * np.array(content["shapes_imag"], float)
     hertz = np.array(content["frequencies_hz"], float)
@@ -176,7 +176,7 @@ def _identified(content: dict) -> dict:
     }
 
 
-def _designed(content: dict) -> dict:
+def _designed(content: dict[str, Any]) -> dict[str, Any]:
     """A comparison of control laws."""
     laws = content["laws"]
     controlled = set(content.get("controlled", ()))
@@ -234,7 +234,7 @@ def _stability(loops: list[str], unstable: list[str]) -> str:
     )
 
 
-def _placed(content: dict) -> dict:
+def _placed(content: dict[str, Any]) -> dict[str, Any]:
     """Actuator placements."""
     placements = content["placements"]
     names = ["optimum", *(str(one["status"]) for one in placements[1:])]
@@ -266,7 +266,7 @@ def _between(places: np.ndarray) -> str:
     return ", ".join(f"{x:.4g}" for x in places)
 
 
-def _studied(content: dict) -> dict:
+def _studied(content: dict[str, Any]) -> dict[str, Any]:
     """The results of a study."""
     checks = [
         [c["name"], c["value"], ("≥ " if c.get("at_least") else "≤ ") + f"{c['limit']:.6g}", bool(c["holds"])]
@@ -279,14 +279,14 @@ def _studied(content: dict) -> dict:
     }
 
 
-def _anything(content: dict) -> dict:
+def _anything(content: dict[str, Any]) -> dict[str, Any]:
     """A table."""
     if not _tables(content):
         raise ValueError("it holds no rows of named figures")
     return {}
 
 
-KINDS: dict[str, Callable[[dict], dict]] = {
+KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "sentence": _verdict,
     "shapes_real": _identified,
     "laws": _designed,

@@ -6,12 +6,16 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
 from workbench.study.cases import StudyError
 from workbench.study.versions import versions
 from workbench.study.whole_file import write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ENDINGS = (".csv", ".parquet", ".json")
 
@@ -29,14 +33,14 @@ class Result:
         seconds: it took.
     """
 
-    parameters: Mapping
+    parameters: Mapping[str, Any]
     seed: int | None
-    values: Mapping
+    values: Mapping[str, Any]
     error: str | None
     trace: str | None
     seconds: float
 
-    def __getitem__(self, name: str):
+    def __getitem__(self, name: str) -> Any:
         """A value or a parameter by name.
 
         Raises:
@@ -52,7 +56,7 @@ class Result:
 
 
 @dataclass(frozen=True, eq=False)
-class Results(Sequence):
+class Results(Sequence[Result]):
     """Results in the order of their cases."""
 
     every: tuple[Result, ...]
@@ -60,7 +64,11 @@ class Results(Sequence):
     def __len__(self) -> int:
         return len(self.every)
 
-    def __getitem__(self, index):
+    @overload
+    def __getitem__(self, index: int) -> Result: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Result, ...]: ...
+    def __getitem__(self, index: int | slice) -> Result | tuple[Result, ...]:
         return self.every[index]
 
     def __iter__(self) -> Iterator[Result]:
@@ -76,7 +84,7 @@ class Results(Sequence):
         """Work of all cases together, s."""
         return sum(result.seconds for result in self.every)
 
-    def rows(self) -> list[dict]:
+    def rows(self) -> list[dict[str, Any]]:
         """A dict a case, all with the same names: parameters, values, seed, error, seconds, versions.
 
         What a dict holds has a column of its own, `outer.inner`; a value that no case of this row has is None.
@@ -118,7 +126,7 @@ class Results(Sequence):
             write_whole(path, _csv(rows))
         return path
 
-    def frame(self):
+    def frame(self) -> "pd.DataFrame":
         """The table as a pandas frame.
 
         Raises:
@@ -131,7 +139,7 @@ class Results(Sequence):
         return pd.DataFrame(self.rows())
 
 
-def _flat(values: Mapping, before: str = "") -> dict:
+def _flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     flat: dict[str, object] = {}
     for name, value in values.items():
         part = _flat(value, f"{before}{name}.") if isinstance(value, Mapping) else {before + name: value}
@@ -142,11 +150,11 @@ def _flat(values: Mapping, before: str = "") -> dict:
     return flat
 
 
-def _same(a, b) -> bool:
+def _same(a: object, b: object) -> bool:
     return json.dumps(_plain(a)) == json.dumps(_plain(b))
 
 
-def _plain(value):
+def _plain(value: object) -> object:
     if isinstance(value, np.ndarray):
         return _plain(value.tolist())
     if isinstance(value, list):
@@ -156,7 +164,7 @@ def _plain(value):
     return str(value) if isinstance(value, Path) else value
 
 
-def _csv(rows: list[dict]) -> str:
+def _csv(rows: list[dict[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()
@@ -164,7 +172,7 @@ def _csv(rows: list[dict]) -> str:
     return text.getvalue()
 
 
-def _write_parquet(path: Path, rows: list[dict]) -> None:
+def _write_parquet(path: Path, rows: list[dict[str, Any]]) -> None:
     try:
         import pyarrow as pa
         from pyarrow import parquet

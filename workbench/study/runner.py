@@ -2,8 +2,9 @@
 
 import inspect
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import joblib
 
@@ -17,8 +18,8 @@ CACHE = Path("out/cache")
 
 
 def run(
-    cases: Iterable[Mapping],
-    function: Callable,
+    cases: Iterable[Mapping[str, Any]],
+    function: Callable[..., Any],
     *,
     cache: str | Path | None = CACHE,
     workers: int | None = None,
@@ -84,7 +85,9 @@ def run(
     )
 
 
-def _computed(function, jobs, workers, scheduler):
+def _computed(
+    function: Callable[..., Any], jobs: list[Job], workers: int | None, scheduler: str | None
+) -> Iterator[tuple[str, dict[str, Any]]]:
     if not jobs:
         return iter(())
     if scheduler:
@@ -93,7 +96,7 @@ def _computed(function, jobs, workers, scheduler):
     return here(function, jobs) if workers == 1 else processes(function, jobs, workers)
 
 
-def _seeds(cases, function, root: int) -> list[int | None]:
+def _seeds(cases: Sequence[Mapping[str, Any]], function: Callable[..., Any], root: int) -> list[int | None]:
     try:
         wants = "seed" in inspect.signature(function).parameters
     except (TypeError, ValueError):
@@ -101,23 +104,24 @@ def _seeds(cases, function, root: int) -> list[int | None]:
     return [seed_of(case, root) if wants and "seed" not in case else None for case in cases]
 
 
-def _arguments(case: dict, seed: int | None) -> dict:
+def _arguments(case: dict[str, Any], seed: int | None) -> dict[str, Any]:
     return case if seed is None else {**case, "seed": seed}
 
 
-def _seed_shown(case: dict, seed: int | None):
+def _seed_shown(case: dict[str, Any], seed: int | None) -> int | None:
     return case.get("seed") if seed is None else seed
 
 
-def _values(record: dict) -> dict:
-    return decoded(record["result"] or {})
+def _values(record: dict[str, Any]) -> dict[str, Any]:
+    values: dict[str, Any] = decoded(record["result"] or {})
+    return values
 
 
-def _ending(record: dict) -> tuple:
+def _ending(record: dict[str, Any]) -> tuple[str | None, str | None, float]:
     return record["error"], record["trace"], record["seconds"]
 
 
-def _kept(folder: Path, keys: list[str]) -> dict[str, dict]:
+def _kept(folder: Path, keys: list[str]) -> dict[str, dict[str, Any]]:
     found = {key: read_record(_file(folder, key)) for key in set(keys)}
     return {key: record for key, record in found.items() if record is not None}
 
@@ -126,11 +130,11 @@ def _file(folder: Path, key: str) -> Path:
     return folder / f"{key}.json"
 
 
-def _name(function) -> str:
+def _name(function: Callable[..., Any]) -> str:
     name = getattr(function, "__name__", type(function).__name__)
     return "".join(c if c.isalnum() or c == "_" else "-" for c in name)
 
 
-def _report(report, done: int, of: int) -> None:
+def _report(report: Callable[[str, float], None] | None, done: int, of: int) -> None:
     if report is not None:
         report(f"{done} of {of} cases", done / of)

@@ -1,15 +1,13 @@
 """A design found on the bench, saved as a study of its own."""
 
-import re
 from dataclasses import fields
 from pathlib import Path
 
 from workbench.rig.rig import Rig
-from workbench.study.cases import StudyError
+from workbench.study.templates import free_path
 from workbench.study.trying import Design, try_out
 from workbench.study.whole_file import write_whole
 
-NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 SCRIPT = '''"""Does the design found on the bench do what the bench showed?"""
 
 from pathlib import Path
@@ -50,14 +48,7 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
     Raises:
         StudyError: a name that is none, or that is taken.
     """
-    if not NAME.fullmatch(name):
-        raise StudyError(
-            f"a study's name is made of small letters, digits and _, and begins with a letter: {name!r:.60}"
-        )
-    path = folder / f"{name}.py"
-    taken = next((file for file in (path, path.with_suffix(".toml")) if file.exists()), None)
-    if taken:
-        raise StudyError(f"{taken} is there already; choose another name")
+    path = free_path(name, folder)
     tried = try_out(rig, design)
     found = {"W_R": tried.work.residual_total, "effort": tried.effort}
     write_whole(path.with_suffix(".toml"), structure)

@@ -1,12 +1,13 @@
 """Templates that a user begins with: a case folder, a study."""
 
+import re
 from pathlib import Path
 
 from workbench.study.cases import StudyError
-from workbench.study.saved_design import NAME
 from workbench.study.whole_file import write_whole
 
 ASSETS = Path(__file__).with_name("assets")
+NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")
 
 
 def new_case(folder: Path) -> Path:
@@ -28,11 +29,21 @@ def new_study(name: str, folder: Path) -> Path:
     Raises:
         StudyError: a name that is none, or that is taken.
     """
+    return write_whole(free_path(name, folder), (ASSETS / "study.py.txt").read_text(encoding="utf-8"))
+
+
+def free_path(name: str, folder: Path) -> Path:
+    """Where a new study goes, folder/name.py, with room for a structure (TOML) beside it.
+
+    Raises:
+        StudyError: a name that is none, or that is taken.
+    """
     if not NAME.fullmatch(name):
         raise StudyError(
             f"a study's name is made of small letters, digits and _, and begins with a letter: {name!r:.60}"
         )
     path = folder / f"{name}.py"
-    if path.exists():
-        raise StudyError(f"{path} is there already; choose another name")
-    return write_whole(path, (ASSETS / "study.py.txt").read_text(encoding="utf-8"))
+    taken = next((file for file in (path, path.with_suffix(".toml")) if file.exists()), None)
+    if taken:
+        raise StudyError(f"{taken} is there already; choose another name")
+    return path

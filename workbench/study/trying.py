@@ -4,9 +4,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.integrate import simpson
 
 from workbench.cases.case import read_rig
@@ -72,7 +73,7 @@ class Tried:
     effort: float
 
 
-def asked(content: Mapping) -> Design:
+def asked(content: Mapping[str, Any]) -> Design:
     """A design from JSON.
 
     Raises:
@@ -101,7 +102,7 @@ def asked(content: Mapping) -> Design:
     )  # fmt: skip
 
 
-def _number(value, name: str) -> float:
+def _number(value: object, name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < LARGEST:
         raise StudyError(f"{name} is made of finite numbers; got {value!r:.40}")
     return float(value)
@@ -164,7 +165,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
 
 
-def shown(rig: Rig, design: Design) -> dict:
+def shown(rig: Rig, design: Design) -> dict[str, Any]:
     """What the bench shows of a design, as plain numbers."""
     tried = try_out(rig, design)
     step = (N_TIMES - 1) // (N_FRAMES - 1)
@@ -186,7 +187,7 @@ def shown(rig: Rig, design: Design) -> dict:
     }
 
 
-def setting(rig: Rig) -> dict:
+def setting(rig: Rig) -> dict[str, Any]:
     """What the bench needs to know once: the structure, its modes and its shapes."""
     _check_along(rig)
     x = np.linspace(0.0, rig.modes.length, N_PLACES)
@@ -202,13 +203,13 @@ def setting(rig: Rig) -> dict:
     }
 
 
-def _plain(values):
+def _plain(values: ArrayLike) -> Any:
     """Six digits of each number, as JSON holds them; what is not finite is null."""
     values = np.asarray(values, float).tolist()
     return _short(values) if isinstance(values, list) else _short([values])[0]
 
 
-def _short(values: list) -> list:
+def _short(values: list[Any]) -> list[Any]:
     if values and isinstance(values[0], list):
         return [_short(row) for row in values]
     return [float(f"{value:.6g}") if isfinite(value) else None for value in values]

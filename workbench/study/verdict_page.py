@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
-from workbench.study.page import Story, block, to_its_error, write_page
+from workbench.study.page import Story, Table, block, to_its_error, write_page
 
 MOVING = (
     "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
@@ -94,7 +95,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         for name, value in effect["parameters"].items()
     ]
     rivals = [(r["kind"].replace("_", " "), r["probability"]) for r in shown["alternatives"]]
-    tables: list[tuple[str, tuple[str, ...], list]] = [
+    tables: list[Table] = [
         ("Gap on records kept out of the fit", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
         ("Rivals", ("set of effects", "probability"), rivals),
@@ -128,7 +129,7 @@ def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
     return found if len(found) < 2 else [found[0], found[-1]]
 
 
-def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict]:
+def moving_modes(rig: Rig, modes: Mapping[str, Modes]) -> list[dict[str, Any]]:
     """A block of modes that move, where they are known all over a structure or at points with positions."""
     domain = rig.modes.domain
     placed = isinstance(domain, NamedPoints) and domain.positions is not None and len(set(domain.nodes)) > 2

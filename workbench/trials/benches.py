@@ -9,7 +9,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Bar, Beam
+from workbench.structure.member import Bar, Beam, Structure
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant, coloured_noise
 
 SAMPLES = 2000
@@ -166,7 +166,7 @@ def _damping(rng: np.random.Generator) -> ModalDamping:
     return ModalDamping(round(float(rng.uniform(0.003, 0.01)), 4))
 
 
-def _long_beam(rng: np.random.Generator):
+def _long_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
     n = int(rng.integers(4, 7))
     places = np.tile(np.arange(1, n + 1) * 10.0 / (n + 1), 2)
     beam = Beam(
@@ -175,7 +175,7 @@ def _long_beam(rng: np.random.Generator):
     return beam, _sensors(rng, places, "d" * n + "v" * n)
 
 
-def _tapered_beam(rng: np.random.Generator):
+def _tapered_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
     n = int(rng.integers(5, 9))
     ends = (["clamped", "hinged"], ["clamped", "clamped"], ["hinged", "clamped"])[rng.integers(3)]
     beam = Beam(
@@ -189,7 +189,7 @@ def _tapered_beam(rng: np.random.Generator):
     return beam, _sensors(rng, np.arange(1, n + 1) * 10.0 / (n + 1), "d" * (n // 2) + "v" * (n - n // 2))
 
 
-def _ruler(rng: np.random.Generator):
+def _ruler(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
     n = int(rng.integers(4, 7))
     beam = Beam(
         length=0.8,
@@ -203,7 +203,7 @@ def _ruler(rng: np.random.Generator):
     return beam, _sensors(rng, places, "a" * n + "v")
 
 
-def _tapered_rod(rng: np.random.Generator):
+def _tapered_rod(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
     n = int(rng.integers(5, 8))
     end = round(float(rng.choice([0.0, 0.5, 1.0])), 1)
     rod = Bar(

@@ -1,5 +1,7 @@
 """Hidden effects at random: a kind, a place, and a strength at which the gap can be seen."""
 
+from typing import Any
+
 import numpy as np
 
 from workbench.trials.draws import DRAWS
@@ -11,7 +13,7 @@ SMALLEST, LARGEST = 0.02, 1.5
 TRIES = 9
 
 
-def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict:
+def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, Any]:
     """An effect of a kind, in the words of the case format, at a strength that gives a gap drawn at random.
 
     Raises:
@@ -40,7 +42,7 @@ def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict:
     raise Unsuitable(f"{kind}: no strength gives a gap that can be seen; the last was {gap:.2g}")
 
 
-def _gap(effect: dict, scene: Scene, rng: np.random.Generator) -> float:
+def _gap(effect: dict[str, Any], scene: Scene, rng: np.random.Generator) -> float:
     try:
         return scene.gap(hide(Plant.of(scene.bench.rig), [effect]), rng)
     except Unsuitable:

@@ -1,17 +1,23 @@
 """Draws of hidden effects, one a kind: the numbers of an effect, or a function of a strength near 1 that gives them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import combinations
+from typing import Any, NoReturn
 
 import numpy as np
 
-from workbench.structure.domain import NamedPoints
-from workbench.structure.member import Beam
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.structure.domain import NamedPoints, position
+from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.supports import HELD
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
 from workbench.trials.scene import Scene, Unsuitable
 
-Draw = Callable[[Scene, np.random.Generator], dict | Callable[[float], dict]]
+Numbers = dict[str, Any]
+OfStrength = Callable[[float], Numbers]
+Draw = Callable[[Scene, np.random.Generator], Numbers | OfStrength]
+Number = Callable[[float], float]  # of a strength near 1
 
 
 def _sign(rng: np.random.Generator) -> float:
@@ -19,7 +25,7 @@ def _sign(rng: np.random.Generator) -> float:
 
 
 def _factor(name: str, size: float) -> Draw:
-    def draw(scene, rng):
+    def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         sign = _sign(rng)
         return lambda s: {name: float(np.exp(sign * size * s))}
 
@@ -39,7 +45,7 @@ def _stiff(scene: Scene) -> float:
 def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> Draw:
     """Draws of an effect at a point, from what is typical there."""
 
-    def draw(scene, rng):
+    def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         at = scene.place(rng)
         w, v = (float(np.sqrt(np.mean(motion**2))) for motion in scene.motion_at(at))
         law = make(PointSizes(_stiff(scene), w, v, scene.bench.level), rng)
@@ -48,26 +54,29 @@ def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> D
     return draw
 
 
-def _member_only(draw: Draw) -> Draw:
-    def only(scene, rng):
-        if scene.bench.rig.structure is None:
-            raise Unsuitable("plain modal data cannot show this")
-        return draw(scene, rng)
-
-    return only
+def _member(scene: Scene) -> Structure:
+    member = scene.bench.rig.structure
+    if not isinstance(member, Bar | Beam):
+        raise Unsuitable("only a beam or a rod shows this")
+    return member
 
 
-def _loss(scene, rng):
-    length = scene.bench.rig.modes.length
+def _beam(scene: Scene) -> Beam:
+    member = scene.bench.rig.structure
+    if not isinstance(member, Beam):
+        raise Unsuitable("only a beam shows this")
+    return member
+
+
+def _loss(scene: Scene, rng: np.random.Generator) -> OfStrength:
+    length = _member(scene).length
     width = round(float(rng.uniform(0.05, 0.2)) * length, 4)
     at = round(float(rng.uniform(0.5 * width + 0.02 * length, 0.9 * length - 0.5 * width)), 4)
     return lambda s: {"at": at, "width": width, "loss": 1.0 - float(np.exp(-0.2 * s))}
 
 
-def _support(scene, rng):
-    member = scene.bench.rig.structure
-    if not isinstance(member, Beam):
-        raise Unsuitable("a rod has no rotation at its ends")
+def _support(scene: Scene, rng: np.random.Generator) -> OfStrength:
+    member = _beam(scene)
     ends = [(0.0, member.left), (member.length, member.right)]
     ends = [(at, end) for at, end in ends if end.translation == HELD]
     at, end = ends[rng.integers(len(ends))]
@@ -77,27 +86,15 @@ def _support(scene, rng):
     return lambda s: {"at": at, "rotational_stiffness": 0.5 * typical * s}
 
 
-def _axial(scene, rng):
-    member = scene.bench.rig.structure
-    if not isinstance(member, Beam):
-        raise Unsuitable("a tension does not alter a rod")
+def _axial(scene: Scene, rng: np.random.Generator) -> OfStrength:
+    member = _beam(scene)
     typical = float(member.bending_stiffness(np.array([0.5 * member.length]))[0]) / member.length**2
     sign = _sign(rng)
     return lambda s: {"tension": sign * 0.2 * s * typical}
 
 
-def _beam_only(draw: Draw) -> Draw:
-    def only(scene, rng):
-        if not isinstance(scene.bench.rig.structure, Beam):
-            raise Unsuitable("only a beam shows this")
-        return draw(scene, rng)
-
-    return only
-
-
-def _stretching(scene, rng):
-    modes = scene.bench.rig.modes
-    member = scene.bench.rig.structure
+def _stretching(scene: Scene, rng: np.random.Generator) -> OfStrength:
+    modes, member = scene.bench.rig.modes, _beam(scene)
     if not (member.left.translation == HELD and member.right.translation == HELD):
         raise Unsuitable("only ends held apart stretch the midplane")
     grid = np.linspace(0.0, 1.0, 101) * modes.length
@@ -107,16 +104,16 @@ def _stretching(scene, rng):
     return lambda s: {"coefficient": s * typical / size}
 
 
-def _drag(scene, rng):
-    modes = scene.bench.rig.modes
+def _drag(scene: Scene, rng: np.random.Generator) -> OfStrength:
+    modes, member = scene.bench.rig.modes, _member(scene)
     grid = np.linspace(0.0, 1.0, 101) * modes.length
     speed = float(np.sqrt(np.mean((modes.phi(grid) @ scene.moved[1].T) ** 2)))
     damping = float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
-    mass = float(np.mean(scene.bench.rig.structure.mass_per_length(grid[1:-1])))
+    mass = float(np.mean(member.mass_per_length(grid[1:-1])))
     return lambda s: {"coefficient": 0.5 * s * mass * damping / speed}
 
 
-def _damper(scene, rng):
+def _damper(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     modes = scene.bench.rig.modes
     shape = float(np.abs(modes.phi(at)[0]).max())
@@ -124,18 +121,16 @@ def _damper(scene, rng):
     return lambda s: {"at": at, "coefficient": s * damping / shape**2}
 
 
-def _mass(scene, rng):
+def _mass(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     shape = float(np.abs(scene.bench.rig.modes.phi(at)[0]).max())
     return lambda s: {"at": at, "mass": 0.01 * s / shape**2}
 
 
-def _drive(
-    name: str, make: Callable[[Scene, np.random.Generator], Callable[[float], float]], every: float = 0.6
-) -> Draw:
+def _drive(name: str, make: Callable[[Scene, np.random.Generator], Number], every: float = 0.6) -> Draw:
     """Draws of an effect on all actuators, or with chance 1 - every on one of them."""
 
-    def draw(scene, rng):
+    def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         which = "all" if rng.random() < every else str(rng.choice(scene.acting))
         number = make(scene, rng)
         return lambda s: {"input": which, name: number(s)}
@@ -143,43 +138,43 @@ def _drive(
     return draw
 
 
-def _gain(scene, rng):
+def _gain(scene: Scene, rng: np.random.Generator) -> Number:
     sign = _sign(rng)
     return lambda s: float(np.exp(sign * 0.2 * s))
 
 
-def _limit(scene, rng):
+def _limit(scene: Scene, rng: np.random.Generator) -> Number:
     peak = float(np.abs(scene.commands).max())
     return lambda s: peak * float(np.exp(-0.5 * s))
 
 
-def _dead(scene, rng):
+def _dead(scene: Scene, rng: np.random.Generator) -> Number:
     return lambda s: 0.1 * s * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
 
 
-def _hysteresis(scene, rng):
+def _hysteresis(scene: Scene, rng: np.random.Generator) -> OfStrength:
     which = "all" if rng.random() < 0.6 else str(rng.choice(scene.acting))
     width = float(rng.uniform(0.3, 1.0)) * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
     return lambda s: {"input": which, "share": float(-np.expm1(-0.3 * s)), "width": width}
 
 
-def _push(scene, rng):
+def _push(scene: Scene, rng: np.random.Generator) -> Number:
     sign = _sign(rng)
     return lambda s: sign * 0.1 * s * scene.bench.level
 
 
-def _rate(scene, rng):
+def _rate(scene: Scene, rng: np.random.Generator) -> Number:
     """No faster than twice the changes of the command: beyond, an accelerometer shows a delay and nothing else."""
     steps = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
     return lambda s: float(np.quantile(steps, 0.9)) / max(s, 0.5)
 
 
-def _swapped_inputs(scene, rng):
+def _swapped_inputs(scene: Scene, rng: np.random.Generator) -> Numbers:
     pair = sorted(str(name) for name in rng.choice(scene.acting, 2, replace=False))
     return {"input": pair[0], "with": pair[1]}
 
 
-def _swapped_outputs(scene, rng):
+def _swapped_outputs(scene: Scene, rng: np.random.Generator) -> Numbers:
     sensors = scene.bench.rig.sensors
     alike = [(a.name, b.name) for a, b in combinations(sensors, 2) if a.quantity == b.quantity]
     if not alike:
@@ -188,39 +183,40 @@ def _swapped_outputs(scene, rng):
     return {"output": pair[0], "with": pair[1]}
 
 
-def _crosstalk(scene, rng):
+def _crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     row, source = rng.choice(len(scene.bench.rig.sensors), 2, replace=False)
     names, sign = [s.name for s in scene.bench.rig.sensors], _sign(rng)
     ratio = float(scene.outputs[row].std() / scene.outputs[source].std())
     return lambda s: {"output": names[row], "from": names[source], "share": sign * 0.2 * s * ratio}
 
 
-def _time(scene, rng):
+def _time(scene: Scene, rng: np.random.Generator) -> Number:
     return lambda s: 0.5 * s * scene.bench.sample_time
 
 
-def _moved_actuator(scene, rng):
+def _moved_actuator(scene: Scene, rng: np.random.Generator) -> Numbers:
     return _moved_port(scene, rng, "input", [a for a in scene.bench.rig.actuators if not a.direct])
 
 
-def _moved_sensor(scene, rng):
+def _moved_sensor(scene: Scene, rng: np.random.Generator) -> Numbers:
     return _moved_port(scene, rng, "output", list(scene.bench.rig.sensors))
 
 
-def _moved_port(scene, rng, side, ports):
-    port, domain = ports[rng.integers(len(ports))], scene.bench.rig.modes.domain
+def _moved_port(scene: Scene, rng: np.random.Generator, side: str, ports: Sequence[Actuator | Sensor]) -> Numbers:
+    port, domain = ports[int(rng.integers(len(ports)))], scene.bench.rig.modes.domain
     if isinstance(domain, NamedPoints):
         return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
     length = domain.size
     step = _sign(rng) * float(rng.uniform(0.03, 0.25)) * length
-    at = port.at + step if 0.02 * length < port.at + step < length else port.at - step
+    stands = position(port.at)
+    at = stands + step if 0.02 * length < stands + step < length else stands - step
     if not 0.02 * length < at < length:
         raise Unsuitable("the port would leave the structure")
     return {side: port.name, "at": round(at, 4)}
 
 
-def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Callable[[float], float]]) -> Draw:
-    def draw(scene, rng):
+def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Number]) -> Draw:
+    def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         row = int(rng.integers(len(scene.bench.rig.sensors)))
         number = make(scene, row, rng)
         return lambda s: {"output": scene.bench.rig.sensors[row].name, name: number(s)}
@@ -228,19 +224,19 @@ def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Callab
     return draw
 
 
-def _in_rms(size: float) -> Callable:
-    def make(scene, row, rng):
+def _in_rms(size: float) -> Callable[[Scene, int, np.random.Generator], Number]:
+    def make(scene: Scene, row: int, rng: np.random.Generator) -> Number:
         rms, sign = float(scene.outputs[row].std()), _sign(rng)
         return lambda s: sign * size * s * rms
 
     return make
 
 
-def _clip(scene, row, rng):
+def _clip(scene: Scene, row: int, rng: np.random.Generator) -> Number:
     return lambda s: float(np.abs(scene.outputs[row]).max()) * float(np.exp(-0.4 * s))
 
 
-def _step(scene, rng):
+def _step(scene: Scene, rng: np.random.Generator) -> Numbers:
     row = int(rng.integers(len(scene.bench.rig.sensors)))
     sensor = scene.bench.rig.sensors[row]
     step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * scene.outputs[row].std()):.3g}")
@@ -249,48 +245,48 @@ def _step(scene, rng):
     return {"output": sensor.name, "step": step}
 
 
-def _sensor_lag(scene, rng):
+def _sensor_lag(scene: Scene, rng: np.random.Generator) -> OfStrength:
     which = "all" if rng.random() < 0.6 else str(rng.choice([s.name for s in scene.bench.rig.sensors]))
     return lambda s: {"output": which, "time_constant": 0.5 * s * scene.bench.sample_time}
 
 
-def _tone(scene, rng):
+def _tone(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     frequency, phase = float(rng.uniform(0.1, 1.0)) * scene.bench.band_hz, float(rng.uniform(-np.pi, np.pi))
     return lambda s: {"at": at, "frequency": frequency, "amplitude": 0.05 * s * scene.bench.level, "phase": phase}
 
 
-def _noise(scene, rng):
+def _noise(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at, corner = scene.place(rng), float(rng.uniform(0.6, 2.0)) * scene.bench.band_hz
     return lambda s: {"at": at, "rms": 0.1 * s * scene.bench.level, "corner": corner}
 
 
-def _drift(scene, rng):
+def _drift(scene: Scene, rng: np.random.Generator) -> OfStrength:
     duration, sign = scene.commands.shape[1] * scene.bench.sample_time, _sign(rng)
     return lambda s: {"rate": sign * min(0.02 * s, 0.5) / duration}
 
 
-def _truncation(scene, rng):
+def _truncation(scene: Scene, rng: np.random.Generator) -> NoReturn:
     raise Unsuitable("truncation is drawn with the bench: the nominal model gives up modes")
 
 
-def _cross_talk(scene, rng):
+def _cross_talk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     first, second = rng.choice(scene.acting, 2, replace=False)
     sign = _sign(rng)
     return lambda s: {"input": str(first), "from": str(second), "share": sign * 0.2 * s}
 
 
-def _bent_command(scene, rng):
+def _bent_command(scene: Scene, rng: np.random.Generator) -> OfStrength:
     rms = float(np.sqrt(np.mean(scene.commands[0] ** 2)))
     return lambda s: {"curvature": 0.2 * s / rms}
 
 
-def _bent_reading(scene, row, rng):
+def _bent_reading(scene: Scene, row: int, rng: np.random.Generator) -> Number:
     rms, sign = float(scene.outputs[row].std()), _sign(rng)
     return lambda s: sign * 0.2 * s / rms
 
 
-def _hum(scene, rng):
+def _hum(scene: Scene, rng: np.random.Generator) -> OfStrength:
     row, frequency = int(rng.integers(len(scene.bench.rig.sensors))), float(rng.uniform(0.2, 2.0)) * scene.bench.band_hz
     rms = float(scene.outputs[row].std())
     return lambda s: {
@@ -300,7 +296,7 @@ def _hum(scene, rng):
     }
 
 
-def _spikes(scene, rng):
+def _spikes(scene: Scene, rng: np.random.Generator) -> OfStrength:
     row, every = int(rng.integers(len(scene.bench.rig.sensors))), int(rng.integers(60, 300))
     rms = float(scene.outputs[row].std())
     return lambda s: {"output": scene.bench.rig.sensors[row].name, "every": every, "amplitude": 2.0 * s * rms}
@@ -309,7 +305,7 @@ def _spikes(scene, rng):
 DRAWS: dict[str, Draw] = {
     "modulus_error": _factor("factor", 0.02),
     "point_mass": _mass,
-    "local_stiffness_loss": _member_only(_loss),
+    "local_stiffness_loss": _loss,
     "support_rotation": _support,
     "axial_load": _axial,
     "ground_spring": _at_point(lambda p, rng: lambda s: {"stiffness": 0.05 * s * p.stiffness}),
@@ -317,8 +313,8 @@ DRAWS: dict[str, Draw] = {
     "truncated_modes": _truncation,
     "modal_damping": _factor("factor", 0.3),
     "point_damper": _damper,
-    "air_drag": _member_only(_drag),
-    "midplane_stretching": _beam_only(_stretching),
+    "air_drag": _drag,
+    "midplane_stretching": _stretching,
     "actuator_gain": _drive("gain", _gain, every=0.0),
     "actuator_lag": _drive("time_constant", _time),
     "actuator_delay": _drive("delay", _time),

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import eigh
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, sparray
 from scipy.sparse.linalg import eigsh
 from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functional, MeshLine
 from skfem.helpers import d, dd
 
+from workbench.arrays import Floats
 from workbench.structure.domain import position
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, frozen
@@ -146,40 +147,40 @@ def _node(nodes: np.ndarray, at: float) -> int:
     return int(np.argmin(np.abs(nodes - at)))
 
 
-def _matrices(basis: Basis, member: Structure, altered: Alterations):
+def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sparray, sparray, sparray, Functional]:
     """Of strain, mass and slopes, and the strain energy of one shape, twice."""
     bar = isinstance(member, Bar)
     profile = member.axial_stiffness if isinstance(member, Bar) else member.bending_stiffness
 
-    def rigidity(x: np.ndarray) -> np.ndarray:
-        values = altered.stiffness_factor * profile(x) * _waves(altered.stiffness_waves, x / member.length)
+    def rigidity(x: Floats) -> Floats:
+        values: Floats = altered.stiffness_factor * profile(x) * _waves(altered.stiffness_waves, x / member.length)
         for at, width, loss in altered.losses:
             values = values * np.where(np.abs(x - at) < width / 2, 1.0 - loss, 1.0)
         return values
 
-    @BilinearForm
-    def bending(u, v, w):
+    def bending(u: Any, v: Any, w: Any) -> Any:
         return rigidity(w.x[0]) * dd(u)[0, 0] * dd(v)[0, 0]
 
-    @BilinearForm
-    def slope(u, v, w):
+    def slope(u: Any, v: Any, w: Any) -> Any:
         return d(u)[0] * d(v)[0]
 
-    @BilinearForm
-    def stretching(u, v, w):
+    def stretching(u: Any, v: Any, w: Any) -> Any:
         return rigidity(w.x[0]) * d(u)[0] * d(v)[0]
 
-    @BilinearForm
-    def inertia(u, v, w):
+    def inertia(u: Any, v: Any, w: Any) -> Any:
         x = w.x[0]
         return member.mass_per_length(x) * _waves(altered.mass_waves, x / member.length) * u * v
 
-    @Functional
-    def energy(w):
+    def energy(w: Any) -> Any:
         return rigidity(w.x[0]) * (d(w["shape"])[0] if bar else dd(w["shape"])[0, 0]) ** 2
 
-    strain = (stretching if bar else bending).assemble(basis)
-    return strain, inertia.assemble(basis).tolil(), slope.assemble(basis), energy
+    strain = BilinearForm(stretching if bar else bending).assemble(basis)
+    return (
+        strain,
+        BilinearForm(inertia).assemble(basis).tolil(),
+        BilinearForm(slope).assemble(basis),
+        Functional(energy),
+    )
 
 
 def _waves(waves: tuple[float, ...], share: np.ndarray) -> np.ndarray:
@@ -187,7 +188,7 @@ def _waves(waves: tuple[float, ...], share: np.ndarray) -> np.ndarray:
     return sum((c * np.cos((k + 1) * np.pi * share) for k, c in enumerate(waves)), np.ones_like(share))
 
 
-def _hold_ends(stiffness, basis: Basis, member: Structure, altered: Alterations) -> list[int]:
+def _hold_ends(stiffness: sparray, basis: Basis, member: Structure, altered: Alterations) -> list[int]:
     """Add the springs of the ends, and give back what is held."""
     held = []
     for end, rotation, node in zip((member.left, member.right), altered.rotational_stiffness, (0, -1), strict=True):

@@ -9,15 +9,15 @@ import numpy as np
 from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant, with_ports
 
-Hide = Callable[[Plant, dict], Plant]
+Hide = Callable[[Plant, dict[str, Any]], Plant]
 
 
-def _altered(plant: Plant, **changes) -> Plant:
+def _altered(plant: Plant, **changes: Any) -> Plant:
     return replace(plant, altered=replace(plant.altered, **changes))
 
 
 def _law(law: PointLaw) -> Hide:
-    def hide(plant: Plant, e: dict) -> Plant:
+    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
         return replace(plant, laws=(*plant.laws, (law.code, e["at"], tuple(e[name] for name in law.parameters))))
 
     return hide
@@ -31,7 +31,7 @@ def _sensor(**fields: str) -> Hide:
     return lambda plant, e: with_ports(plant, "sensors", e["output"], **{f: e[name] for f, name in fields.items()})
 
 
-def _support(plant: Plant, e: dict) -> Plant:
+def _support(plant: Plant, e: dict[str, Any]) -> Plant:
     left, right = plant.altered.rotational_stiffness
     ends = (e["rotational_stiffness"], right) if e["at"] == 0 else (left, e["rotational_stiffness"])
     return _altered(plant, rotational_stiffness=ends)
@@ -40,7 +40,7 @@ def _support(plant: Plant, e: dict) -> Plant:
 def _swapped(side: str, key: str) -> Hide:
     """Two actuators or two sensors on each other's wires; a channel keeps its name and its noise."""
 
-    def hide(plant: Plant, e: dict) -> Plant:
+    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
         by_name = {port.name: port for port in getattr(plant, side)}
         pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
         kept = ("name", "noise_std") if side == "sensors" else ("name",)
@@ -53,7 +53,7 @@ def _swapped(side: str, key: str) -> Hide:
     return hide
 
 
-def _crosstalk(plant: Plant, e: dict) -> Plant:
+def _crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
     names = [sensor.name for sensor in plant.sensors]
     row, source = names.index(e["output"]), names.index(e["from"])
 
@@ -65,20 +65,20 @@ def _crosstalk(plant: Plant, e: dict) -> Plant:
     return replace(plant, reading_laws=(*plant.reading_laws, read))
 
 
-def _cross_talk(plant: Plant, e: dict) -> Plant:
+def _cross_talk(plant: Plant, e: dict[str, Any]) -> Plant:
     names = [a.name for a in plant.actuators]
     mix = np.eye(len(names))
     mix[names.index(e["input"]), names.index(e["from"])] = e["share"]
     return replace(plant, mix=mix)
 
 
-def _bent_command(plant: Plant, e: dict) -> Plant:
+def _bent_command(plant: Plant, e: dict[str, Any]) -> Plant:
     acting = np.array([not a.direct for a in plant.actuators], float)
     return replace(plant, curvature=e["curvature"] * acting)
 
 
-def _reading(law: Callable[[np.ndarray, float, dict, int], None]) -> Hide:
-    def hide(plant: Plant, e: dict) -> Plant:
+def _reading(law: Callable[[np.ndarray, float, dict[str, Any], int], None]) -> Hide:
+    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
         row = [s.name for s in plant.sensors].index(e["output"])
 
         def read(y: np.ndarray, sample_time: float) -> np.ndarray:
@@ -91,15 +91,15 @@ def _reading(law: Callable[[np.ndarray, float, dict, int], None]) -> Hide:
     return hide
 
 
-def _bent_reading(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
+def _bent_reading(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
     y[row] += e["curvature"] * y[row] ** 2
 
 
-def _hum(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
+def _hum(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
     y[row] += e["amplitude"] * np.sin(2.0 * np.pi * e["frequency"] * sample_time * np.arange(y.shape[1]))
 
 
-def _spikes(y: np.ndarray, sample_time: float, e: dict, row: int) -> None:
+def _spikes(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
     y[row, e["every"] // 2 :: e["every"]] += e["amplitude"]
 
 
@@ -153,7 +153,7 @@ OUTSIDE: dict[str, Hide] = {
 }
 
 
-def hide(plant: Plant, effects: list[dict]) -> Plant:
+def hide(plant: Plant, effects: list[dict[str, Any]]) -> Plant:
     """The plant with effects in it, given in the words of the case format (inputs and outputs by name)."""
     for effect in effects:
         plant = (HIDE | OUTSIDE)[effect["kind"]](plant, effect)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from joblib import Parallel, delayed
 
@@ -27,10 +28,10 @@ class Trials:
         tally: of all scores.
     """
 
-    verdicts: dict[str, dict]
-    labels: dict[str, dict]
-    scores: dict[str, dict]
-    dirty_scores: dict[str, dict]
+    verdicts: dict[str, dict[str, Any]]
+    labels: dict[str, dict[str, Any]]
+    scores: dict[str, dict[str, Any]]
+    dirty_scores: dict[str, dict[str, Any]]
     tally: Tally
 
 
@@ -42,7 +43,7 @@ def hold_trials(
     kinds: Sequence[Sequence[str]] | None = None,
     dirt: str | None = None,
     size: float | None = None,
-    diagnose_case: Callable[[Path], dict] | None = None,
+    diagnose_case: Callable[[Path], dict[str, Any]] | None = None,
     jobs: int = 1,
     report: Callable[[str, float], None] = lambda text, share: None,
 ) -> Trials:
@@ -90,7 +91,7 @@ def hold_trials(
     return Trials(verdicts, labels, scores, dirty, tally(scores.values()))
 
 
-def verdict_on(folder: Path) -> dict:
+def verdict_on(folder: Path) -> dict[str, Any]:
     """The verdict on a case folder, as JSON, by one thread."""
     case = read_case(folder)
     return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1).to_json()

@@ -4,10 +4,11 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.cases.writing import write_case
 from workbench.records.record import Channel, Record
@@ -55,7 +56,7 @@ def make_trial(
     name: str = "case",
     dirt: str = CLEAN,
     size: float = 1.0,
-) -> tuple[Case, dict]:
+) -> tuple[Case, dict[str, Any]]:
     """A case that hides effects of the given kinds, and its label in the words of the case format.
 
     Args:
@@ -96,7 +97,7 @@ def make_trial(
 
 def _draw_effects(
     bench: Bench, commands: np.ndarray, kinds: Sequence[str], rng: np.random.Generator
-) -> tuple[Bench, list[dict]]:
+) -> tuple[Bench, list[dict[str, Any]]]:
     effects = []
     if "truncated_modes" in kinds:
         bench, effect = _truncate(bench, rng)
@@ -109,7 +110,7 @@ def _draw_effects(
     return bench, effects
 
 
-def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict]:
+def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict[str, Any]]:
     """The nominal model gives up modes: the rig is left with few, the structure shows what it had."""
     modes = bench.rig.modes
     if bench.rig.structure is None or modes.n_modes < 6:
@@ -119,7 +120,7 @@ def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict]:
     return replace(bench, rig=rig), {"kind": "truncated_modes", "kept": kept, "needed": modes.n_modes}
 
 
-def _check_each_seen(scene: Scene, effects: list[dict], rng: np.random.Generator) -> None:
+def _check_each_seen(scene: Scene, effects: list[dict[str, Any]], rng: np.random.Generator) -> None:
     nominal = Plant.of(scene.bench.rig)
     for one in effects:
         if one["kind"] == "sensor_quantisation":
@@ -133,8 +134,13 @@ def _check_each_seen(scene: Scene, effects: list[dict], rng: np.random.Generator
 
 
 def _case(
-    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict], dirt: Dirt, rng: np.random.Generator, name: str
-) -> tuple[Case, dict]:
+    bench: Bench,
+    tests: dict[str, np.ndarray],
+    effects: list[dict[str, Any]],
+    dirt: Dirt,
+    rng: np.random.Generator,
+    name: str,
+) -> tuple[Case, dict[str, Any]]:
     dirty = dirt.on(Plant.of(bench.rig), bench.sample_time)
     nominal = Plant.of(bench.rig).solved()
     real = hide(dirty, effects).solved()
@@ -198,11 +204,12 @@ def _check_strong(
         raise Unsuitable(f"the effects make {max(ratios):.2g} times the gap that the dirt makes, at most")
 
 
-def _logged(sent: np.ndarray, noise: float, rng: np.random.Generator) -> np.ndarray:
+def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
     """Inputs as they are logged, with noise of a share of their rms; those at rest are logged as they are."""
     if noise == 0:
         return sent
-    return sent + noise * np.sqrt(np.mean(sent**2, axis=1, keepdims=True)) * rng.standard_normal(sent.shape)
+    rms: Floats = np.sqrt(np.mean(sent**2, axis=1, keepdims=True))
+    return sent + noise * rms * rng.standard_normal(sent.shape)
 
 
 def _budget(figures: dict[str, float]) -> dict[str, float]:
@@ -212,7 +219,7 @@ def _budget(figures: dict[str, float]) -> dict[str, float]:
     return {"explained": (whole - left) / whole, "unexplained": (left - noise) / whole, "noise": noise / whole}
 
 
-def _check_visible(figures: dict[str, dict], effects: list[dict]) -> None:
+def _check_visible(figures: dict[str, dict[str, Any]], effects: list[dict[str, Any]]) -> None:
     """Some record to fit must show the gap well above its noise, else nobody could name it."""
     shown = [f["gap"] ** 2 - f["noise_floor"] ** 2 for test, f in figures.items() if test != "validate"]
     ratio = max(f["gap"] / f["noise_floor"] for test, f in figures.items() if test != "validate")
@@ -342,7 +349,7 @@ def write_trials(
     labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _first_possible(seed: int, i: int, draw: DirtyDraw, like: Case | None, name: str) -> tuple[Case, dict]:
+def _first_possible(seed: int, i: int, draw: DirtyDraw, like: Case | None, name: str) -> tuple[Case, dict[str, Any]]:
     """The trial, or with kinds that this rig cannot show, one of kinds that it can."""
     rng, kinds = np.random.default_rng([seed, i]), draw.kinds
     pool = [k for k in KINDS if k != "truncated_modes" and k not in MIMICS[draw.dirt]]

@@ -7,13 +7,23 @@ coordinates and rates, the lags of actuators, the hysteretic variables of laws a
 import numpy as np
 from numba import njit
 
+from workbench.arrays import Floats
 from workbench.trials.laws import BOUC_WEN, law_force
 
 HYSTERESIS_STEPS = 200  # of a command's change over one sample
 
+# As `integrate` describes it: structure, actuators, tones, laws, air drag.
+System = tuple[
+    tuple[Floats, Floats, Floats, float, float],
+    tuple[Floats, Floats, Floats, Floats],
+    tuple[Floats, Floats],
+    tuple[Floats, Floats],
+    tuple[float, Floats],
+]
+
 
 @njit(cache=True)
-def headed(target, before, rate, time):
+def headed(target: float, before: float, rate: float, time: float) -> float:
     """What an actuator gives that heads for a target for some time, from what it gave before, no faster than a rate."""
     if np.isinf(rate):
         return target
@@ -22,7 +32,7 @@ def headed(target, before, rate, time):
 
 
 @njit(cache=True)
-def hysteretic(z, change, width):
+def hysteretic(z: float, change: float, width: float) -> float:
     """z after a command has changed, z' = u' - (|u'| z + u' |z|) / (2 width), in small steps of the command."""
     h = change / HYSTERESIS_STEPS
     for _ in range(HYSTERESIS_STEPS):
@@ -35,12 +45,12 @@ def hysteretic(z, change, width):
 
 
 @njit(cache=True)
-def _hysteretic_rate(z, change, width):
+def _hysteretic_rate(z: float, change: float, width: float) -> float:
     return change - (abs(change) * z + change * abs(z)) / (2.0 * width)
 
 
 @njit(cache=True)
-def _rates(t, y, dy, system, drive, held):
+def _rates(t: float, y: Floats, dy: Floats, system: System, drive: tuple[Floats, Floats, float], held: Floats) -> None:
     """dy/dt under the forces that the actuators head for and the modal forces held over the interval.
 
     drive: targets (m,), what each actuator gave when it began to head for them (m,), and that time, s.
@@ -93,7 +103,16 @@ def _rates(t, y, dy, system, drive, held):
 
 
 @njit(cache=True)
-def integrate(system, drive, commands, feedback, held, sample_time, edges, steps):
+def integrate(
+    system: System,
+    drive: tuple[Floats, Floats],
+    commands: Floats,
+    feedback: Floats,
+    held: Floats,
+    sample_time: float,
+    edges: Floats,
+    steps: Floats,
+) -> Floats:
     """Modal motion at the samples, from rest.
 
     Args:

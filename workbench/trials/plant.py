@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
+from workbench.arrays import Floats
+from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.member import Structure
@@ -40,7 +42,7 @@ class Plant:
     """
 
     nominal: Rig
-    actuators: tuple
+    actuators: tuple[Actuator, ...]
     sensors: tuple[Sensor, ...]
     n_modes: int
     altered: Alterations = field(default_factory=Alterations)
@@ -223,14 +225,14 @@ def coloured_noise(rng: np.random.Generator, n_samples: int, sample_time: float,
     """Gaussian noise of unit rms, white up to a corner frequency and fading steeply above it."""
     spectrum = np.fft.rfft(rng.standard_normal(2 * n_samples))
     frequency = np.fft.rfftfreq(2 * n_samples, sample_time)
-    noise = np.fft.irfft(spectrum / np.sqrt(1.0 + (frequency / corner_hz) ** 8), 2 * n_samples)[:n_samples]
-    return noise / np.sqrt(np.mean(noise**2))
+    noise: Floats = np.fft.irfft(spectrum / np.sqrt(1.0 + (frequency / corner_hz) ** 8), 2 * n_samples)[:n_samples]
+    return noise / float(np.sqrt(np.mean(noise**2)))
 
 
-def _damping_ratios(plant: Plant) -> np.ndarray:
+def _damping_ratios(plant: Plant) -> Floats:
     """The nominal ratios, mode by mode; modes beyond the nominal ones take the last."""
     zeta = plant.nominal.modes.zeta
-    padded = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
+    padded: Floats = np.r_[zeta, np.full(max(plant.n_modes - zeta.size, 0), zeta[-1])][: plant.n_modes]
     factors = np.ones(plant.n_modes)
     known = plant.damping_factors[: plant.n_modes]
     factors[: len(known)] = known
@@ -260,19 +262,19 @@ def _lag(y: np.ndarray, time_constant: float, sample_time: float) -> np.ndarray:
     return out
 
 
-def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:
+def _mean_rounded(y: Floats, step: float, noise_std: float) -> Floats:
     """The mean of round((y + noise) / step) step: every half step that noise carries a reading across counts one."""
     nearest = np.round(y / step)
     reach = np.arange(int(np.ceil(8.0 * noise_std / step)) + 1)[:, None] + 0.5
-    above = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
-    below = ndtr(((nearest - reach) * step - y) / noise_std).sum(axis=0)
+    above: Floats = ndtr((y - (nearest + reach) * step) / noise_std).sum(axis=0)
+    below: Floats = ndtr(((nearest - reach) * step - y) / noise_std).sum(axis=0)
     return step * (nearest + above - below)
 
 
-def with_ports(plant: Plant, side: str, name: str, **changes) -> Plant:
+def with_ports(plant: Plant, side: str, name: str, **changes: Any) -> Plant:
     """The plant with one actuator or sensor changed, or all of them (never a hammer) for the name "all"."""
 
-    def meant(port) -> bool:
+    def meant(port: Actuator | Sensor) -> bool:
         return port.name == name or (name == "all" and not getattr(port, "direct", False))
 
     ports: Any = tuple(replace(port, **changes) if meant(port) else port for port in getattr(plant, side))

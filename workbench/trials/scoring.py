@@ -217,7 +217,9 @@ def _matched(
         pairs = list(zip(hidden, order, strict=True))
         if any(h["kind"] != t["kind"] for h, t in pairs):
             return float("inf")
-        return sum(abs(h["at"] - t["at"]) / length for h, t in pairs if "at" in h and t.get("at") is not None)
+        return sum(
+            abs(float(h["at"]) - float(t["at"])) / length for h, t in pairs if "at" in h and t.get("at") is not None
+        )
 
     return list(zip(hidden, min(permutations(told), key=cost), strict=True)) if hidden else []
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
 
+from workbench.arrays import Floats
 from workbench.structure.modes import Modes, frozen
-from workbench.structure.profile import ProfileLike, as_profile
+from workbench.structure.profile import Profile, ProfileLike, as_profile
 
 GAUSS_POINTS = 24
 
@@ -29,20 +30,22 @@ class ModalFilter:
     """
 
     positions: np.ndarray
-    displacement: np.ndarray
-    slope: np.ndarray
+    displacement: Floats
+    slope: Floats
     designed_by: Callable[[Modes], "ModalFilter"] | None = None
 
     def __post_init__(self) -> None:
         for name in ("positions", "displacement", "slope"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
-    def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> np.ndarray:
+    def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> Floats:
         """Modal coordinates (n_modes, ...) from readings (n_sensors, ...), time last."""
-        modal = self.displacement @ np.asarray(displacement, float)
-        return modal if slope is None or self.slope.size == 0 else modal + self.slope @ np.asarray(slope, float)
+        modal: Floats = self.displacement @ np.asarray(displacement, float)
+        if slope is not None and self.slope.size:
+            modal = modal + self.slope @ np.asarray(slope, float)
+        return modal
 
-    def seen(self, modes: Modes) -> np.ndarray:
+    def seen(self, modes: Modes) -> Floats:
         """What the filter makes of each mode: (n_filtered, n_modes); the identity for a perfect filter.
 
         Columns beyond the filtered modes are observation spillover.
@@ -108,7 +111,7 @@ def displacement_filter(
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
 
-def _spline_weights(modes: Modes, splines: BSpline, mass) -> np.ndarray:
+def _spline_weights(modes: Modes, splines: BSpline, mass: Profile) -> Floats:
     points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
     breaks = np.unique(np.r_[0.0, splines.t, modes.length])
     breaks = breaks[(breaks >= 0) & (breaks <= modes.length)]

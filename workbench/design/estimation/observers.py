@@ -5,13 +5,14 @@
 What the residual modes add to y is observation spillover (Balas, IEEE Trans. Automatic Control 23 (1978) 673).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import control
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.law import DesignError, Law
@@ -68,7 +69,7 @@ def kalman(
     return _controller(law, sensors, a, b, c, np.asarray(gain), "Kalman filter", again)
 
 
-def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[Floats, Floats, Floats]:
     """A, B and C of the controlled modes alone, from forces to readings.
 
     Raises:
@@ -99,7 +100,16 @@ def _intensity(value: ArrayLike, size: int, name: str) -> np.ndarray:
     return matrix
 
 
-def _controller(law: Law, sensors, a, b, c, gain, how: str, designed_by) -> Controller:
+def _controller(
+    law: Law,
+    sensors: Sequence[Sensor],
+    a: Floats,
+    b: Floats,
+    c: Floats,
+    gain: Floats,
+    how: str,
+    designed_by: Callable[..., Controller],
+) -> Controller:
     state = a - b @ law.gain - gain @ c
     direct = np.zeros((len(law.actuators), len(sensors)))
     name = f"{law.name} on a {how}"

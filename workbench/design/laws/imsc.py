@@ -4,12 +4,13 @@ Meirovitch & Baruh; dissertation section 5.2. Mode r is controlled by the modal 
 actuators by F = B⁺ f, B the participation of the controlled modes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats
 from workbench.design.laws.law import DesignError, Law, controlled_indices, participation
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes
@@ -98,6 +99,13 @@ def imsc_poles(
     return _law(modes, index, actuators, pole_gains(modes.omega[list(index)], poles, c), "IMSC poles", again)
 
 
-def _law(modes: Modes, index, actuators, gains, name: str, designed_by) -> Law:
+def _law(
+    modes: Modes,
+    index: tuple[int, ...],
+    actuators: Sequence[Actuator],
+    gains: Sequence[Floats],
+    name: str,
+    designed_by: Callable[..., Law],
+) -> Law:
     spread = np.linalg.pinv(participation(modes, index, actuators))
     return Law(spread @ np.hstack([np.diag(g) for g in gains]), index, tuple(actuators), name, designed_by)

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.design.laws.printed import Printed, numbered, place_text
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Between, NamedPoints, Rectangle
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed, place_text
 
 SINGULAR = 1e8
 UNMOVED = 1e-9
@@ -152,3 +152,10 @@ def _largest_participation(modes: Modes, actuators: Sequence[Actuator]) -> np.nd
             shapes = modes.phi(np.linspace(0.0, modes.length, 8 * modes.n_modes + 9), int(turns))
         most = np.maximum(most, abs(actuator.gain) * np.abs(shapes).max(axis=0))
     return most
+
+
+def numbered(indices: Sequence[int]) -> str:
+    """Zero-based modes as they are counted: 1 to 4, or 1, 2, 5."""
+    if len(indices) > 2 and list(indices) == list(range(indices[0], indices[-1] + 1)):
+        return f"{indices[0] + 1} to {indices[-1] + 1}"
+    return ", ".join(str(r + 1) for r in indices)

@@ -5,8 +5,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import expm
 
+from workbench.arrays import Complexes, Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
@@ -62,21 +64,21 @@ class Response:
         modes: whose shapes carry the motion.
     """
 
-    time: np.ndarray
-    modal: np.ndarray
-    forces: np.ndarray
+    time: Floats
+    modal: Floats
+    forces: Floats
     modes: Modes
 
     def __post_init__(self) -> None:
         for name in ("time", "modal", "forces"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
-    def displacement(self, x) -> np.ndarray:
+    def displacement(self, x: ArrayLike) -> Floats:
         """w(x, t): (n_points, n_times)."""
         return self.modes.phi(x) @ self.modal[: self.modes.n_modes]
 
     @property
-    def energy(self) -> np.ndarray:
+    def energy(self) -> Floats:
         """Energy of each mode, (n_modes, n_times): ½ (q'² + ω² q²)."""
         n = self.modes.n_modes
         return 0.5 * (self.modal[n:] ** 2 + (self.modes.omega[:, None] * self.modal[:n]) ** 2)
@@ -125,9 +127,9 @@ def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
     return ClosedLoop(modes, controller.law, matrix, feedback)
 
 
-def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> np.ndarray:
+def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> Floats:
     """State (2n,) just after an impulse (N s) at x: q_r' = impulse φ_r(x) (5.58)."""
-    return np.r_[np.zeros(modes.n_modes), impulse * modes.phi(at)[0]]
+    return np.concatenate([np.zeros(modes.n_modes), impulse * modes.phi(at)[0]])
 
 
 def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
@@ -222,7 +224,7 @@ def _halves(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return time[0] + step * width * np.arange(-(-n // width)), step * np.arange(width)
 
 
-def _added_up(amplitudes: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _added_up(amplitudes: Complexes, left: Complexes, right: Complexes) -> Floats:
     """Re Σ_k a_k e^{λ_k (t_a + t_b)} at all instants, from factors (n_outer, n_poles) and (n_poles, n_inner)."""
     scaled = left * amplitudes
     return (np.hstack([scaled.real, -scaled.imag]) @ np.vstack([right.real, right.imag])).ravel()

@@ -8,6 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
+from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import ONSET
 from workbench.rig.stepping import (
     BOUC_WEN,
@@ -20,11 +21,16 @@ from workbench.rig.stepping import (
     yield_update,
 )
 
+# As `loop_record` and `_commands` describe them.
+StructureArrays = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
+LawArrays = tuple[Integers, Floats, Floats]
+ControllerArrays = tuple[tuple[Floats, ...], ...]
+
 RUN_AWAY = 1e100  # of any unit: no loop comes back
 
 
 @njit(cache=True, nogil=True)
-def _headed(u, drive, j, z, before):
+def _headed(u: float, drive: Floats, j: int, z: Floats, before: Floats) -> float:
     """The force that actuator j heads for: hysteresis, gain, dead zone, saturation; z is its hysteresis."""
     if drive[j, 7] > 0.0:
         z[j], _ = yield_update(z[j], u - before[j], drive[j, 8])
@@ -32,11 +38,14 @@ def _headed(u, drive, j, z, before):
         u = (1.0 - drive[j, 7]) * u + drive[j, 7] * z[j]
     f = drive[j, 0] * u
     f = math.copysign(max(abs(f) - drive[j, 1], 0.0), f)
-    return min(max(f, -drive[j, 2]), drive[j, 2])
+    limit: float = drive[j, 2]
+    return min(max(f, -limit), limit)
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _commands(controller, k, reading, z, z_next, v, command):
+def _commands(
+    controller: ControllerArrays, k: int, reading: Floats, z: Floats, z_next: Floats, v: Floats, command: Floats
+) -> None:
     """Fill the commands of a `DigitalController` (n_actuators,), what is followed of them, and its next state."""
     (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (spread, on, band), (push, cf, df, force, smooth) = (
         controller
@@ -85,7 +94,22 @@ def _commands(controller, k, reading, z, z_next, v, command):
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def loop_record(structure, laws, drive, into, sense, seen, noise, controller, start, disturbance, at, dt, n_sub, out):
+def loop_record(
+    structure: StructureArrays,
+    laws: LawArrays,
+    drive: Floats,
+    into: Floats,
+    sense: Floats,
+    seen: Floats,
+    noise: Floats,
+    controller: ControllerArrays,
+    start: Floats,
+    disturbance: Floats,
+    at: Floats,
+    dt: float,
+    n_sub: int,
+    out: tuple[Floats, ...],
+) -> bool:
     """Fill a loop's motion from a start; False where it runs away.
 
     Args:

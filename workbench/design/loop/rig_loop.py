@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from os import cpu_count
+from typing import TypeVar
 
 import numpy as np
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
-from workbench.design.loop.loop_steps import loop_record
+from workbench.design.loop.loop_steps import ControllerArrays, LawArrays, StructureArrays, loop_record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, MidplaneStretching, PeriodicForce, PointElement, RandomForce, UserLaw
 from workbench.rig.rig import Rig
@@ -19,6 +20,8 @@ from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Where
 
 SUBSTEPS = 4
+
+P = TypeVar("P", Actuator, Sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +109,8 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
     """
     check_fits(rig, controller, test)
     modes, n = rig.modes, rig.modes.n_modes
-    sensors = [_named(rig.sensors, name) for name in controller.sensors]
-    actuators = [_named(rig.actuators, name) for name in controller.actuators]
+    sensors = [named(rig.sensors, name) for name in controller.sensors]
+    actuators = [named(rig.actuators, name) for name in controller.actuators]
     into = participation_of(Rig(modes, tuple(actuators), ()))
     rng = None if test.seed is None else np.random.default_rng(test.seed)
     noise = np.zeros((len(sensors), test.n_samples))
@@ -178,15 +181,16 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
     if any(isinstance(e, UserLaw) for e in rig.elements):
         raise ValueError("a loop cannot simulate a UserLaw; describe it by one of the laws of workbench.rig.elements")
     for name in controller.sensors:
-        if MEASURED[_named(rig.sensors, name).quantity][1] > 1:
+        if MEASURED[named(rig.sensors, name).quantity][1] > 1:
             raise ValueError(f"sensor {name} reads acceleration; a controller here reads motion or rates")
 
 
-def _named(parts: Sequence, name: str):
+def named(parts: Sequence[P], name: str) -> P:
+    """The actuator or the sensor of that name."""
     return next(part for part in parts if part.name == name)
 
 
-def _structure(rig: Rig) -> tuple:
+def _structure(rig: Rig) -> StructureArrays:
     modes, n = rig.modes, rig.modes.n_modes
     diagonal = np.diag(modes.damping).copy()
     coupling = modes.damping - np.diag(diagonal)
@@ -205,7 +209,7 @@ def _structure(rig: Rig) -> tuple:
     )
 
 
-def _laws(rig: Rig, points: Sequence) -> tuple:
+def _laws(rig: Rig, points: Sequence[PointElement]) -> LawArrays:
     parameters = np.zeros((len(points), 3))
     for row, element in zip(parameters, points, strict=True):
         values = LAWS[type(element)][1](element)
@@ -229,7 +233,7 @@ def _seen(rig: Rig, sensors: Sequence[Sensor]) -> np.ndarray:
     """(2, n_sensors, n_modes) truth of each sensor by displacements and by rates, gain left out, cross-talk in."""
     seen = np.zeros((2, len(sensors), rig.modes.n_modes))
     for j, sensor in enumerate(sensors):
-        for source, share in ((sensor, 1.0), *((_named(rig.sensors, n), part) for n, part in sensor.crosstalk)):
+        for source, share in ((sensor, 1.0), *((named(rig.sensors, n), part) for n, part in sensor.crosstalk)):
             order = MEASURED[source.quantity][1]
             if order < 2:
                 seen[order, j] += share / source.gain * output_matrix(rig.modes, [source])[0]
@@ -252,7 +256,7 @@ def _disturbances(rig: Rig, test: LoopTest, rng: np.random.Generator | None) -> 
     return np.array(rows).reshape(-1, test.n_samples), np.ascontiguousarray(np.array(columns).reshape(-1, n).T)
 
 
-def _arrays(one: DigitalController) -> tuple:
+def _arrays(one: DigitalController) -> ControllerArrays:
     n, n_sensors, n_actuators = one.a.shape[0], len(one.sensors), len(one.actuators)
     relays, friction = one.relays, one.friction
     switching = (np.zeros((n_actuators, 0)), np.zeros(0), np.zeros(0))

@@ -7,12 +7,15 @@ under the mean force that keeps s' = 0 (Filippov 1988); every piece of the motio
 """
 
 import cmath
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 
+from workbench.arrays import Floats
 from workbench.design.laws.on_off import Relay
 
 # of the largest |s| in reach: an extremum of s that comes no further past an edge than this touches and turns back
@@ -79,7 +82,9 @@ def _stretches(relay: Relay, q: float, v: float, final: float) -> Iterator[Stret
     raise RuntimeError(f"more than {MOST_EVENTS} switchings before {final:g} s")
 
 
-def _crossing(relay, q, v, force, levels, edge, horizon) -> tuple[float, float | None]:
+def _crossing(
+    relay: Relay, q: float, v: float, force: float, levels: Sequence[float], edge: float | None, horizon: float
+) -> tuple[float, float | None]:
     """When s first crosses one of the levels, and which; (inf, None) where it does not before the horizon.
 
     s' obeys the free equation of the mode, so its zeros are known and s is monotone between them.
@@ -92,7 +97,7 @@ def _crossing(relay, q, v, force, levels, edge, horizon) -> tuple[float, float |
 
     def s(time: float) -> float:
         position, rate = travel(omega, c, time, q, v, force)
-        return rate + slope * position
+        return float(rate + slope * position)
 
     left, value = 0.0, s0 if edge is None else edge
     for right in _turns(omega, c, acceleration + slope * v, jerk + slope * acceleration, horizon):
@@ -131,13 +136,13 @@ def _turns(omega: float, c: float, w: float, dw: float, horizon: float) -> Itera
     yield horizon
 
 
-def _slid(relay: Relay, q: float, edge: float, time):
+def _slid(relay: Relay, q: float, edge: float, time: float) -> float:
     """q after sliding along s = edge for a while: q' = edge - λ q."""
     slope = relay.slope
     return q + (edge - slope * q) * (-np.expm1(-slope * time) / slope if slope > 0 else time)
 
 
-def _pull(relay: Relay, q, edge):
+def _pull(relay: Relay, q: float, edge: float) -> float:
     """s' on the edge with the force off: the mean force that holds the mode there, sign reversed."""
     return -(relay.omega**2) * q + (relay.slope - relay.damping) * (edge - relay.slope * q)
 
@@ -171,10 +176,10 @@ def _sliding(relay: Relay, start: float, end: float, q: float, v: float, edge: f
 # --- closed forms
 
 
-def kernels(omega, c, time):
+def kernels(omega: ArrayLike, c: ArrayLike, time: ArrayLike) -> tuple[Any, Any, Any, Any]:
     """h, h', ∫h and ∫∫h of q'' + c q' + ω² q = δ(t), from rest; arrays broadcast."""
     if np.ndim(omega) == 0 and np.ndim(time) == 0:
-        return _kernels(float(omega), float(c), float(time))
+        return _kernels(float(omega), float(c), float(time))  # type: ignore[arg-type]
     omega, c, time = np.broadcast_arrays(np.asarray(omega, float), np.asarray(c, float), np.asarray(time, float))
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma = 0.5 * c
@@ -193,7 +198,7 @@ def kernels(omega, c, time):
     return h, dh, once, twice
 
 
-def _kernels(omega: float, c: float, time: float):
+def _kernels(omega: float, c: float, time: float) -> tuple[float, float, float, float]:
     """`kernels` of one number, without the cost of arrays."""
     sigma = 0.5 * c
     r = cmath.sqrt(sigma**2 - omega**2)
@@ -211,7 +216,17 @@ def _kernels(omega: float, c: float, time: float):
     return h, dh, once, twice
 
 
-def travel(omega, c, time, q, v, steady, ramp=0.0, fading=0.0, slope=0.0):
+def travel(
+    omega: float | Floats,
+    c: float | Floats,
+    time: float | Floats,
+    q: float | Floats,
+    v: float | Floats,
+    steady: float | Floats,
+    ramp: float | Floats = 0.0,
+    fading: float | Floats = 0.0,
+    slope: float | Floats = 0.0,
+) -> tuple[Any, Any]:
     """(q, q') after `time` under f(τ) = steady + ramp τ + fading e^{-λτ}; arrays broadcast."""
     h, dh, once, twice = kernels(omega, c, time)
     position = q * (dh + c * h) + v * h + steady * once + ramp * twice

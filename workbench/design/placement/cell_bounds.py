@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from workbench.arrays import Flags, Floats, Integers
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
@@ -108,7 +109,7 @@ class CellBounds:
             table.most_rate,
             np.ascontiguousarray(task.roots),
             roots,
-            inverses.any(axis=(1, 2)),
+            np.asarray(inverses.any(axis=(1, 2))),
             np.einsum("skl,il->isk", inverses, table.slope[:, :n]),
             np.linalg.norm(np.einsum("skl,il->isk", np.abs(inverses), table.most_bend[:, :n]), axis=2),
             np.array([limit for _, limit in squares]),
@@ -126,7 +127,7 @@ class CellBounds:
 
 
 @njit(cache=True, nogil=True)
-def _inverse(matrix, inverse, least):
+def _inverse(matrix: Floats, inverse: Floats, least: float) -> bool:
     """Gauss-Jordan with pivots; whether every pivot is above the least. The matrix is destroyed."""
     n = matrix.shape[0]
     for i in range(n):
@@ -157,7 +158,7 @@ def _inverse(matrix, inverse, least):
 
 
 @njit(cache=True, nogil=True)
-def _least_linear(cost, h, direction, slack):
+def _least_linear(cost: Floats, h: Floats, direction: Floats, slack: float) -> float:
     """min cᵀδ over |δ| <= h with aᵀδ <= slack, by its dual; inf where no δ keeps the constraint."""
     n = cost.size
     reach = 0.0
@@ -183,26 +184,26 @@ def _least_linear(cost, h, direction, slack):
 
 @njit(cache=True, nogil=True)
 def _bounds(
-    cells,
-    halves,
-    value,
-    slope,
-    bend,
-    most_bend,
-    most_rate,
-    transforms,
-    roots,
-    regular,
-    root_slope,
-    root_bend,
-    square_limits,
-    condition,
-    forces,
-    peak,
-    lower,
-    work,
-    axis,
-):
+    cells: Integers,
+    halves: Floats,
+    value: Floats,
+    slope: Floats,
+    bend: Floats,
+    most_bend: Floats,
+    most_rate: Floats,
+    transforms: Floats,
+    roots: Floats,
+    regular: Flags,
+    root_slope: Floats,
+    root_bend: Floats,
+    square_limits: Floats,
+    condition: float,
+    forces: Floats,
+    peak: float,
+    lower: Floats,
+    work: Floats,
+    axis: Integers,
+) -> None:
     n_cells, n = cells.shape
     n_residual, _, n_columns = transforms.shape
     n_squares, n_instants = roots.shape[0], forces.shape[1]

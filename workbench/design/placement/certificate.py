@@ -14,6 +14,7 @@ from math import comb
 
 import numpy as np
 
+from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.cell_bounds import CellBounds
 from workbench.design.placement.cell_tree import CellTree
@@ -162,11 +163,12 @@ class _Search:
             return Certificate(self._best, float(self._wanted**2), self.cells, True, seconds=spent)
         return Certificate(self._best, float(bound**2), self.cells, False, None, cell, spent)
 
-    def _kept(self, cells: np.ndarray) -> np.ndarray:
+    def _kept(self, cells: Integers) -> Integers:
         """Cells in order, no closer than the spacing everywhere, and each interval with a place to stand."""
         tree = self._tree
         apart = tree.high[cells[:, 1:]] - tree.low[cells[:, :-1]] >= tree.apart
-        return cells[apart.all(axis=1) & tree.stands[cells].all(axis=1)]
+        kept: Integers = cells[apart.all(axis=1) & tree.stands[cells].all(axis=1)]
+        return kept
 
     def _halved(self, rows: np.ndarray) -> np.ndarray:
         """Both halves of each cell along its axis, the last column; (n_cells, n_actuators + 2) with the bound."""
@@ -209,7 +211,7 @@ class _Search:
             self._shelves[i].append(rows[shelf == i])
         return None
 
-    def _better(self, cells: np.ndarray, work: np.ndarray) -> np.ndarray | None:
+    def _better(self, cells: Integers, work: Floats) -> Floats | None:
         for i in np.argsort(work)[:TRIED]:
             if not work[i] < self._wanted:
                 break

@@ -5,6 +5,7 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
+from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
@@ -82,7 +83,7 @@ def scan_coupled(
     return CoupledScan(best, int(standing.sum()), float(min(bound, best.residual_work)))
 
 
-def _least(index: np.ndarray, values: np.ndarray, n_places: int) -> np.ndarray:
+def _least(index: Integers, values: Floats, n_places: int) -> Floats:
     """What each may fall to half-way to its neighbours, all actuators moved at once."""
     field = np.full((n_places,) * index.shape[1], np.nan)
     field[tuple(index.T)] = np.where(np.isfinite(values), values, np.nan)
@@ -93,4 +94,5 @@ def _least(index: np.ndarray, values: np.ndarray, n_places: int) -> np.ndarray:
         before, after = edge.copy(), edge.copy()
         before[axis], after[axis] = (1, 0), (0, 1)
         fall += 0.5 * np.maximum(np.pad(change, before), np.pad(change, after))
-    return values - fall[tuple(index.T)]
+    least: Floats = values - fall[tuple(index.T)]
+    return least

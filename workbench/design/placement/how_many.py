@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.placement import nodes_of_mode
@@ -33,10 +34,10 @@ class HowMany:
     """
 
     counts: np.ndarray
-    energy: np.ndarray
-    untouched: np.ndarray
-    spilled: np.ndarray
-    effort: np.ndarray
+    energy: Floats
+    untouched: Floats
+    spilled: Floats
+    effort: Floats
     recommended: int | None
     least: int
 
@@ -46,7 +47,7 @@ class HowMany:
         object.__setattr__(self, "counts", frozen(self.counts, int))
 
     @property
-    def left(self) -> np.ndarray:
+    def left(self) -> Floats:
         """Untouched and spilled together, (n_counts,)."""
         return self.untouched + self.spilled
 

@@ -32,7 +32,7 @@ def largest(poles: np.ndarray, amplitudes: np.ndarray, span: float) -> float:
         value, slope = np.abs(terms.sum(axis=1).real), np.abs((terms @ poles).real)
         bend = (size[signal] * np.exp(np.outer(start, decay))) @ np.abs(poles) ** 2
         upper = value + 0.5 * width * slope + 0.125 * width**2 * bend
-        best = max(best, value.max())
+        best = max(best, float(value.max()))
         kept = upper > best * (1 + SHARE)
         if not kept.any():
             return best * (1 + SHARE)

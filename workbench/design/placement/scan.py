@@ -124,7 +124,7 @@ def allowed_places(task: PlacementTask, limits: Limits, n_places: int) -> np.nda
         grid = as_places(domain, domain.rotations() if task.actuator.kind == "moment" else domain.grid())
     else:
         grid = as_places(domain, domain.grid(n_places))
-    grid = grid[free_places(domain, grid, boxes)]
-    if len(grid) < n:
-        raise DesignError(f"{n} actuators need as many places; the limits leave {len(grid)}: allow more")
-    return grid
+    allowed: np.ndarray = grid[free_places(domain, grid, boxes)]
+    if len(allowed) < n:
+        raise DesignError(f"{n} actuators need as many places; the limits leave {len(allowed)}: allow more")
+    return allowed

@@ -4,7 +4,7 @@ A filter makes q̂ = T q of all modes, T = (n_controlled, n_modes); perfect is T
 square e_r, the error is Σ_i Σ_r (T_ir - δ_ir)² e_r: what it misses of the controlled modes, and observation spillover.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
@@ -116,7 +116,7 @@ def place_sensors(
     return SensorPlacement(polished.x, float(polished.fun), even, False)
 
 
-def _exchanged(choice: tuple[int, ...], size: int, error) -> tuple[int, ...]:
+def _exchanged(choice: tuple[int, ...], size: int, error: Callable[[tuple[int, ...]], float]) -> tuple[int, ...]:
     """The choice after every exchange of one sensor that helps."""
     while True:
         better = choice

@@ -13,15 +13,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm, solve_continuous_lyapunov
 
+from workbench.arrays import Floats
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law
-from workbench.design.laws.printed import Printed
 from workbench.design.placement.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import Between, Interval, Place, Rectangle, position
 from workbench.structure.modes import Modes, frozen, modal_state_matrix
-from workbench.structure.printed import place_text
+from workbench.structure.printed import Printed, place_text
 
 SINGULAR_SHARE = 1e-14
 SHOWN_INSTANTS = 240
@@ -302,7 +302,7 @@ def listed(places: np.ndarray) -> list[Place]:
     return [tuple(place) if isinstance(place, list) else place for place in places.tolist()]
 
 
-def participation_along(modes: Modes, actuator: Actuator, x: np.ndarray, derivative: int = 0) -> np.ndarray:
+def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative: int = 0) -> Floats:
     """Modal forces (n_places, n_modes) per unit command of an actuator at x (n_places,), m; derivatives with x."""
     half, order = 0.5 * extent(actuator), derivative + (actuator.kind == "moment")
     if half == 0:
@@ -310,15 +310,16 @@ def participation_along(modes: Modes, actuator: Actuator, x: np.ndarray, derivat
     return actuator.gain * (modes.phi(x + half, order) - modes.phi(x - half, order))
 
 
-def _root(matrix: np.ndarray) -> np.ndarray:
+def _root(matrix: Floats) -> Floats:
     values, vectors = np.linalg.eigh(matrix)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
 
 
-def _force_gramian(a: np.ndarray, gains: np.ndarray, rates: np.ndarray, final_time: float) -> np.ndarray:
+def _force_gramian(a: Floats, gains: Floats, rates: Floats, final_time: float) -> Floats:
     n = rates.shape[1]
     start = np.vstack([np.zeros((n, rates.shape[0])), rates.T])
-    gramian = solve_continuous_lyapunov(a, -start @ start.T)
+    gramian: Floats = solve_continuous_lyapunov(a, -start @ start.T)
     if np.isfinite(final_time):
         end = expm(a * final_time)
         gramian = gramian - end @ gramian @ end.T

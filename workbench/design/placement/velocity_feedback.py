@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
+from workbench.arrays import Floats
 from workbench.design.laws.law import DesignError
-from workbench.design.laws.printed import Printed
 from workbench.design.placement.task import extent, participation_along
 from workbench.rig.actuators import Actuator
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed
 
 GRID = 4_001  # places at which the largest curvature of the participation is looked for
 BATCH = 2_000  # cells bounded at once
@@ -242,15 +243,17 @@ class _Expansion:
         moved = np.abs(slope) * halves[:, :, None] + curved
         size, strength = np.abs(b), np.abs(gain)
 
-        def products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-            return np.einsum("ij,pir,pjs->prs", strength, one, other)
+        def products(one: Floats, other: Floats) -> Floats:
+            product: Floats = np.einsum("ij,pir,pjs->prs", strength, one, other)
+            return product
 
         second = products(curved, size) + products(size, curved) + products(moved, moved)
         change = products(moved, size) + products(size, moved) + products(moved, moved)
 
-        def norm(p: np.ndarray, c: np.ndarray) -> np.ndarray:
+        def norm(p: Floats, c: Floats) -> Floats:
             """Of ΔAᵀ P + P ΔA, at most, with |ΔC| <= c."""
-            return 2.0 * np.linalg.norm(np.abs(p[..., n:]) @ c, axis=(-2, -1))
+            size: Floats = np.linalg.norm(np.abs(p[..., n:]) @ c, axis=(-2, -1))
+            return 2.0 * size
 
         by_axis = halves * norm(derivatives, change[:, None])
         rest = norm(self._p, second) + by_axis.sum(axis=1)
@@ -263,8 +266,9 @@ class _Expansion:
         return lower, np.abs(gradient) * halves + np.maximum(loose, 1e-12 * halves)
 
 
-def _curvature(task: FeedbackTask) -> np.ndarray:
+def _curvature(task: FeedbackTask) -> Floats:
     """Largest second derivative of a pair's participation in each mode anywhere, (n_modes,)."""
     grid = np.linspace(*task.reach, GRID)
     bend = participation_along(task.modes, task.actuator, grid, 2)
-    return np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0)
+    most: Floats = np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0)
+    return most

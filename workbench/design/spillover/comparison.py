@@ -128,16 +128,13 @@ def through_sensors(
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
     for law in laws:
         own = modes.select(law.controlled)
-        ways = [
-            lambda law=law, own=own: luenberger(
-                modes, law, [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)], poles=OBSERVER_POLES * own.omega
-            )
-        ]
-        if mass_per_length is not None:
-            ways.insert(0, lambda law=law, own=own: filtered(law, displacement_filter(own, stands, mass_per_length)))
-        for way in ways:
+        sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)]
+        for mass in (mass_per_length, None) if mass_per_length is not None else (None,):
             try:
-                controller = way()
+                if mass is not None:
+                    controller = filtered(law, displacement_filter(own, stands, mass))
+                else:
+                    controller = luenberger(modes, law, sensors, poles=OBSERVER_POLES * own.omega)
                 tried.append((controller, explain(modes, controller), ""))
             except ValueError as error:
                 tried.append((None, None, f"{law.name}: {error}"))

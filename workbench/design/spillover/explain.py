@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from workbench.arrays import Complexes
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.loop.closed_loop import ClosedLoop, close_with
 from workbench.rig.statespace import input_matrix
@@ -172,18 +173,21 @@ class _OneMode:
         c, omega = modes.damping[r, r], modes.omega[r]
         self.pole = complex(-0.5 * c + 1j * np.sqrt(max(omega**2 - 0.25 * c**2, 0.0)))
 
-    def _terms(self, s: complex) -> np.ndarray:
+    def _terms(self, s: complex) -> Complexes:
         """Shares (n_actuators, n_channels) of the movement that s would be."""
-        answer = self._rest.forces(self._r, s)
-        return self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
+        answer: Complexes = self._rest.forces(self._r, s)
+        terms: Complexes = (
+            self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
+        )
+        return terms
 
     def closed_pole(self) -> complex:
         """Where the mode goes: s = λ + Δ(s) by the secant method, else to first order."""
-        first = self.pole + self._terms(self.pole).sum()
+        first = complex(self.pole + self._terms(self.pole).sum())
         near, s = self.pole, first
         miss = near - first
         for _ in range(SECANT_STEPS):
-            now = s - self.pole - self._terms(s).sum()
+            now = complex(s - self.pole - self._terms(s).sum())
             if abs(now) < 1e-12 * abs(s) or now == miss:
                 break
             near, s, miss = s, s - now * (s - near) / (now - miss), now

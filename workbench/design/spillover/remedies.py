@@ -169,7 +169,7 @@ def _moved_sensor(start: _Setting) -> Iterator[tuple[str, float, Callable[[float
         yield f"sensor at x = {at:.4g}", at, move
 
 
-def _added(start: _Setting, met, length: float, most: int) -> _Setting | None:
+def _added(start: _Setting, met: Callable[[_Setting], float], length: float, most: int) -> _Setting | None:
     """Sensors added one by one, each where it serves best."""
     setting = start
     for _ in range(most):

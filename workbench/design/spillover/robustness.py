@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
@@ -96,9 +97,10 @@ def draw_modes(
     return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
 
 
-def _root(covariance: np.ndarray) -> np.ndarray:
+def _root(covariance: Floats) -> Floats:
     values, vectors = np.linalg.eigh(covariance)
-    return vectors * np.sqrt(np.maximum(values, 0.0))
+    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
+    return root
 
 
 def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:

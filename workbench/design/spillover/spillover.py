@@ -14,15 +14,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm, matrix_balance, solve_continuous_lyapunov
 
+from workbench.arrays import Complexes, Floats
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_matrices
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.laws.printed import Printed
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed
 
 GAUSS_POINTS = 12
 
@@ -78,7 +79,7 @@ class Spillover(Printed):
         return line, ("mode", "", "W_r"), rows, ()
 
 
-def force_transform(modes: Modes, law: Law, state: np.ndarray, s: np.ndarray) -> np.ndarray:
+def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Complexes:
     """Laplace transforms (n_actuators, n_s) of the actuator forces, exact modal coordinates fed back.
 
     Args:
@@ -92,7 +93,8 @@ def force_transform(modes: Modes, law: Law, state: np.ndarray, s: np.ndarray) ->
     values, vectors = np.linalg.eig(loop)
     if np.linalg.cond(vectors) < 1e6:
         weights = -(law.gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
-        return weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None]))
+        transform: Complexes = weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None]))
+        return transform
     eye = np.eye(loop.shape[0])
     return np.array([-law.gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
 
@@ -124,7 +126,7 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     return Spillover(work, law.controlled, np.inf)
 
 
-def _cross(push: np.ndarray, moving: np.ndarray) -> np.ndarray:
+def _cross(push: Complexes, moving: Complexes) -> Floats:
     """The share of W_r from motion already there: with z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)."""
     return (np.conj(moving) * push).real
 
@@ -161,7 +163,7 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
     return Spillover(power @ (width * weights).ravel(), law.controlled, final_time)
 
 
-def second_moments(a: np.ndarray, state: np.ndarray, final_time: float) -> np.ndarray:
+def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
     """∫_0^t x xᵀ dt for x' = A x: from dM/dt = A M + M Aᵀ + x0 x0ᵀ, doubled up from a short time.
 
     Balanced first: displacements and rates of a fast structure differ by its frequency, and round-off by its square.
@@ -174,11 +176,12 @@ def second_moments(a: np.ndarray, state: np.ndarray, final_time: float) -> np.nd
     block = np.block([[-a, np.outer(state, state)], [np.zeros_like(a), a.T]]) * h
     exponential = expm(block)
     transition = exponential[size:, size:].T
-    moments = transition @ exponential[:size, size:]
+    moments: Floats = transition @ exponential[:size, size:]
     for _ in range(halvings):
         moments = moments + transition @ moments @ transition.T
         transition = transition @ transition
-    return scale[:, None] * moments * scale
+    balanced: Floats = scale[:, None] * moments * scale
+    return balanced
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
@@ -204,8 +207,8 @@ def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np
     return float(np.trace(q @ gramian))
 
 
-def _weighed(gain: np.ndarray, weight: float | np.ndarray) -> np.ndarray:
-    return weight * gain.T @ gain if np.ndim(weight) == 0 else gain.T @ weight @ gain
+def _weighed(gain: Floats, weight: float | Floats) -> Floats:
+    return gain.T @ weight @ gain if isinstance(weight, np.ndarray) and weight.ndim else weight * gain.T @ gain
 
 
 def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
@@ -225,7 +228,7 @@ def distributed_cost(modes: Modes, controlled: int | Sequence[int], state: np.nd
     return float(np.einsum("ir,rij,jr->", x, p, x))
 
 
-def _energies(modes: Modes, state: np.ndarray) -> np.ndarray:
+def _energies(modes: Modes, state: Floats) -> Floats:
     n = modes.n_modes
     return 0.5 * (state[n:] ** 2 + (modes.omega * state[:n]) ** 2)
 

@@ -5,20 +5,23 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.evidence import Evidence
 from workbench.gap.effects.nonlinear import strength_along, with_element
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
 EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # to start from
 
 
-def _of_power(v: Mapping[str, Any], motion: np.ndarray) -> np.ndarray:
+def _of_power(v: Mapping[str, Any], motion: Floats) -> Floats:
     """-F |w / w_r|^p."""
-    return -v["force_at_rms"] * np.abs(motion / v["rms"]) ** v["exponent"]
+    force, rms, exponent = float(v["force_at_rms"]), float(v["rms"]), float(v["exponent"])
+    return -force * np.abs(motion / rms) ** exponent
 
 
 def _power_law(element: type, name: str, motion: str, words: str, *, even: bool = False) -> Kind:
-    def starts(evidence, _) -> Iterator[dict[str, float]]:
+    def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         for place in evidence.at_peaks:
             path = getattr(place, motion)
             rms = float(np.sqrt(np.mean(path**2)))

@@ -7,6 +7,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from workbench.gap.effects.evidence import Evidence
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
 
@@ -117,7 +118,7 @@ class Kind:
     path: str
     parameters: Callable[[Rig, Any], tuple[Parameter, ...]]
     apply: Callable[[Rig, Any, dict[str, Any]], Rig]
-    starts: Callable[[Any, Any], Iterable[dict[str, Any]]]
+    starts: Callable[[Evidence, Any], Iterable[dict[str, Any]]]
     targets: Callable[[Rig], tuple[Any, ...]] = lambda rig: (None,)
     nonlinear: bool = False
     phrase: str = ""

@@ -1,10 +1,12 @@
 """Effects of the surroundings: forces that nobody commanded."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.evidence import Evidence
 from workbench.gap.effects.nonlinear import with_element
 from workbench.identification.signal.periodicity import period_of
 from workbench.records.record import Record
@@ -34,16 +36,16 @@ def _is_distortion(frequency: float, records: Sequence[Record]) -> bool:
     At several levels a disturbance stays as it is, and a law does not.
     """
     rms = np.array([np.sqrt((record.inputs**2).mean()) for record in records])
-    periods = {period_of(record.inputs) for record in records}
-    if rms.max() > ONE_LEVEL * rms.min() or len(periods) > 1 or None in periods:
+    period, *others = {period_of(record.inputs) for record in records}
+    if rms.max() > ONE_LEVEL * rms.min() or others or period is None:
         return False
-    sample_time, (period,) = records[0].sample_time, periods
+    sample_time = records[0].sample_time
     order = frequency * period * sample_time
     duration = sample_time * min(record.n_samples for record in records)
     return abs(order - round(order)) / (period * sample_time) < SAME_LINE / duration
 
 
-def _periodic_starts(evidence, _):
+def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     records, sample_time = evidence.data.counted, evidence.data.records[0].sample_time
     shortest = min(record.n_samples for record in records)
     ends = np.cumsum([0, *(record.n_samples for record in records)])
@@ -75,7 +77,7 @@ PERIODIC_DISTURBANCE = Kind(
 )
 
 
-def _random_starts(evidence, _):
+def _random_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in [place for place in evidence.at_peaks if not isinstance(place.at, Between)][:2]:
         yield {**place_values(place.at), "rms": float(np.sqrt(np.mean(place.force**2)))}
 

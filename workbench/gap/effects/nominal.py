@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter
 from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
 from workbench.rig.rig import Rig
@@ -168,9 +169,9 @@ def _off(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
     return replace(rig, sensors=tuple(replace(s, delay=delays[s]) if s in delays else s for s in rig.sensors))
 
 
-def _padded(values: np.ndarray, size: int) -> np.ndarray:
+def _padded(values: Floats, size: int) -> Floats:
     """The values with zeros behind them, or cut: (size,)."""
-    return np.r_[values, np.zeros(max(size - values.size, 0))][:size]
+    return np.concatenate([values, np.zeros(max(size - values.size, 0))])[:size]
 
 
 def nominal_errors(rig: Rig, prior: NominalPrior, start: Mapping[str, float] | None = None) -> Effect:

@@ -1,12 +1,14 @@
 """Effects of the structure that depend on level: contacts, friction, hysteresis, large motion, air."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.evidence import Evidence
 from workbench.gap.effects.scales import Scales
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import (
@@ -15,6 +17,7 @@ from workbench.rig.elements import (
     Clearance,
     CoulombFriction,
     CubicSpring,
+    Element,
     LinearSpring,
     MidplaneStretching,
     OneSidedStop,
@@ -28,7 +31,7 @@ from workbench.structure.member import Structure
 LEAST, MOST = 1e-12, 1e12  # bounds of a strength, in units of the rig's own
 
 
-def with_element(rig: Rig, element) -> Rig:
+def with_element(rig: Rig, element: Element) -> Rig:
     """The rig with one more element."""
     return replace(rig, elements=(*rig.elements, element))
 
@@ -61,7 +64,7 @@ def _distance(name: str, rig: Rig) -> Parameter:
 # --- cubic_spring
 
 
-def _cubic_starts(evidence, _):
+def _cubic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         k = strength_along(place.force, place.displacement**3)
         for share in (0.3, 1.0, 3.0):
@@ -70,7 +73,7 @@ def _cubic_starts(evidence, _):
                 yield {**place_values(place.at), "stiffness": -share * k}
 
 
-def _cubic_parameters(rig: Rig, _):
+def _cubic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     unit = Scales.of(rig).stiffness / Scales.of(rig).length ** 2
     return (*place_parameters(rig), Parameter("stiffness", "N/m^3", -1e15 * unit, 1e15 * unit, scale=unit, neutral=0.0))
 
@@ -90,7 +93,7 @@ CUBIC_SPRING = Kind(
 # --- midplane_stretching
 
 
-def _stretching_starts(evidence, _):
+def _stretching_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
     modes = evidence.rig.modes
     points, weights = np.polynomial.legendre.leggauss(40)
     x, w = 0.5 * modes.length * (points + 1), 0.5 * modes.length * weights
@@ -102,7 +105,7 @@ def _stretching_starts(evidence, _):
     return [{"coefficient": s * tension / max(stretch, 1e-300)} for s in np.geomspace(1e-3, 30.0, 14)]
 
 
-def _stretching_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+def _stretching_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     unit = Scales.of(rig).stiffness  # tension over a squared slope times length
     return (Parameter("coefficient", "N/m", LEAST * unit, 1e15 * unit, logarithmic=True, neutral=0.0),)
 
@@ -122,7 +125,7 @@ MIDPLANE_STRETCHING = Kind(
 # --- air_drag
 
 
-def _drag_starts(evidence, _):
+def _drag_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
     modes = evidence.rig.modes
     x = modes.length * np.linspace(0.05, 0.95, 19)
     speeds = [np.sqrt(np.mean((modes.phi(x) @ m.velocity[:, ::5]) ** 2)) for m in evidence.motions]
@@ -132,7 +135,7 @@ def _drag_starts(evidence, _):
     return [{"coefficient": s * viscous / max(max(speeds), 1e-300)} for s in np.geomspace(0.02, 50.0, 12)]
 
 
-def _drag_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+def _drag_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     scales = Scales.of(rig)
     unit = scales.damping / scales.speed / scales.length
     return (Parameter("coefficient", "N s^2/m^3", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0),)
@@ -153,7 +156,7 @@ AIR_DRAG = Kind(
 # --- clearance and one_sided_stop
 
 
-def _contact_parameters(rig: Rig, _):
+def _contact_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     return (
         *place_parameters(rig),
         _stiffness("stiffness", rig),
@@ -161,8 +164,8 @@ def _contact_parameters(rig: Rig, _):
     )
 
 
-def _contact_starts(two_sided: bool):
-    def starts(evidence, _):
+def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
+    def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         for place in evidence.at_peaks:
             reach = np.abs(place.displacement) if two_sided else place.displacement
             levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
@@ -207,7 +210,7 @@ ONE_SIDED_STOP = Kind(
 # --- coulomb_friction
 
 
-def _friction_starts(evidence, _):
+def _friction_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
@@ -251,7 +254,7 @@ COULOMB_FRICTION = Kind(
 # --- bouc_wen
 
 
-def _bouc_wen_starts(evidence, _):
+def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks[:2]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
@@ -287,7 +290,7 @@ BOUC_WEN = Kind(
 # --- joint_slip
 
 
-def _slip_starts(evidence, _):
+def _slip_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
@@ -296,7 +299,7 @@ def _slip_starts(evidence, _):
                 yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
 
 
-def _slipping(rig: Rig, _, v: dict[str, Any]) -> Rig:
+def _slipping(rig: Rig, _: object, v: dict[str, Any]) -> Rig:
     """The rig with + k (w - z), what the joint no longer holds: nothing while it sticks, all of k w once it slips."""
     where, stiffness = place_of(v), v["stiffness"]
     return with_element(
@@ -318,7 +321,7 @@ JOINT_SLIP = Kind(
 # --- two_way_friction
 
 
-def _two_way_starts(evidence, _):
+def _two_way_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
@@ -347,9 +350,9 @@ def _two_way_element(v: Mapping[str, Any]) -> CoulombFriction:
     return CoulombFriction(place_of(v), force, v["smoothing_speed"], offset)
 
 
-def _two_way_law(v: Mapping[str, Any], u: np.ndarray) -> np.ndarray:
+def _two_way_law(v: Mapping[str, Any], u: Floats) -> Floats:
     force, offset = _sliding_both_ways(v)
-    return -force * np.tanh(u / v["smoothing_speed"]) - offset
+    return -force * np.tanh(u / float(v["smoothing_speed"])) - offset
 
 
 TWO_WAY_FRICTION = Kind(
@@ -374,14 +377,14 @@ TWO_WAY_FRICTION = Kind(
 # --- quadratic_damper
 
 
-def _quadratic_starts(evidence, _):
+def _quadratic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         c = strength_along(place.force, np.abs(place.velocity) * place.velocity)
         for share in (0.4, 1.0, 2.5) if c > 0 else ():
             yield {**place_values(place.at), "coefficient": share * c}
 
 
-def _quadratic_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+def _quadratic_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     unit = Scales.of(rig).damping / Scales.of(rig).speed
     coefficient = Parameter("coefficient", "N s^2/m^2", 1e-12 * unit, 1e12 * unit, logarithmic=True, neutral=0.0)
     return (*place_parameters(rig), coefficient)

@@ -1,6 +1,6 @@
 """Effects on the way in and on the way out: actuators and sensors."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import combinations, permutations
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import ALL, Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.evidence import Evidence
 from workbench.gap.effects.scales import Scales
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
@@ -15,6 +16,8 @@ from workbench.structure.domain import Interval, NamedPoints
 
 OF_THE_SENSOR = "unit of the sensor"
 ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
+Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
+
 SLOW = 0.1  # of the rms step between samples: faster, a reading does not come to rest
 OVERSTAYED = 6.0  # steps over their decrease: three times as long as free flight up and back
 TURNING = 2  # samples: a motion that turns round slowly is no longer at its top
@@ -42,14 +45,14 @@ def sensors_or_all(rig: Rig) -> tuple[str, ...]:
     return (ALL, *names) if len(names) > 1 else names
 
 
-def _change_actuators(rig: Rig, target: str, **changes) -> Rig:
+def _change_actuators(rig: Rig, target: str, **changes: Any) -> Rig:
     changed = tuple(
         replace(a, **changes) if (a.name == target or (target == ALL and not a.direct)) else a for a in rig.actuators
     )
     return replace(rig, actuators=changed)
 
 
-def _change_sensors(rig: Rig, target: str, **changes) -> Rig:
+def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
     return replace(rig, sensors=tuple(replace(s, **changes) if target in (s.name, ALL) else s for s in rig.sensors))
 
 
@@ -65,7 +68,7 @@ def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
     return replace(rig, **{side: ports})
 
 
-def _commands(evidence, target: str) -> np.ndarray:
+def _commands(evidence: Evidence, target: str) -> np.ndarray:
     """All commands to the target that are not at rest, joined."""
     names = each_actuator(evidence.rig) if target == ALL else (target,)
     rows = [
@@ -79,7 +82,7 @@ def _commands(evidence, target: str) -> np.ndarray:
     return values if values.size else np.ones(1)
 
 
-def _sample_time(evidence) -> float:
+def _sample_time(evidence: Evidence) -> float:
     return evidence.data.records[0].sample_time
 
 
@@ -89,14 +92,14 @@ def _actuator(
     unit: str,
     phrase: str,
     *,
-    targets,
-    starts,
-    low,
-    high,
-    log=True,
+    targets: Callable[[Rig], tuple[str, ...]],
+    starts: Starts,
+    low: float,
+    high: float,
+    log: bool = True,
     attribute: str | None = None,
     neutral: float | None = None,
-    **options,
+    **options: Any,
 ) -> Kind:
     """A kind that sets one number of an actuator, the attribute of that name unless another one is given."""
     attribute = attribute or field
@@ -201,7 +204,7 @@ def _force(rig: Rig) -> float:
     return Scales.of(rig).force
 
 
-def _rate_starts(evidence, target: str) -> list[dict[str, float]]:
+def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
     """From slower than most changes of the command to as fast as its fastest."""
     steps = _changes(evidence, target) / _sample_time(evidence)
     return [{"rate": float(q)} for q in np.quantile(steps, (0.1, 0.3, 0.5, 0.7, 0.9, 0.99))]
@@ -221,7 +224,7 @@ ACTUATOR_RATE_LIMIT = _actuator(
 )
 
 
-def _changes(evidence, target: str) -> np.ndarray:
+def _changes(evidence: Evidence, target: str) -> np.ndarray:
     """All changes of commands to the target from sample to sample, joined, those of none left out."""
     names = each_actuator(evidence.rig) if target == ALL else (target,)
     changes = [
@@ -235,7 +238,7 @@ def _changes(evidence, target: str) -> np.ndarray:
     return values if values.size else np.ones(1)
 
 
-def _hysteresis_starts(evidence, target: str) -> Iterator[dict[str, float]]:
+def _hysteresis_starts(evidence: Evidence, target: str) -> Iterator[dict[str, float]]:
     for width in np.quantile(_commands(evidence, target), (0.2, 0.5, 0.8)):
         for share in (0.1, 0.4):
             yield {"share": share, "width": float(width)}
@@ -271,17 +274,17 @@ SWAPPED_INPUTS = Kind(
 )
 
 
-def _position_starts(evidence, _):
+def _position_starts(evidence: Evidence, _: object) -> list[dict[str, Any]]:
     domain = evidence.rig.modes.domain
     if isinstance(domain, Interval):
         return [{"at": float(x)} for x in domain.length * np.linspace(0.015, 0.985, 41)]
     return [place_values(where) for where in domain.grid(9)]
 
 
-def _movable(targets: Callable[[Rig], tuple]) -> Callable[[Rig], tuple]:
+def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple[str, ...]]:
     """Targets that may stand elsewhere; where shapes are known at the inputs and outputs alone, none may."""
 
-    def where_there_is_room(rig: Rig) -> tuple:
+    def where_there_is_room(rig: Rig) -> tuple[str, ...]:
         domain = rig.modes.domain
         crowded = isinstance(domain, NamedPoints) and len(domain.names) <= len(rig.actuators) + len(rig.sensors)
         return () if crowded else targets(rig)
@@ -313,20 +316,20 @@ SENSOR_MISPLACEMENT = Kind(
 # --- sensors
 
 
-def _size(evidence, target: str) -> float:
+def _size(evidence: Evidence, target: str) -> float:
     """Largest root mean square of an output among the records, in its unit."""
     j = each_sensor(evidence.rig).index(target)
     return float(max(np.sqrt(np.mean(record.outputs[j] ** 2)) for record in evidence.data.records))
 
 
-def _sensor(name: str, field: str, phrase: str, starts: Callable, unit: str = "", **options) -> Kind:
+def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", **options: Any) -> Kind:
     """A kind that sets one figure of a sensor."""
     attribute = {"drift_over_record": "drift"}.get(field, field)
     log = options.pop("log", False)
     low, high = options.pop("low", -1e12), options.pop("high", 1e12)
     neutral = options.pop("neutral", None)
 
-    def parameters(rig: Rig, target) -> tuple[Parameter, ...]:
+    def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
         noise = max((s.noise_std for s in rig.sensors if target in (s.name, ALL)), default=1.0)
         scale = 0.1 if field == "gain" else max(noise, 1e-300)
         quantity = next((s.quantity for s in rig.sensors if target in (s.name, ALL)), "")
@@ -357,7 +360,7 @@ SENSOR_GAIN = _sensor(
 )
 
 
-def _mean_residual(evidence, target: str) -> float:
+def _mean_residual(evidence: Evidence, target: str) -> float:
     j = each_sensor(evidence.rig).index(target)
     return float(np.mean(np.concatenate([r[j] for r in evidence.residuals])))
 
@@ -407,18 +410,18 @@ SENSOR_DELAY = _sensor(
 )
 
 
-def _predicted(evidence, name: str) -> np.ndarray:
+def _predicted(evidence: Evidence, name: str) -> np.ndarray:
     j = each_sensor(evidence.rig).index(name)
     records = zip(evidence.data.counted, evidence.residuals, strict=True)
     return np.concatenate([record.outputs[j] - residual[j] for record, residual in records])
 
 
-def _residual(evidence, name: str) -> np.ndarray:
+def _residual(evidence: Evidence, name: str) -> np.ndarray:
     j = each_sensor(evidence.rig).index(name)
     return np.concatenate([residual[j] for residual in evidence.residuals])
 
 
-def _crosstalk_starts(evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+def _crosstalk_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
     """The share of the other sensor's reading in this one's residual, where it is more than a little of it."""
     residual, source = _residual(evidence, pair[0]), _predicted(evidence, pair[1])
     size = float(source @ source)
@@ -446,7 +449,7 @@ SENSOR_CROSSTALK = Kind(
 )
 
 
-def _exchanged_starts(evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
+def _exchanged_starts(evidence: Evidence, pair: tuple[str, str]) -> list[dict[str, float]]:
     """Where each of the two reads rather what the model predicts of the other."""
     noise = {sensor.name: max(sensor.noise_std, 1e-300) for sensor in evidence.rig.sensors}
     own = crossed = 0.0
@@ -469,7 +472,7 @@ SWAPPED_OUTPUTS = Kind(
 )
 
 
-def clipped_level(evidence, target: str) -> float | None:
+def clipped_level(evidence: Evidence, target: str) -> float | None:
     """The level that a sensor's readings stop at: its largest magnitude, met again and again, where it is cut off."""
     j = each_sensor(evidence.rig).index(target)
     rows = [record.outputs[j] for record in evidence.data.records]
@@ -499,7 +502,7 @@ def _rests(rows: list[np.ndarray], at_top: list[np.ndarray]) -> bool:
     return bool(entering) and float(np.median(entering)) < SLOW * typical and float(np.mean(overstayed)) > 0.5
 
 
-def rounding_step(evidence, target: str) -> float | None:
+def rounding_step(evidence: Evidence, target: str) -> float | None:
     """The step that all of a sensor's readings are multiples of, or None."""
     j = each_sensor(evidence.rig).index(target)
     return step_of(np.concatenate([record.outputs[j] for record in evidence.data.records]))
@@ -523,7 +526,7 @@ def step_of(readings: np.ndarray) -> float | None:
     return step if np.abs(inside - step * np.round(inside / step)).max() < 0.05 * step else None
 
 
-def _clipping_starts(evidence, target):
+def _clipping_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
     level = clipped_level(evidence, target)
     return [{"limit": level}] if level is not None else []
 
@@ -541,7 +544,7 @@ SENSOR_CLIPPING = _sensor(
 )
 
 
-def _rounding_starts(evidence, target):
+def _rounding_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
     step = rounding_step(evidence, target)
     return [{"step": step}] if step is not None else []
 

@@ -1,6 +1,6 @@
 """Effects of the structure that leave it linear: its stiffness, mass, supports, damping, and what hangs on it."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from functools import lru_cache
 from typing import Any
@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.evidence import Evidence, Moved
 from workbench.gap.effects.scales import Scales
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
@@ -24,7 +25,7 @@ EDGE = 1e-9  # of the length
 BESIDE = 0.1  # of the length: farther out a spring does not turn the hinge, it holds the beam
 
 
-def resolved(rig: Rig, structure) -> Rig:
+def resolved(rig: Rig, structure: Structure | Plate | Membrane) -> Rig:
     """The rig with a changed structure and the modes it then has."""
     return replace(rig, structure=structure, modes=modes_of(structure, rig.modes.n_modes))
 
@@ -49,21 +50,24 @@ def _attachments(structure: object) -> tuple[Attachment, ...]:
 
 
 @lru_cache(maxsize=16)
-def _bare_modes(kind: Any, facts: tuple, n_modes: int) -> Modes:
+def _bare_modes(kind: Any, facts: tuple[tuple[str, Any], ...], n_modes: int) -> Modes:
     """Modes of a plate or membrane without attachments, as many as tell what one does to the lowest `n_modes`."""
     surface = kind(**{**dict(facts), "edges": dict(dict(facts)["edges"])})
     in_closed_form = getattr(surface, "is_navier", False)
-    return surface.modes((MANY if in_closed_form else FEWER) * n_modes, tolerance=ROUGHLY)
+    modes: Modes = surface.modes((MANY if in_closed_form else FEWER) * n_modes, tolerance=ROUGHLY)
+    return modes
 
 
 def solved_once(change: Callable[[Rig, Any, dict[str, float]], Rig]) -> Callable[[Rig, Any, dict[str, float]], Rig]:
     """The change of a structure or of its modes, remembered: a search asks for one beside many other effects."""
 
     @lru_cache(maxsize=256)
-    def changed(structure: Structure | None, modes: Modes, target, values) -> Rig:
+    def changed(
+        structure: Structure | Plate | Membrane | None, modes: Modes, target: Any, values: tuple[tuple[str, Any], ...]
+    ) -> Rig:
         return change(Rig(modes, (), (), structure=structure), target, dict(values))
 
-    def apply(rig: Rig, target, values: dict[str, float]) -> Rig:
+    def apply(rig: Rig, target: Any, values: dict[str, Any]) -> Rig:
         found = changed(rig.structure, rig.modes, target, tuple(values.items()))
         return replace(rig, structure=found.structure, modes=found.modes)
 
@@ -82,7 +86,7 @@ def _beam(rig: Rig) -> Beam:
     return rig.structure
 
 
-def _with_attachment(rig: Rig, part) -> Rig:
+def _with_attachment(rig: Rig, part: Attachment) -> Rig:
     bare = None if isinstance(rig.structure, Membrane) else rig.structure
     structure = bare and replace(bare, attachments=(*bare.attachments, part))
     if structure is None or isinstance(part, PointDamper):  # which leaves the modes what they are
@@ -90,7 +94,7 @@ def _with_attachment(rig: Rig, part) -> Rig:
     return resolved(rig, structure)
 
 
-def stiffness_name(structure) -> str:
+def stiffness_name(structure: Structure) -> str:
     """The name of the stiffness profile of a bar or beam."""
     return "bending_stiffness" if isinstance(structure, Beam) else "axial_stiffness"
 
@@ -98,7 +102,7 @@ def stiffness_name(structure) -> str:
 # --- modulus_error
 
 
-def _modulus(rig: Rig, _, values) -> Rig:
+def _modulus(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     factor = values["factor"]
     if rig.structure is None:
         return replace(rig, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
@@ -125,7 +129,7 @@ def _scaled_modes(modes: Modes, factor: float) -> Modes:
     return replace(modes, omega=modes.omega * factor, damping=modes.damping * factor)
 
 
-def _modulus_starts(evidence, _):
+def _modulus_starts(evidence: Evidence, _: object) -> list[dict[str, float]]:
     return [{"factor": f} for f in np.exp(np.linspace(-0.6, 0.6, 41)) if abs(f - 1) > 1e-3] + [
         {"factor": f} for f in (0.995, 1.005)
     ]
@@ -145,14 +149,16 @@ MODULUS_ERROR = Kind(
 # --- what hangs on the structure at a point
 
 
-def _regressed(place, series: str) -> float:
+def _regressed(place: Moved, series: str) -> float:
     """The coefficient k of force = -k series, by least squares."""
     x = getattr(place, series)
     return float(-np.dot(place.force, x) / max(np.dot(x, x), 1e-300))
 
 
-def _point_starts(name: str, series: str, typical, *, between: bool = True, signed: bool = False):
-    def starts(evidence, _) -> Iterable[dict[str, float]]:
+def _point_starts(
+    name: str, series: str, typical: Callable[[Rig], float], *, between: bool = True, signed: bool = False
+) -> Callable[[Evidence, object], Iterator[dict[str, Any]]]:
+    def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         size = typical(evidence.rig)
         for place in evidence.at_peaks:
             if isinstance(place.at, Between) and not between:
@@ -180,8 +186,8 @@ def _typical_damping(rig: Rig) -> float:
     return Scales.of(rig).damping
 
 
-def _positive(name: str, unit: str, typical):
-    def parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+def _positive(name: str, unit: str, typical: Callable[[Rig], float]) -> Callable[[Rig, object], tuple[Parameter, ...]]:
+    def parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
         size = typical(rig)
         return (*place_parameters(rig), Parameter(name, unit, 1e-8 * size, 1e5 * size, logarithmic=True, neutral=0.0))
 
@@ -198,7 +204,7 @@ POINT_MASS = Kind(
 )
 
 
-def _spring_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+def _spring_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     size = Scales.of(rig).stiffness
     bounds = -1e5 * size, 1e5 * size
     stiffness = Parameter("stiffness", "N/m", *bounds, logarithmic=True, scale=1e-8 * size, neutral=0.0)
@@ -241,7 +247,7 @@ POINT_DAMPER = Kind(
 # --- local_stiffness_loss
 
 
-def _softened(rig: Rig, _, values) -> Rig:
+def _softened(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     member = _member(rig)
     name, length = stiffness_name(member), member.length
     start, stop = values["at"] - 0.5 * values["width"], values["at"] + 0.5 * values["width"]
@@ -252,7 +258,7 @@ def _softened(rig: Rig, _, values) -> Rig:
     return resolved(rig, replace(member, **{name: profile}))
 
 
-def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
+def _loss_parameters(rig: Rig, _: object) -> tuple[Parameter, ...]:
     length = rig.modes.domain.size
     return (
         *place_parameters(rig),
@@ -261,7 +267,7 @@ def _loss_parameters(rig: Rig, _) -> tuple[Parameter, ...]:
     )
 
 
-def _loss_starts(evidence, _):
+def _loss_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     length = evidence.domain.size
     for x in (0.04, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96):
         for loss in (0.003, 0.01, 0.03, 0.12, 0.45):
@@ -282,14 +288,14 @@ LOCAL_STIFFNESS_LOSS = Kind(
 # --- support_rotation
 
 
-def _ends(rig: Rig) -> tuple:
+def _ends(rig: Rig) -> tuple[str, ...]:
     if not isinstance(rig.structure, Beam):
         return ()
     ends = (("left", rig.structure.left), ("right", rig.structure.right))
     return tuple(name for name, end in ends if end.translation == HELD and end.rotation in (0.0, HELD))
 
 
-def _rotated(rig: Rig, end: str, values) -> Rig:
+def _rotated(rig: Rig, end: str, values: dict[str, float]) -> Rig:
     support: Any = End(HELD, values["rotational_stiffness"])
     return resolved(rig, replace(_beam(rig), **{end: support}))
 
@@ -328,7 +334,7 @@ def _buckling(rig: Rig) -> float:
     return float(np.min(beam.bending_stiffness(x))) * (np.pi / beam.length) ** 2 * (1.0 + held)
 
 
-def _pulled(rig: Rig, _, values) -> Rig:
+def _pulled(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     beam = _beam(rig)
     return resolved(rig, replace(beam, tension=beam.tension + values["tension"]))
 
@@ -372,7 +378,7 @@ AXIAL_LOAD = Kind(
 # --- truncated_modes: no number to fit, one start a count
 
 
-def _truncated(rig: Rig, count, _) -> Rig:
+def _truncated(rig: Rig, count: int, _: object) -> Rig:
     return replace(rig, modes=_member(rig).modes(count, tolerance=RESOLUTION))
 
 
@@ -399,7 +405,7 @@ TRUNCATED_MODES = Kind(
 # --- modal_damping
 
 
-def _damped(rig: Rig, _, values) -> Rig:
+def _damped(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     factor = values["factor"]
     structure = rig.structure
     if structure is None or not isinstance(structure.damping, ModalDamping):
@@ -423,7 +429,7 @@ MODAL_DAMPING = Kind(
 # --- stiffness_drift
 
 
-def _duration(evidence) -> float:
+def _duration(evidence: Evidence) -> float:
     return max(record.n_samples * record.sample_time for record in evidence.data.records)
 
 

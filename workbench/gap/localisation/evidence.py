@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from workbench.gap.localisation.force_lines import lines_of, screened
+from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
     ForceFilter,
@@ -153,7 +153,8 @@ class Evidence:
     def _coarse(self) -> Sequence[Any]:
         """A few places, of which one is near enough to tell how large the force is."""
         if isinstance(self.domain, Interval):
-            return self.places[::5]
+            every_fifth: Sequence[Any] = self.places[::5]
+            return every_fifth
         if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= CROWD:
             return self.domain.grid()
         return self._screened[:MOST_PEAKS]
@@ -170,10 +171,11 @@ class Evidence:
     def _misfits(self, places: Sequence[Any]) -> np.ndarray:
         """What one force of any law at each of the places leaves, in units of the noise."""
         shapes = np.array([self.rig.modes.phi_at(where) for where in places])
-        return np.sum([screened(lines, shapes) for lines in self._lines], axis=0)
+        misfits: np.ndarray = np.sum([screened(lines, shapes) for lines in self._lines], axis=0)
+        return misfits
 
     @cached_property
-    def _lines(self):
+    def _lines(self) -> list[Lines]:
         return lines_of(self.rig, self.model, self.residuals, self.data.counted[0].sample_time)
 
     @cached_property
@@ -189,10 +191,6 @@ class Evidence:
         return tuple(ranked[i] for i in sorted((*points[:most], *pairs[:PAIRS_TRIED])))
 
     @property
-    def _spacing(self) -> float:
-        return max(self.domain.length) / self._along  # type: ignore[union-attr, arg-type]
-
-    @property
     def _along(self) -> int:
         """Spacings along the longer side of a rectangle."""
         return max(self.n_places // 2, 16)
@@ -201,7 +199,7 @@ class Evidence:
         """The tops of the profile over a rectangle, and their images: a symmetric plate all but repeats itself."""
         (a, b), tops = rectangle.length, _apart(ranked, rectangle, BROAD, MOST_PEAKS)
         mirrored = [image for x, y in tops for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
-        offsets = self._spacing * np.arange(-FINER, FINER + 1) / FINER
+        offsets = max(a, b) / self._along * np.arange(-FINER, FINER + 1) / FINER
         around = [
             [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
             for x, y in mirrored
@@ -215,7 +213,7 @@ class Evidence:
     def _misfit(self, where: Where) -> float:
         """What one force of any law there leaves, in units of the noise, the ends of records accounted for."""
         shape = self.rig.modes.phi_at(where)
-        return sum(lines.misfit(shape) for lines in self._lines)
+        return float(sum(lines.misfit(shape) for lines in self._lines))
 
     @cached_property
     def peaks(self) -> tuple[Any, ...]:

@@ -52,7 +52,7 @@ class Lines:
     def freedom(self) -> int:
         """Values that stay noise once a force, of any law, and the ends are accounted for."""
         n_lines, n_sensors = self.left.shape
-        return max(2 * n_lines * (n_sensors - 1) - self._products[1].size, 0)
+        return int(max(2 * n_lines * (n_sensors - 1) - self._products[1].size, 0))
 
     @cached_property
     def power(self) -> float:

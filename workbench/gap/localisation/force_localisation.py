@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from workbench.arrays import Floats
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
@@ -132,7 +133,8 @@ class _Search:
     def screened(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:
         """About the misfit at each of many places: the ends of the records are left out."""
         shapes = np.array([self.shape(where) for where in places])
-        return np.sum([screened(each, shapes) for each in lines], axis=0)
+        misfits: Floats = np.sum([screened(each, shapes) for each in lines], axis=0)
+        return misfits
 
     def refined_over(self, top: tuple[float, float]) -> tuple[tuple[float, float], float]:
         """The bottom of a valley over a rectangle, and one standard deviation along its longer axis, m."""

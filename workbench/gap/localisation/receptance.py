@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.arrays import Complexes, Floats
 from workbench.gap.prediction.unmodelled_force import SampledModel
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import reading_of
@@ -25,14 +26,14 @@ class Coupled:
         tail: T, (n_lines, n_sensors, 2 n_modes).
     """
 
-    compliance: np.ndarray
-    tail: np.ndarray
+    compliance: Complexes
+    tail: Complexes
 
-    def to_force(self, shape: np.ndarray) -> np.ndarray:
+    def to_force(self, shape: Floats) -> Complexes:
         """Readings (n_lines, n_sensors) of a unit force where the modes have that shape (n_modes,)."""
         return self.compliance @ shape
 
-    def along(self, directions: np.ndarray) -> np.ndarray:
+    def along(self, directions: Complexes) -> Complexes:
         """T seen along a direction (n_lines, n_sensors) of the sensors: (n_lines, 2 n_modes)."""
         return (directions[:, None, :] @ self.tail)[:, 0]
 
@@ -76,7 +77,7 @@ class Apart:
     compliance: np.ndarray
     sensors: tuple[_Alike, ...]
 
-    def to_force(self, shape: np.ndarray) -> np.ndarray:
+    def to_force(self, shape: Floats) -> Complexes:
         """See `Coupled`."""
         moved = self.compliance * shape
         readings = np.empty((len(moved), sum(alike.here.size for alike in self.sensors)), complex)
@@ -84,9 +85,12 @@ class Apart:
             readings[:, alike.here] = (moved @ alike.shapes.T) * alike.rates[:, None]
         return readings
 
-    def along(self, directions: np.ndarray) -> np.ndarray:
+    def along(self, directions: Complexes) -> Complexes:
         """See `Coupled`."""
-        return sum(np.tile(directions[:, alike.here] @ alike.shapes, 2) * alike.tail for alike in self.sensors)
+        seen: list[Complexes] = [
+            np.tile(directions[:, alike.here] @ alike.shapes, 2) * alike.tail for alike in self.sensors
+        ]
+        return sum(seen[1:], start=seen[0])
 
     def products(self, left: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `Coupled`."""
@@ -108,12 +112,13 @@ class Apart:
 Answers = Apart | Coupled
 
 
-def real_product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def real_product(one: Complexes, other: Complexes) -> Floats:
     """Sums over lines, those of negative frequency too: 2 Re(one* other)."""
-    return 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
+    product: Floats = 2.0 * (one.real.T @ other.real + one.imag.T @ other.imag)
+    return product
 
 
-def answers_of(rig: Rig, model: SampledModel, omega: np.ndarray, n_samples: int, sample_time: float) -> Answers:
+def answers_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Answers:
     """The answers of a rig at lines of frequency omega (n_lines,), rad/s, of a record of so many samples.
 
     Args:
@@ -121,10 +126,10 @@ def answers_of(rig: Rig, model: SampledModel, omega: np.ndarray, n_samples: int,
     """
     z = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time)
     turn = _apart if rig.modes.proportional else _coupled
-    return turn(rig, model, 1j * omega, z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
+    return turn(rig, model, np.asarray(1j * omega, complex), z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
 
 
-def _coupled(rig: Rig, model: SampledModel, rate, z, noise, share: float) -> Coupled:
+def _coupled(rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float) -> Coupled:
     modes = rig.modes
     dynamic = rate[:, None, None] * modes.damping
     each = np.arange(modes.n_modes)
@@ -137,7 +142,7 @@ def _coupled(rig: Rig, model: SampledModel, rate, z, noise, share: float) -> Cou
     return Coupled(compliance / noise[:, None], share * tail / noise[:, None])
 
 
-def _apart(rig: Rig, model: SampledModel, rate, z, noise, share: float) -> Apart:
+def _apart(rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float) -> Apart:
     modes = rig.modes
     n, rate, z = modes.n_modes, rate[:, None], z[:, None]
     damping, stiffness = np.diag(modes.damping), modes.omega**2
@@ -159,7 +164,7 @@ def _apart(rig: Rig, model: SampledModel, rate, z, noise, share: float) -> Apart
     return Apart(compliance, tuple(sensors))
 
 
-def _velocities(rig: Rig) -> np.ndarray:
+def _velocities(rig: Rig) -> Floats:
     """Units (2 n_modes,) of a state."""
     omega = rig.modes.omega
-    return np.r_[np.ones(omega.size), np.maximum(omega, 0.1 * omega[-1])]
+    return np.concatenate([np.ones(omega.size), np.maximum(omega, 0.1 * omega[-1])])

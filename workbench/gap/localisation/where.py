@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.coherence import linear_share
 from workbench.gap.localisation.evidence import Evidence
@@ -52,7 +54,7 @@ class Where:
     place: Placed
 
     @property
-    def at(self) -> float:
+    def at(self) -> Any:
         return self.place.at
 
     @property
@@ -109,12 +111,12 @@ def _shares_between(edges: np.ndarray, evidence: Evidence, scaled: list[np.ndarr
         floor = ((evidence.data.noise / record.outputs.std(axis=1)) ** 2).sum()
         power += np.bincount(band, spectrum - floor, power.size)
     power = np.maximum(power, 0.0)
-    return power / max(power.sum(), 1e-300)
+    return power / max(float(power.sum()), 1e-300)
 
 
-def _by_eighths(scaled: np.ndarray) -> np.ndarray:
-    power = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
-    return power / max(power.sum(), 1e-300)
+def _by_eighths(scaled: Floats) -> Floats:
+    power: Floats = np.array([(piece**2).sum() for piece in np.array_split(scaled, 8, axis=1)])
+    return power / max(float(power.sum()), 1e-300)
 
 
 def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> str:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.prediction.unmodelled_force import driven, force_filter, sampled_model
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -58,7 +59,8 @@ class Follower:
 
         What sensors lose by delay, lag or clipping is not followed: it is made up for as the whole record has it.
         """
-        return self.whitening @ self._followed(rig, record, substeps)
+        errors: Floats = self.whitening @ self._followed(rig, record, substeps)
+        return errors
 
     def left(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """What a rig leaves of a whole record (n_outputs, n_samples) whose laws act on the motion that was measured.
@@ -96,7 +98,9 @@ class Follower:
         bare = replace(rig, actuators=(), elements=(), sensors=sensors)
         gain, no_inputs = self._gain_for(rig.modes.n_modes), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
-        return self.whitening @ follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
+        errors = follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
+        white: Floats = self.whitening @ errors
+        return white
 
     def _gain_for(self, n_modes: int) -> np.ndarray:
         """The gain with none for modes that are more than it knows of."""

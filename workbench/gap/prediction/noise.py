@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from workbench.arrays import Floats
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
@@ -34,7 +35,8 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     alike = whole[1] < ALIKE * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
     same = whole < SAME * whole[0]
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
-    return np.sqrt(np.where(alike | (under > LOUD * whole[0]), noise, under))
+    power: Floats = np.where(alike | (under > LOUD * whole[0]), noise, under)
+    return np.sqrt(power)
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
@@ -75,7 +77,7 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     return float(min(np.sqrt(share), MOST_LOGGED))
 
 
-def _under_peaks(residual: np.ndarray) -> np.ndarray:
+def _under_peaks(residual: Floats) -> Floats:
     """Mean square (n_outputs,) under the peaks of the spectrum."""
     n_outputs, n_samples = residual.shape
     window = np.hanning(n_samples)
@@ -85,4 +87,5 @@ def _under_peaks(residual: np.ndarray) -> np.ndarray:
     reach = min(REACH, (bands - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
     floor = np.quantile(around, QUIET, axis=2) * (1.0 + LOWER / np.sqrt(LINES))
-    return np.minimum(means, floor).mean(axis=1)
+    under: Floats = np.minimum(means, floor).mean(axis=1)
+    return under

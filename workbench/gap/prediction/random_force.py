@@ -1,6 +1,6 @@
 """A random disturbance: no prediction can hold it, so it is found by what it does to the statistics."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -180,7 +180,7 @@ def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float
     return float(max(fitted @ fitted / (target @ target) - 3.0 * followed.shape[1] / target.size, 0.0))
 
 
-def _deviation(loss, point: np.ndarray, j: int, step: float) -> float:
+def _deviation(loss: Callable[[np.ndarray], float], point: np.ndarray, j: int, step: float) -> float:
     """From the curvature of minus twice the log-likelihood."""
     ahead, behind = point.copy(), point.copy()
     ahead[j] += step

@@ -4,6 +4,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, is_stepped, move, read, steps_exactly
+from workbench.structure.modes import Modes
 
 REMEMBERED = 24
 
@@ -41,7 +43,9 @@ class FitData:
     whitener: ForceFilter | None = None
     given_way: tuple[np.ndarray, np.ndarray] | None = None
     follower: Follower | None = None
-    _memory: OrderedDict = field(default_factory=OrderedDict, repr=False, init=False)
+    _memory: OrderedDict[Any, tuple[Modes, tuple[Motion, ...]]] = field(
+        default_factory=OrderedDict, repr=False, init=False
+    )
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 
     @property

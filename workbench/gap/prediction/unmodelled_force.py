@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 from scipy.linalg import expm, solve_triangular
 
+from workbench.arrays import Floats
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.stepping import FAST, LANES
 from workbench.structure.modes import Modes
@@ -169,11 +170,12 @@ def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_varianc
         hk = hk + change
         if np.abs(change).max() <= 1e-10 * np.abs(hk).max():
             break
-    return 0.5 * (hk + hk.T)
+    covariance: np.ndarray = 0.5 * (hk + hk.T)
+    return covariance
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def _carry_on(a, x):
+def _carry_on(a: Floats, x: Floats) -> None:
     """Add a x_k to x_k+1, row after row of x (n_samples + 1, n_lanes); a (n_states, n_lanes)."""
     for k in range(x.shape[0] - 1):
         for i in range(a.shape[0]):
@@ -183,7 +185,7 @@ def _carry_on(a, x):
             x[k + 1, i] += total
 
 
-def driven(a: np.ndarray, drive: np.ndarray) -> np.ndarray:
+def driven(a: Floats, drive: Floats) -> Floats:
     """States x_k+1 = a x_k + drive_k from rest: (n_states, n_samples + 1) of a drive (n_states, n_samples)."""
     n, n_samples = drive.shape
     n_lanes = LANES * -(-n // LANES)
@@ -193,19 +195,20 @@ def driven(a: np.ndarray, drive: np.ndarray) -> np.ndarray:
     return states[:, :n].T
 
 
-def innovations(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+def innovations(filter_: ForceFilter, residual: Floats) -> Floats:
     """One-step prediction errors (n_sensors, n_samples) of a residual, from rest."""
     closed = filter_.a - filter_.gain @ filter_.h
     return residual - filter_.h @ driven(closed, filter_.gain @ residual)[:, :-1]
 
 
-def log_likelihoods(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+def log_likelihoods(filter_: ForceFilter, residual: Floats) -> Floats:
     """Gaussian log-likelihood of each sample of a residual given those before it, constants left out: (n_samples,)."""
     e = innovations(filter_, residual)
     if not np.abs(e).max() < RUNAWAY:
         return np.full(e.shape[1], -np.inf)
     white = _of_unit_covariance(filter_, e)
-    return -0.5 * (np.einsum("jk,jk->k", white, white) + np.linalg.slogdet(filter_.innovation)[1])
+    squares: Floats = np.einsum("jk,jk->k", white, white)
+    return -0.5 * (squares + float(np.linalg.slogdet(filter_.innovation)[1]))
 
 
 def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
@@ -213,17 +216,18 @@ def log_likelihood(filter_: ForceFilter, residuals: list[np.ndarray]) -> float:
     return float(sum(log_likelihoods(filter_, residual).sum() for residual in residuals))
 
 
-def whiten(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+def whiten(filter_: ForceFilter, residual: Floats) -> Floats:
     """Innovations of unit covariance (n_sensors, n_samples)."""
     return _of_unit_covariance(filter_, innovations(filter_, residual))
 
 
-def _of_unit_covariance(filter_: ForceFilter, errors: np.ndarray) -> np.ndarray:
+def _of_unit_covariance(filter_: ForceFilter, errors: Floats) -> Floats:
     # errors of a motion that ran away are no numbers, and stay none
-    return solve_triangular(np.linalg.cholesky(filter_.innovation), errors, lower=True, check_finite=False)
+    white: Floats = solve_triangular(np.linalg.cholesky(filter_.innovation), errors, lower=True, check_finite=False)
+    return white
 
 
-def smoothed_states(filter_: ForceFilter, residual: np.ndarray) -> np.ndarray:
+def smoothed_states(filter_: ForceFilter, residual: Floats) -> Floats:
     """Smoothed augmented states (2n + m, n_samples): the error of the motion, and the missing forces.
 
     Bryson-Frazier form: a backward pass of the adjoint, so that no covariance is inverted.

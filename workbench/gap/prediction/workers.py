@@ -119,7 +119,7 @@ def _per_turn(n: int) -> int:
     return -(-n // MOST_TURNS)
 
 
-def _taken(function: Callable, items: list, turns: int) -> dict[int, Any]:
+def _taken(function: Callable[[Any], Any], items: list[Any], turns: int) -> dict[int, Any]:
     """What this process found, by the index of the item."""
     found = {}
     while turn := os.read(turns, TURN):
@@ -134,7 +134,7 @@ class _Helper:
 
     is_this_process = False
 
-    def __init__(self, work: Callable[[], Any], aside: bool = False):
+    def __init__(self, work: Callable[[], Any], aside: bool = False) -> None:
         self._source, sink = os.pipe()
         with warnings.catch_warnings():
             # no lock of another thread is ever asked for by a helper: it computes, writes to its pipe and ends

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -58,7 +59,7 @@ class Budget:
             return None
         return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """Plain numbers, as the case format asks for them: effects by kind."""
         by_kind: dict[str, float] = {}
         for label, share in self.effects.items():

@@ -2,9 +2,11 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind
 from workbench.gap.effects.structural import modes_of
@@ -209,7 +211,9 @@ def readiness(evidence: Evidence, *, catalogue: tuple[Kind, ...] = CATALOGUE) ->
     )
 
 
-def _first_seen(kind: Kind, target, evidence: Evidence, data: FitData, base: np.ndarray):
+def _first_seen(
+    kind: Kind, target: Any, evidence: Evidence, data: FitData, base: Floats
+) -> tuple[Effect | None, Floats]:
     """The first strength of a kind that these records show, or the one that they show most; and what it changes."""
     best, change, most = None, np.zeros(0), -1.0
     for effect in _strengths(kind, target, evidence):
@@ -226,7 +230,7 @@ def _first_seen(kind: Kind, target, evidence: Evidence, data: FitData, base: np.
     return best, change
 
 
-def _strengths(kind: Kind, target, evidence: Evidence) -> Iterator[Effect]:
+def _strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
     """Where a search would start, and from the first and the last start each number by decades up and down.
 
     A search starts from the missing force, and where none is missing it starts from nothing, and anywhere: also by a
@@ -249,7 +253,8 @@ def _liveliest(evidence: Evidence) -> Where:
     power = sum(motion.displacement @ motion.displacement.T for motion in evidence.motions)
     places = [where for where in evidence.places if not isinstance(where, Between)]
     shapes = evidence.rig.modes.phi(places)
-    return same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
+    liveliest: Where = same_place(places[int(np.argmax(np.sum((shapes @ power) * shapes, axis=1)))])
+    return liveliest
 
 
 def _by_decades(effect: Effect, rig: Rig) -> Iterator[Effect]:

@@ -157,7 +157,7 @@ class Verdict:
     def __repr__(self) -> str:
         return f"<Verdict on {self.case}: {self.sentence}>"
 
-    def to_json(self) -> dict:
+    def to_json(self) -> dict[str, Any]:
         """The verdict as the case format asks for it, and what stands behind it."""
         known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._told]
@@ -198,11 +198,11 @@ class Verdict:
         }
 
 
-def effect_json(effect: Effect, nominal: Rig) -> dict:
+def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
     """One effect: kind, parameters with their standard deviations, place, input or output."""
     kind = effect.kind
     stated = effect.stated(nominal)
-    entry: dict = {"kind": kind.name, "parameters": {n: _rounded(v) for n, v in stated.items()}}
+    entry: dict[str, Any] = {"kind": kind.name, "parameters": {n: _rounded(v) for n, v in stated.items()}}
     deviations = {n: _rounded(d) for n, d in effect.deviations.items() if n in stated}
     if deviations:
         entry["parameters_std"] = deviations
@@ -231,7 +231,7 @@ def _place_json(where: Any) -> dict[str, Any]:
     return {"at": where if isinstance(where, str) else _rounded(where)}
 
 
-def where_json(where: Where) -> dict:
+def where_json(where: Where) -> dict[str, Any]:
     """Where, as plain numbers."""
     return {
         "path": where.path,

@@ -10,6 +10,7 @@ from itertools import combinations
 
 import numpy as np
 
+from workbench.arrays import Flags, Floats
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
@@ -185,12 +186,13 @@ class _Gap:
         scale = np.where(power > 0, power, 1.0)
         return _Gap(measured, np.array([s.noise_std for s in rig.sensors]) ** 2 / scale, scale)
 
-    def power(self, predicted: Sequence[np.ndarray]) -> np.ndarray:
+    def power(self, predicted: Sequence[Floats]) -> Floats:
         """(n_outputs,) mean square of what is left, as a share of the mean square measured."""
         count = sum(y.shape[1] for y in self.measured)
         with np.errstate(over="ignore", invalid="ignore"):
             left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
-        return np.nan_to_num(left / count / self.scale, nan=np.inf)
+        power: Floats = np.nan_to_num(left / count / self.scale, nan=np.inf)
+        return power
 
     def closed(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed."""
@@ -218,7 +220,9 @@ def _overall(faults: Sequence[WiringFault], rig: Rig, records: Sequence[Record])
     return -float(np.minimum(gap.power([_predict(rig, record) for record in kept]), 1.0).mean())
 
 
-def _scaled_outputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _scaled_outputs(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     """Outputs that read a known factor times what is predicted."""
     over = sum((p**2).sum(axis=1) for p in predicted)
     along = sum((y * p).sum(axis=1) for y, p in zip(gap.measured, predicted, strict=True))
@@ -253,7 +257,9 @@ def _factor(gain: float) -> float | None:
     return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
 
 
-def _exchanged_outputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _exchanged_outputs(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     for i, j in combinations(np.flatnonzero(wide), 2):
         order = np.arange(len(rig.sensors))
         order[[i, j]] = j, i
@@ -266,7 +272,9 @@ def _exchanged_outputs(rig, records, gap, predicted, before, wide) -> list[Wirin
     return []
 
 
-def _exchanged_inputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _exchanged_inputs(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     found: list[WiringFault] = []
     n = len(rig.actuators)
     for i, j in combinations(range(n), 2):
@@ -281,7 +289,9 @@ def _exchanged_inputs(rig, records, gap, predicted, before, wide) -> list[Wiring
     return sorted(found, key=lambda fault: -fault.closes)[:1]
 
 
-def _scaled_inputs(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _scaled_inputs(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     """Inputs that a linear rig would need a known factor larger or smaller, by least squares on their responses."""
     n = len(rig.actuators)
     if n < 2 or n > MOST_CHANNELS or is_stepped(rig):
@@ -319,7 +329,9 @@ def _scaled_inputs(rig, records, gap, predicted, before, wide) -> list[WiringFau
     return faults
 
 
-def _quantities(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _quantities(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     """Outputs that are another time derivative of the motion than their label says."""
     meant: dict[tuple[str, str], list[int]] = {}
     for quantity in QUANTITIES:
@@ -342,7 +354,9 @@ def _quantities(rig, records, gap, predicted, before, wide) -> list[WiringFault]
     return faults
 
 
-def _rates(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _rates(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     """Records sampled at another rate than they are said to be."""
     wrong: dict[float, list[int]] = {}
     for i, record in enumerate(records):
@@ -372,7 +386,9 @@ def _rates(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
     return faults
 
 
-def _structure(rig, records, gap, predicted, before, wide) -> list[WiringFault]:
+def _structure(
+    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
+) -> list[WiringFault]:
     """Damping in per cent, frequencies in rad/s for Hz and the other way about."""
     tries: list[tuple[str, str, Mend]] = []
     zeta = float(rig.modes.zeta.max(initial=0.0))

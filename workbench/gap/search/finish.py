@@ -180,7 +180,7 @@ def ranked(search: Search, fits: Sequence[Fit]) -> tuple[Fit, tuple[tuple[Fit, f
 
 def best_of_each(fits: Sequence[Fit]) -> list[Fit]:
     """The first fit of every set, in the order of the fits."""
-    distinct: dict[tuple, Fit] = {}
+    distinct: dict[tuple[str, ...], Fit] = {}
     for candidate in fits:
         distinct.setdefault(candidate.key, candidate)
     return list(distinct.values())

@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all, key_of
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -120,7 +121,7 @@ class _Problem:
         residual = finite_residual(self.rig, (*self.at(free), *self.held), data)
         if residual is None or not self.believed:
             return residual
-        return np.r_[residual, free[self.believed] / self.prior_std]
+        return np.concatenate([residual, free[self.believed] / self.prior_std])
 
     def near(self, free: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, bool]:
         """The residual that slopes start from, and whether it is by coarser steps of time, as it is for a stepped rig.
@@ -182,7 +183,9 @@ def slopes(
 
 def sensitivity(rig: Rig, effects: Sequence[Effect], data: FitData, workers: Workers = ALONE) -> np.ndarray:
     """The slopes along the numbers of believed effects, each in units of its belief."""
-    return slopes(rig, effects, data, workers=workers)[1] * _Problem(rig, effects, data).prior_std
+    along: np.ndarray = slopes(rig, effects, data, workers=workers)[1]
+    scaled: np.ndarray = along * _Problem(rig, effects, data).prior_std
+    return scaled
 
 
 def fit(
@@ -250,9 +253,9 @@ def fit(
     return _result(problem, free, residual, normal, status, falling)
 
 
-def _straight(problem: _Problem, free, gradient, damped) -> tuple[np.ndarray, np.ndarray]:
+def _straight(problem: _Problem, free: Floats, gradient: Floats, damped: Floats) -> tuple[Floats, Flags]:
     """The damped step, and which numbers it moves: one at a bound that it would pass stays, the others do without."""
-    moving = np.ones(free.size, bool)
+    moving: Flags = np.ones(free.size, bool)
     step = np.zeros(free.size)
     for _ in range(free.size):
         among = np.ix_(moving, moving)
@@ -265,14 +268,24 @@ def _straight(problem: _Problem, free, gradient, damped) -> tuple[np.ndarray, np
     return step, moving
 
 
-def _bounded(problem: _Problem, free, step) -> np.ndarray:
+def _bounded(problem: _Problem, free: Floats, step: Floats) -> Floats:
     """The step, no longer than is sensible, and inside the bounds."""
     reach = _reach(problem)
     step = np.clip(step, -reach, reach)
-    return np.clip(free + step, problem.low, problem.high) - free
+    ended: Floats = np.clip(free + step, problem.low, problem.high)
+    return ended - free
 
 
-def _bend(problem: _Problem, free, residual, coarsely, jacobian, damped, step, moving) -> np.ndarray:
+def _bend(
+    problem: _Problem,
+    free: Floats,
+    residual: Floats,
+    coarsely: bool,
+    jacobian: Floats,
+    damped: Floats,
+    step: Floats,
+    moving: Flags,
+) -> Floats:
     """What the step turns by in a valley that bends: geodesic acceleration, none where it is no small correction.
 
     Transtrum & Sethna (2012), arXiv:1201.5885. A place and a strength make up for one another along such a valley.

@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Flags, Floats
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all
 from workbench.gap.localisation.evidence import Evidence
@@ -129,9 +131,11 @@ class Weighed:
         """Whether two starts of one kind are in one valley: (n_starts, n_starts)."""
         if isinstance(self.domain, NamedPoints):
             names = np.array([str(start.at) for start in self.starts])
-            return names[:, None] == names
+            alike: Flags = names[:, None] == names
+            return alike
         at = np.array([[start.values.get(name, 0.0) for name in self.domain.coordinates] for start in self.starts])
-        return np.linalg.norm(at[:, None] - at, axis=2) <= ELSEWHERE * self.domain.size
+        beside: Flags = np.linalg.norm(at[:, None] - at, axis=2) <= ELSEWHERE * self.domain.size
+        return beside
 
     def _of_pairs(self) -> np.ndarray:
         """min |left + a m_i + b m_j|² - |left|² over a and b within their bounds: (n_starts, n_starts)."""
@@ -145,7 +149,8 @@ class Weighed:
         a = np.nan_to_num(a, nan=1.0).clip(least, most)
         b = (-(j + a * products) / own_j).clip(self.least, self.most)
         a = (-(i + b * products) / own_i).clip(least, most)
-        return a * (2.0 * i + a * own_i) + b * (2.0 * j + b * own_j) + 2.0 * a * b * products
+        changes: Floats = a * (2.0 * i + a * own_i) + b * (2.0 * j + b * own_j) + 2.0 * a * b * products
+        return changes
 
 
 def _bounds(starts: list[Effect]) -> tuple[float, float]:
@@ -168,7 +173,7 @@ def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> li
     return [task for task in starts if task and not any(_repeats(task[0], effect) for effect in given)]
 
 
-def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple:
+def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, ...]:
     """Targets of a kind; a fault of one sensor is only looked for where that sensor disagrees."""
     targets = kind.targets(rig)
     if kind.path != "sensor":
@@ -177,7 +182,7 @@ def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple:
     names = [s.name for s in rig.sensors]
     worst = {names[j] for j in np.argsort(-by_sensor)[:3]}
 
-    def disagrees(target) -> bool:
+    def disagrees(target: Any) -> bool:
         name = target[0] if isinstance(target, tuple) else target
         return name == ALL or name in worst or by_sensor[names.index(name)] > 0.2 * by_sensor.max()
 

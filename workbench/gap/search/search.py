@@ -85,7 +85,7 @@ class Search:
     def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
         """Whether the gain in likelihood pays for `extra` more numbers."""
         n = self.data.n_values
-        return n * (than - candidate.cost) > SURE + extra * np.log(n)
+        return bool(n * (than - candidate.cost) > SURE + extra * np.log(n))
 
     def worthwhile(self, candidate: Fit, than: float) -> bool:
         """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
@@ -93,7 +93,7 @@ class Search:
 
     def near(self, candidate: Fit, share: float) -> bool:
         """Whether at most this share of the gap's power is left."""
-        return candidate.cost - 1.0 < share * (self.nominal.mean() - 1.0)
+        return candidate.cost - 1.0 < share * float(self.nominal.mean() - 1.0)
 
     def with_noise(self, noise: np.ndarray) -> "Search":
         """The same search with other standard deviations of the sensors' noise (n_outputs,)."""

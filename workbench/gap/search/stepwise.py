@@ -301,7 +301,7 @@ class Stepwise:
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
     """
 
-    def __init__(self, search: Search, tolerance: float = 0.0):
+    def __init__(self, search: Search, tolerance: float = 0.0) -> None:
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.plain: Fit | None = None
@@ -345,7 +345,7 @@ class Stepwise:
     @property
     def unexplained(self) -> float:
         """Share of the nominal gap's power that the last set leaves above noise of sensors and logged inputs."""
-        return self.last.excess(self.last.noise_power) / self._gap
+        return float(self.last.excess(self.last.noise_power) / self._gap)
 
     @property
     def _gap(self) -> float:

@@ -17,6 +17,7 @@ from typing import NoReturn
 import numpy as np
 from scipy.stats import chi2
 
+from workbench.arrays import Complexes
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refined import Identified, in_coloured_noise, unshaped
@@ -214,9 +215,10 @@ class _FreeDecay:
             if strength < WEAK * self.threshold(model, pole) or near < CLOSE * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
 
-    def oscillating(self, model: _Model) -> np.ndarray:
+    def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and hardly grow; others may be noise that is not white."""
-        poles, span = model.poles, max(record.n_samples * record.sample_time for record in self.records)
+        poles: Complexes = model.poles
+        span = max(record.n_samples * record.sample_time for record in self.records)
         return poles[(poles.real * span < MOST_GROWTH) & (np.abs(poles) * span > 2.0 * np.pi)]
 
     def evidence(self, model: _Model) -> np.ndarray:

@@ -121,7 +121,7 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
     """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
     omega = np.abs(poles)
     order = np.argsort(omega)
-    shapes = np.ones((record.n_outputs, poles.size))
+    shapes = np.ones((record.n_outputs, poles.size), complex)
     return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)
 
 

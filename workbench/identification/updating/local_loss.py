@@ -134,7 +134,13 @@ def _price(task: Task) -> float:
     return 3.0 * float(np.log(task.n_data))
 
 
-def _smooth(task: Task, basis, terms, lossy: FittedStructure, limit: float) -> FittedStructure:
+def _smooth(
+    task: Task,
+    basis: Callable[[int], Basis],
+    terms: tuple[list[int], list[int]],
+    lossy: FittedStructure,
+    limit: float,
+) -> FittedStructure:
     """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
 
     def alike(*n_terms: int) -> FittedStructure:

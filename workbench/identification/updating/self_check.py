@@ -92,7 +92,7 @@ def choose_terms(
     terms: Iterable[int] = range(1, 7),
     basis: Callable[[int], Basis] = Basis.polynomial,
     first_mode: int = 0,
-    **priors,
+    **priors: Any,
 ) -> Identified:
     """Identify with each pair of numbers of terms and keep the one whose own modes agree best with the measured.
 

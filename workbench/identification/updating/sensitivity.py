@@ -87,7 +87,7 @@ class SeriesStructure:
     mass: Basis
     stiffness: Basis
     positions: np.ndarray
-    _meshes: dict = field(default_factory=dict, repr=False)
+    _meshes: dict[int, "_Mesh"] = field(default_factory=dict, repr=False)
 
     @property
     def order(self) -> int:

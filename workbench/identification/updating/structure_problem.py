@@ -19,6 +19,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2 as chi2_distribution
 
+from workbench.arrays import Floats
 from workbench.identification.updating.distributions import KNOWN_TOLERANCE, Basis
 from workbench.identification.updating.fitted_structure import UNLIKELY, FittedStructure, UncertainProfile
 from workbench.identification.updating.self_check import SelfCheck
@@ -74,7 +75,7 @@ class Problem:
     @property
     def n_free(self) -> int:
         """Free parameters without a loss."""
-        return self.mass_held[1].shape[1] + self.stiffness_held[1].shape[1]
+        return int(self.mass_held[1].shape[1] + self.stiffness_held[1].shape[1])
 
     def fit(self, near: FittedStructure | None = None, loss: LocalLoss | None = None) -> FittedStructure:
         """The most likely structure, searched from one found before, with a loss near `loss` if there is one."""
@@ -88,9 +89,9 @@ class Problem:
             z[-3:] = np.clip(z[-3:], *(0.999 * low[-3:] + 0.001 * high[-3:], 0.001 * low[-3:] + 0.999 * high[-3:]))
         if z.size == 0:
             return self.report(z)
-        memory: dict[bytes, tuple] = {}
+        memory: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-        def at(z: np.ndarray):
+        def at(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             key = z.tobytes()
             if key not in memory:
                 memory.clear()
@@ -331,8 +332,8 @@ def _uncertain(
 ) -> UncertainProfile:
     """nominal (1 + series) (1 - loss), and as many others as there are draws."""
 
-    def values(x: np.ndarray, coefficients: np.ndarray, losses: np.ndarray | None) -> np.ndarray:
-        series = nominal(x) * (1.0 + coefficients @ basis.functions(x).T)
+    def values(x: Floats, coefficients: Floats, losses: Floats | None) -> Floats:
+        series: Floats = nominal(x) * (1.0 + coefficients @ basis.functions(x).T)
         if losses is None:
             return series
         share, centre, width = losses[:, :, None].transpose(1, 0, 2)
