@@ -1,7 +1,6 @@
 """What every command shares: the terminal it writes to, its progress, its exit codes."""
 
 import json
-import math
 import re
 import warnings
 from collections.abc import Callable, Mapping
@@ -121,8 +120,3 @@ def short(path: Path) -> str:
 def names_in(text: str) -> tuple[str, ...]:
     """Names between commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
-
-
-def compact(value: float) -> str:
-    """A number in five digits; an infinite one in words."""
-    return "none" if math.isinf(value) else f"{value:.5g}"

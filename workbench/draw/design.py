@@ -65,19 +65,6 @@ def plot_work(spillovers: dict[str, Spillover]) -> Figure:
     return figure
 
 
-def plot_modal_coordinates(responses: dict[str, Response], modes: Sequence[int]) -> Figure:
-    """Modal coordinates over time, one panel a mode, one line a design."""
-    figure, axes = new_figure(len(modes), 1, width=10, height=1.7 * len(modes), sharex=True, squeeze=False)
-    styles = ("-", "--", ":", "-.")
-    for ax, r in zip(axes[:, 0], modes, strict=True):
-        for (name, response), style in zip(responses.items(), styles, strict=False):
-            ax.plot(response.time, response.modal[r], style, label=name)
-        ax.set_ylabel(f"q{r + 1}")
-    axes[0, 0].legend(ncols=len(responses))
-    axes[-1, 0].set_xlabel("time [s]")
-    return figure
-
-
 def plot_effort_front(placements: Sequence[Placement], marked: dict[str, Placement]) -> Figure:
     """Spillover against effort along the front of placements, with named ones marked; the places below."""
     figure, axes = new_figure(2, 1, width=9, height=7, height_ratios=[3, 2])

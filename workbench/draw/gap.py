@@ -105,15 +105,15 @@ def plot_where(verdict: Verdict) -> Figure:
 
 
 def _plot_places(ax: Axes, verdict: Verdict) -> None:
-    """How likely each place is for one missing force: a curve along the structure, or bars at named places."""
+    """How likely each place is for one unmodelled force: a curve along the structure, or bars at named places."""
     place = verdict.where.place
     profile = place.profile
-    told = {
-        True: "where one missing force stands",
-        False: "not one force at a point: where one would do best",
-        None: "no place of a force can be told",
+    title = {
+        True: "place of one unmodelled force",
+        False: "no single point force: where one fits best",
+        None: "no place of a force can be identified",
     }
-    ax.set(title=told[place.holds], ylabel="log-likelihood, less its peak")
+    ax.set(title=title[place.holds], ylabel="log-likelihood, less its peak")
     domain = verdict.nominal.modes.domain
     if isinstance(domain, Rectangle):
         _map(ax, verdict, domain)
@@ -177,7 +177,7 @@ def plot_missing_force(verdict: Verdict) -> Figure:
         if law is not None:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")
             ax.legend()
-    axes[0].set_ylabel("missing force [N]")
+    axes[0].set_ylabel("unmodelled force [N]")
     axes[0].set_title("the force that the nominal model lacks, no law assumed")
     return figure
 

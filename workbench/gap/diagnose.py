@@ -71,7 +71,7 @@ def diagnose(
     check_kept_apart(records, validation)
     faults = () if settle else wiring(rig, records)
     sharing = Workers.at_hand() if workers is None else Workers(workers)
-    report("looking for the missing force", 0.02)
+    report("looking for the unmodelled force", 0.02)
     found = opened(rig, records, settle=settle, workers=sharing)
     nominal = found.nominal
     with (

@@ -28,7 +28,7 @@ STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "
 
 
 def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None) -> Path:
-    """Write the page: the verdict, measured beside nominal and corrected, where, the missing force, the rivals.
+    """Write the page: the verdict, measured beside nominal and corrected, where, the unmodelled force, the rivals.
 
     Args:
         verdict: of the diagnosis.

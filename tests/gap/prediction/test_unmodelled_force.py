@@ -1,4 +1,4 @@
-"""Filter and smoother of a missing force, beside Gaussian distributions of all samples at once."""
+"""Filter and smoother of an unmodelled force, beside Gaussian distributions of all samples at once."""
 
 import numpy as np
 import pytest

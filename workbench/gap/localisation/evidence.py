@@ -1,4 +1,4 @@
-"""What the records say before any effect is guessed: the missing force, its place, and the motion there."""
+"""What the records say before any effect is guessed: the unmodelled force, its place, and the motion there."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Rectangle, Where
 
-LEVELS = (1e-3, 1e-2, 1e-1, 1.0)  # rms of a missing force over that of the inputs
+LEVELS = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
 MEMORIES = (10.0, 1000.0)  # its correlation time, in samples
 MOST_PEAKS = 3
 PLACES, FEWER_PLACES = 40, 20  # where a force is looked for: the first, and one beside what is given
@@ -37,7 +37,7 @@ CROWD = 12  # named points, of which all are looked at
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """The missing force at a point and the motion there, one row a record joined end to end.
+    """The unmodelled force at a point and the motion there, one row a record joined end to end.
 
     Attributes:
         at: on the structure.
@@ -54,7 +54,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The residual of a rig on the fit records, and what it says of a missing force.
+    """The residual of a rig on the fit records, and what it says of an unmodelled force.
 
     Attributes:
         rig: the rig that was simulated.
@@ -136,7 +136,7 @@ class Evidence:
 
     @cached_property
     def size(self) -> tuple[float, float]:
-        """Rms, N, and correlation time, in samples, of the missing force: the likeliest of a coarse grid."""
+        """Rms, N, and correlation time, in samples, of the unmodelled force: the likeliest of a coarse grid."""
         if self.sized is not None:
             return self.sized
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
@@ -241,12 +241,12 @@ class Evidence:
 
     @cached_property
     def at_peaks(self) -> tuple[Place, ...]:
-        """The missing force and the motion at the likeliest places."""
+        """The unmodelled force and the motion at the likeliest places."""
         _ = self.size  # found once, before the work is shared
         return tuple(self.workers.map(self.place, self.peaks))
 
     def place(self, where: Where) -> Place:
-        """The missing force somewhere and the motion there, smoothed."""
+        """The unmodelled force somewhere and the motion there, smoothed."""
         kalman = self.filter_at(where, *self.size)
         n, shape = self.rig.modes.n_modes, self.rig.modes.phi_at(where)
         pieces = []

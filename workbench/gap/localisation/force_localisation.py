@@ -1,4 +1,4 @@
-"""The place of a missing force along the structure, with its uncertainty, before any law is guessed."""
+"""The place of an unmodelled force along the structure, with its uncertainty, before any law is guessed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -36,7 +36,7 @@ class Where:
         record_gaps: (n_records,) gap as the case format defines it.
         input_levels: (n_records,) root mean square of the inputs.
         linear_share: of the gap's power, what one linear reply to the inputs explains.
-        place: of a missing force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
+        place: of an unmodelled force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
     """
 
     path: str
@@ -68,7 +68,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: Placed) -> Wher
     Args:
         evidence: of the nominal rig.
         effects: that explain the gap, where they are known: the path is theirs.
-        place: of a missing force; without sensors that are known to be at fault, which it would have to explain too.
+        place: of an unmodelled force, found without sensors that are known to be at fault.
     """
     data = evidence.data
     scaled = [

@@ -1,4 +1,4 @@
-"""The missing force: what force at a point, of any form, would make the simulation agree with the test?
+"""The unmodelled force: what force at a point, of any form, would make the simulation agree with the test?
 
 The residual of the nominal model obeys the model's own equations, driven by whatever the model leaves out. A Kalman
 filter with an unknown force at x (a first-order random process) gives the likelihood of that place without a guess
@@ -228,7 +228,7 @@ def _of_unit_covariance(filter_: ForceFilter, errors: Floats) -> Floats:
 
 
 def smoothed_states(filter_: ForceFilter, residual: Floats) -> Floats:
-    """Smoothed augmented states (2n + m, n_samples): the error of the motion, and the missing forces.
+    """Smoothed augmented states (2n + m, n_samples): the error of the motion, and the unmodelled forces.
 
     Bryson-Frazier form: a backward pass of the adjoint, so that no covariance is inverted.
     """

@@ -233,7 +233,7 @@ def _first_seen(
 def _strengths(kind: Kind, target: Any, evidence: Evidence) -> Iterator[Effect]:
     """Where a search would start, and from the first and the last start each number by decades up and down.
 
-    A search starts from the missing force, and where none is missing it starts from nothing, and anywhere: also by a
+    A search starts from the unmodelled force, and where there is none it starts from nothing, and anywhere: also by a
     support, where nothing shows. So the last resort is where the structure moves most.
     """
     starts = [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]

@@ -23,12 +23,12 @@ NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wro
 RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
 STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
 FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
-SPREAD = 0.5  # of the missing force's level over records: most forces of the rig's own follow the level of the inputs
+SPREAD = 0.5  # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
 
 def looks_random(evidence: Evidence) -> bool:
-    """Whether the missing force is as strong in every record, follows little that the rig does, and is no tone."""
+    """Whether the unmodelled force is as strong in every record, follows little that the rig does, and is no tone."""
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
     levels = np.array([np.sqrt(np.mean(force**2)) for force in forces])
@@ -66,7 +66,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
 def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
     """The fits of single effects that the filter of a random force leaves something to explain, best first.
 
-    The missing force stands where the random one does; where the best of them stands, all laws are tried again.
+    The unmodelled force stands where the random one does; where the best of them stands, all laws are tried again.
     """
     cost = cost_of(beside.rig, (), beside.data)
 

@@ -107,7 +107,7 @@ class Search:
         return replace(self, data=data, quick=quick, first=first)
 
     def evidence_of(self, rig: Rig) -> Evidence:
-        """What the records say of a missing force beside what a rig has."""
+        """What the records say of an unmodelled force beside what a rig has."""
         return Evidence.of(rig, self.data, FEWER_PLACES, self.workers)
 
     def hearing(self) -> "Search":
