@@ -59,6 +59,7 @@ from .rig.sensors import Sensor as Sensor
 from .rig.simulate import simulate as simulate
 from .rig.statespace import state_space as state_space
 from .robust.posterior import UncertainRig as UncertainRig
+from .robust.prediction import predict as predict
 from .robust.proof import prove as prove
 from .robust.redesign import redesign as redesign
 from .structure.damping import ModalDamping as ModalDamping

@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from workbench.cli.bench import bench
+from workbench.cli.check import check
 from workbench.cli.design import design
 from workbench.cli.diagnose import diagnose
 from workbench.cli.export import export
@@ -12,6 +13,7 @@ from workbench.cli.identify import identify
 from workbench.cli.look import look
 from workbench.cli.new import new
 from workbench.cli.place import place
+from workbench.cli.predict import predict
 from workbench.cli.redesign import redesign
 from workbench.cli.report import report
 from workbench.cli.study import study
@@ -44,7 +46,8 @@ def _options(
     """Options of the command itself."""
 
 
-for command in (look, identify, design, place, export, diagnose, redesign, trial, study, report, bench, new):
+COMMANDS = (look, identify, design, place, export, diagnose, redesign, predict, check, trial, study, report, bench, new)
+for command in COMMANDS:
     app.command()(command)
 
 

@@ -1,12 +1,12 @@
 """`workbench redesign`: the controller that holds on the real structure."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
+from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig
 from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
 
 if TYPE_CHECKING:
@@ -14,16 +14,12 @@ if TYPE_CHECKING:
 
     from workbench.arrays import Floats
     from workbench.records.record import Record
-    from workbench.rig.rig import Rig
-    from workbench.robust.posterior import UncertainRig
 
 
 @guarded
 def redesign(
-    case: Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")],
-    verdict: Annotated[
-        Path | None, typer.Option(help="Verdict that `workbench diagnose --json` wrote; diagnosed now unless given.")
-    ] = None,
+    case: CasePath,
+    verdict: VerdictPath = None,
     law: Annotated[str, typer.Option(help="Law in use: imsc, coupled, poles or on-off.")] = "imsc",
     control: Annotated[
         int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
@@ -37,7 +33,7 @@ def redesign(
     ] = None,
     draws: Annotated[int, typer.Option(help="Possible rigs on which both controllers are proved.")] = 200,
     seed: Annotated[int, typer.Option(help="Of the draws and of the noise.")] = 0,
-    workers: Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")] = None,
+    workers: Workers = None,
     json_path: JsonPath = None,
     page: PagePath = None,
 ) -> None:
@@ -48,9 +44,7 @@ def redesign(
     Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05
     """
     from workbench.cases.case import read_case
-    from workbench.gap.diagnose import diagnose
     from workbench.robust.plain_law import plain_law
-    from workbench.robust.posterior import UncertainRig
     from workbench.robust.redesign import impulse_test
     from workbench.robust.redesign import redesign as run
     from workbench.study.redesign_page import redesign_page
@@ -61,18 +55,9 @@ def redesign(
     rig, records = found.rig, (*found.fit, *found.validation)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
-        if verdict is None:
-            told = diagnose(
-                rig,
-                found.fit,
-                validation=found.validation,
-                name=found.name,
-                workers=workers,
-                report=lambda what, share: report(what, 0.7 * share),
-            )
-            possible = UncertainRig.of(told)
-        else:
-            possible = _read_verdict(verdict, rig)
+        possible, _ = possible_rig(
+            found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
+        )
         level = _largest(records)
         sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
         controlled = range(len([a for a in rig.actuators if not a.direct]) if control is None else control)
@@ -106,16 +91,3 @@ def _largest(records: "Sequence[Record]") -> "Floats":
 
     level: Floats = np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
     return level
-
-
-def _read_verdict(path: Path, rig: "Rig") -> "UncertainRig":
-    from workbench.robust.posterior import UncertainRig
-
-    try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        posterior = told["posterior"]
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
-        raise ValueError(
-            f"{path} holds no verdict with its uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
-        ) from None
-    return UncertainRig.from_json(rig, posterior)

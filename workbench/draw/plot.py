@@ -17,6 +17,7 @@ from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.distortion import plot_distortion
 from workbench.draw.gap import plot_where
+from workbench.draw.prediction import plot_prediction
 from workbench.draw.robust import plot_redesign
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.draw.surface import plot_point_modes, plot_surface_modes
@@ -26,6 +27,7 @@ from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
 from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
+from workbench.robust.prediction import Prediction
 from workbench.robust.redesign import Redesign
 from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.modes import Modes, SampledModes
@@ -37,7 +39,8 @@ MOST_PANELS = 12
 @singledispatch
 def plot(result: object) -> Figure:
     """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
-    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion`, `Verdict` or `Redesign`.
+    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion`, `Verdict`, `Redesign` or
+    `Prediction`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -168,6 +171,11 @@ def _(result: Distortion) -> Figure:
 @plot.register
 def _(result: Redesign) -> Figure:
     return plot_redesign(result)
+
+
+@plot.register
+def _(result: Prediction) -> Figure:
+    return plot_prediction(result)
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:

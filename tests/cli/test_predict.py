@@ -1,0 +1,92 @@
+"""`workbench predict` and `workbench check`: bands of a test to come, and a log of tests."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.cases.case import Case
+from workbench.cases.writing import write_case
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.records.files import write_record
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.robust.posterior import UncertainRig
+from workbench.structure.damping import ModalDamping
+from workbench.structure.member import Beam
+
+NOISE = 1e-4
+
+
+@pytest.fixture
+def case(tmp_path, monkeypatch):
+    """A case whose actuator is late, its verdict, and two tests that came later: one like it, one that is not."""
+    monkeypatch.chdir(tmp_path)
+    beam = Beam(
+        length=2.0,
+        mass_per_length=1.0,
+        bending_stiffness=4.0,
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    sensors = [Sensor(f"d{i}", x, noise_std=NOISE) for i, x in enumerate((0.3, 1.1))]
+    rig = Rig(beam.modes(4), (Actuator("F1", 0.45),), tuple(sensors), structure=beam)
+    late = Effect(kind_named("actuator_delay"), "all", {"delay": 0.02})
+    rng = np.random.default_rng(0)
+
+    def test_of(real, name):
+        record = simulate(real, 0.1 * rng.normal(size=(1, 300)), sample_time=0.01, name=name)
+        return replace(record, outputs=record.outputs + NOISE * rng.normal(size=record.outputs.shape))
+
+    write_case(Case("late", rig, (test_of(late.apply(rig), "low"),), ()), tmp_path / "late")
+    posterior = UncertainRig(rig, (late,), np.array([[1e-4]])).to_json()
+    told = {"posterior": posterior, "noise": {"found": [NOISE, NOISE]}}
+    (tmp_path / "verdict.json").write_text(json.dumps(told))
+    write_record(test_of(late.apply(rig), "friday"), tmp_path / "friday.csv")
+    write_record(test_of(rig, "monday"), tmp_path / "monday.csv")
+    return tmp_path
+
+
+def test_a_planned_test_is_predicted_from_its_inputs_alone(run, case):
+    t = 0.01 * np.arange(200)
+    np.savetxt(case / "plan.csv", np.column_stack([t, np.sin(20 * t)]), delimiter=",", header="t,F1", comments="")
+    done = run("predict", "late", "plan.csv", "--verdict", "verdict.json", "--draws", 40, "--json", "told.json")
+    assert done.exit_code == 0, done.output
+    told = json.loads((case / "told.json").read_text())
+    low, high = np.array(told["lower"]), np.array(told["upper"])
+    assert low.shape == (2, 200) and (low < high).all() and told["sensors"] == ["d0", "d1"]
+    assert "95 % bands from 40 draws" in (case / "out" / "late-prediction.html").read_text()
+
+
+def test_tests_are_checked_and_logged_beside_the_case(run, case):
+    for name, holds in (("friday", True), ("monday", False)):
+        options = ("--verdict", "verdict.json", "--draws", 60, "--json", "told.json")
+        done = run("check", "late", f"{name}.csv", *options)
+        assert done.exit_code == 0, done.output
+        assert json.loads((case / "told.json").read_text())["holds"] is holds
+    assert "held on 1 of 2 tests" in done.output
+    with (case / "late" / "tests.csv").open(newline="") as file:
+        assert [row["holds"] for row in csv.DictReader(file)] == ["yes", "no"]
+    assert "The model does not hold" in (case / "out" / "late-check.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("check", "late", "low"), "was fitted, so it is no test"),
+        (("predict", "late", "nothing.csv"), "neither a file nor a record of the case, which are low"),
+        (("check", "late", "friday.csv", "--log", "friday.csv"), "friday.csv is no log of tests"),
+        (("predict", "late", "friday.csv", "--draws", "3"), "need 40 draws or more"),
+    ],
+)
+def test_what_cannot_be_is_said_in_one_line(run, case, arguments, said):
+    done = run(*arguments, "--verdict", "verdict.json")
+    assert done.exit_code == 2
+    assert said in done.stderr and len(done.stderr.strip().splitlines()) == 1
+    assert not (case / "late" / "tests.csv").exists()

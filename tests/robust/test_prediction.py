@@ -1,0 +1,150 @@
+"""Bands of a test to come, against closed forms and hidden plants."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from workbench.draw.plot import plot
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.rig.elements import RandomForce
+from workbench.rig.simulate import simulate
+from workbench.robust.check import check_prediction, log_test, read_log
+from workbench.robust.posterior import UncertainRig
+from workbench.robust.prediction import predict
+
+NOISE, SPREAD = 2e-4, 0.1  # of the sensors, m; of ln gain
+
+
+@pytest.fixture(scope="module")
+def plain(rig):
+    """Two displacement sensors and one actuator, whose gain is known within SPREAD."""
+    sensors = tuple(replace(sensor, noise_std=NOISE) for sensor in rig.sensors[:2])
+    return replace(rig, actuators=rig.actuators[:1], sensors=sensors)
+
+
+def gain_of(value: float) -> Effect:
+    return Effect(kind_named("actuator_gain"), "F1", {"gain": value})
+
+
+def uncertain(rig, gain: float = 1.0, spread: float = SPREAD, **more) -> UncertainRig:
+    effect = gain_of(gain)
+    slope = effect.parameters(rig)[0].slope(gain) / gain
+    return UncertainRig(rig, (effect,), np.array([[(spread / slope) ** 2]]), **more)
+
+
+def measured(rig, gain: float, rng, n: int = 300, level: float = 0.3):
+    record = simulate(gain_of(gain).apply(rig), level * rng.normal(size=(1, n)), sample_time=0.01, name="new")
+    return replace(record, outputs=record.outputs + NOISE * rng.normal(size=record.outputs.shape))
+
+
+def test_the_band_of_a_gain_and_noise_is_that_of_the_closed_form(plain):
+    sent = np.random.default_rng(0).normal(size=(1, 300))
+    told = predict(uncertain(plain, spread=0.02), sent, sample_time=0.01, draws=400, seed=1)
+    response = simulate(plain, sent, sample_time=0.01).outputs
+    deviation = np.sqrt((0.02 * response) ** 2 + NOISE**2)
+    half = 0.5 * (told.upper - told.lower) / (1.96 * deviation)
+    assert half.mean() == pytest.approx(1.0, abs=0.02) and half.std() < 0.1
+    assert np.abs((told.median - response) / deviation).mean() < 0.1
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_bands_hold_what_they_say_on_plants_drawn_from_what_is_possible(plain, share):
+    rng = np.random.default_rng(2)
+    shares = []
+    for k in range(16):
+        new = measured(plain, float(np.exp(SPREAD * rng.normal())), rng)
+        error = share / np.sqrt(2.0) * rng.normal(size=(2, 1))
+        new = replace(new, outputs=(1.0 + error) * new.outputs + 0.0)
+        told = predict(uncertain(plain, unexplained=share), new, draws=60, seed=k)
+        shares.append(check_prediction(told, new).overall)
+    assert 0.90 < np.mean(shares) < 0.99
+
+
+def test_a_model_holds_on_its_own_tests_and_not_on_others(plain):
+    rng = np.random.default_rng(3)
+    checks = []
+    for gain in (1.0, 1.05, 1.5):
+        new = measured(plain, gain, rng)
+        checks.append(check_prediction(predict(uncertain(plain), new, seed=3), new))
+    assert [check.holds for check in checks] == [True, True, False]
+    assert checks[2].overall < checks[2].expected_least
+    assert "does not hold" in checks[2].sentence and "worst is sensor" in checks[2].sentence
+
+
+def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
+    rng = np.random.default_rng(4)
+    new = measured(plain, 1.0, rng, n=2000)
+    truth = simulate(plain, new.inputs, sample_time=0.01).outputs
+    low = np.sqrt(1 - 0.9**2) * lfilter([1.0], [1.0, -0.9], NOISE * rng.normal(size=truth.shape), axis=1)
+    told = predict(uncertain(plain, spread=1e-3), new, draws=60)
+    good, bad = check_prediction(told, new), check_prediction(told, replace(new, outputs=truth + low))
+    assert good.holds and not bad.holds
+    assert abs(bad.overall - 0.95) < 0.02 and bad.band_coverage[:, -1].max() < 0.6
+
+
+def test_clipping_and_rounding_bound_the_bands(plain):
+    sent = np.random.default_rng(5).normal(size=(1, 300))
+    top = float(np.abs(simulate(plain, sent, sample_time=0.01).outputs[0]).max())
+    sensors = (replace(plain.sensors[0], limit=0.5 * top, step=0.05 * top), plain.sensors[1])
+    told = predict(uncertain(replace(plain, sensors=sensors)), sent, sample_time=0.01, draws=60)
+    assert told.upper[0].max() == pytest.approx(0.5 * top)
+    steps = told.median[0] / (0.05 * top)
+    assert np.abs(steps - np.round(2 * steps) / 2).max() < 1e-9
+
+
+def test_a_random_force_widens_the_bands_by_its_response(plain):
+    sent = np.zeros((1, 400))
+    loud = replace(plain, elements=(RandomForce(0.9, 0.5),))
+    quiet, told = (
+        predict(uncertain(rig, spread=1e-3), sent, sample_time=0.01, draws=60) for rig in (plain, loud)
+    )  # fmt: skip
+    assert quiet.upper.std() < NOISE
+    assert (told.upper - told.lower)[:, 200:].mean() > 20 * (quiet.upper - quiet.lower).mean()
+
+
+def test_the_log_grows_test_by_test(plain, tmp_path):
+    new = measured(plain, 1.0, np.random.default_rng(6))
+    check = check_prediction(predict(uncertain(plain), new, draws=60), new)
+    path = log_test(tmp_path / "tests.csv", check)
+    log_test(path, replace(check, name='friday, "late"'))
+    first, second = read_log(path)
+    assert second["record"] == 'friday, "late"' and first["holds"] == "yes"
+    assert float(first["coverage"]) == pytest.approx(check.overall, abs=1e-4)
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(ValueError, match="is no log of tests"):
+        log_test(tmp_path / "other.csv", check)
+
+
+def test_bands_are_drawn_by_sensor_over_time_and_frequency(plain):
+    new = measured(plain, 1.0, np.random.default_rng(7))
+    figure = plot(predict(uncertain(plain), new, draws=60))
+    labels = [ax.get_ylabel() for ax in figure.axes]
+    assert labels[0] == "d1\n[m]" and [ax.get_xlabel() for ax in figure.axes[-2:]] == ["time [s]", "frequency [Hz]"]
+
+
+def test_what_cannot_be_predicted_or_checked_is_named(plain):
+    rng = np.random.default_rng(8)
+    new = measured(plain, 1.0, rng)
+    one = uncertain(plain)
+    with pytest.raises(ValueError, match="need a positive sample_time"):
+        predict(one, new.inputs)
+    with pytest.raises(ValueError, match="one row for each of F1 and 2 samples or more"):
+        predict(one, np.zeros((3, 100)), sample_time=0.01)
+    with pytest.raises(ValueError, match="need 40 draws or more"):
+        predict(one, new, draws=5)
+    with pytest.raises(ValueError, match="too many for 40 draws"):
+        predict(one, np.zeros((1, 1_000_000)), sample_time=0.01)
+    with pytest.raises(ValueError, match="noise_std must be 0 or more for each of the 2 sensors"):
+        predict(one, new, noise_std=[1.0])
+    with pytest.raises(ValueError, match="has no input 'F1'"):
+        predict(one, replace(new, input_channels=(replace(new.input_channels[0], name="F9"),)))
+    told = predict(one, new, draws=60)
+    with pytest.raises(ValueError, match="Predict with this record's own inputs"):
+        check_prediction(told, measured(plain, 1.0, rng, n=200))
+    with pytest.raises(ValueError, match="has no output 'd2'"):
+        check_prediction(told, replace(new, outputs=new.outputs[:1], output_channels=new.output_channels[:1]))
+    unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
+    assert "leaves the gap unexplained: 20 %" in str(unknown)

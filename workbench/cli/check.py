@@ -1,0 +1,81 @@
+"""`workbench check`: whether a new test of a case came out as its model predicts."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig, record_of
+from workbench.cli.predict import Draws, Rate, RecordName, Seed
+from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short, write_json
+
+LOG = "tests.csv"
+
+
+@guarded
+def check(
+    case: CasePath,
+    record: RecordName,
+    verdict: VerdictPath = None,
+    sample_rate_hz: Rate = None,
+    draws: Draws = 200,
+    seed: Seed = 0,
+    workers: Workers = None,
+    log: Annotated[Path | None, typer.Option(help=f"Log of tests; CASE/{LOG} unless given.")] = None,
+    json_path: JsonPath = None,
+    page: PagePath = None,
+) -> None:
+    """Check whether a new record lies inside the bands that the corrected model predicts, and log it.
+
+    Example: workbench check cases/arm friday.csv --verdict verdict.json
+    """
+    import numpy as np
+
+    from workbench.cases.case import read_case
+    from workbench.robust.check import check_prediction, log_test, read_log
+    from workbench.robust.prediction import predict
+    from workbench.study.prediction_page import prediction_page
+    from workbench.study.whole_file import check_target
+
+    check_target(json_path)
+    log = case / LOG if log is None else log
+    read_log(log)  # a file that is no log is refused before the work
+    found = read_case(case)
+    measured = record_of(found, record, sample_rate_hz)
+    fitted = [one.name for one in found.fit if np.array_equal(one.outputs, measured.outputs)]
+    if fitted:
+        raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; check one that was not")
+    with progress_bar() as progress:
+        report = reporter(progress, "reading")
+        possible, noise = possible_rig(
+            found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
+        )
+        told = predict(
+            possible, measured, noise_std=noise, draws=draws, seed=seed,
+            report=lambda what, share: report(what, 0.7 + 0.3 * share),
+        )  # fmt: skip
+    result = check_prediction(told, measured)
+    head, *rest = str(result).splitlines()
+    say(head, bold=True)
+    for line in (*rest, *told.notes):
+        say(line)
+    log_test(log, result)
+    tests = read_log(log)
+    held = sum(test["holds"] == "yes" for test in tests)
+    say(f"  log        {short(log)}: the model held on {held} of {len(tests)} tests")
+    write_json(
+        json_path,
+        {
+            "record": result.name,
+            "holds": result.holds,
+            "sentence": result.sentence,
+            "probability": result.probability,
+            "coverage": dict(zip(result.sensors, result.coverage)),
+            "bands_hz": result.bands_hz,
+            "band_coverage": dict(zip(result.sensors, result.band_coverage)),
+            "expected_least": result.expected_least,
+        },
+    )
+    target = page or Path("out") / f"{found.name}-check.html"
+    shown = prediction_page(told, target, name=found.name, folder=case, check=result, measured=measured)
+    say(f"  page       {short(shown)}")

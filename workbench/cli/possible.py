@@ -1,0 +1,87 @@
+"""What `predict`, `check` and `redesign` start from: the rigs that a diagnosis of the case leaves possible."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+
+if TYPE_CHECKING:
+    from workbench.cases.case import Case
+    from workbench.robust.posterior import UncertainRig
+
+CasePath = Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")]
+VerdictPath = Annotated[
+    Path | None, typer.Option(help="Verdict that `workbench diagnose --json` wrote; diagnosed now unless given.")
+]
+Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")]
+
+
+def possible_rig(
+    case: "Case", verdict: Path | None, *, workers: int | None, report: Callable[[str, float], None]
+) -> "tuple[UncertainRig, tuple[float, ...] | None]":
+    """The uncertain rig of a case, and the noise (n_outputs,) that its diagnosis found; from a verdict where given."""
+    from workbench.gap.diagnose import diagnose
+    from workbench.robust.posterior import UncertainRig
+
+    if verdict is not None:
+        return read_verdict(verdict, case.rig)
+    told = diagnose(
+        case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report
+    )  # fmt: skip
+    return UncertainRig.of(told), told.budget.noise_found or None
+
+
+def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...] | None]":
+    """The uncertain rig of a verdict in JSON, and the noise that was found.
+
+    Raises:
+        ValueError: a file that is no verdict of this case.
+    """
+    from workbench.robust.posterior import UncertainRig
+
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        posterior, noise = told["posterior"], told.get("noise", {}).get("found")
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+        raise ValueError(
+            f"{path} holds no verdict with its uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
+        ) from None
+    try:
+        return UncertainRig.from_json(rig, posterior), tuple(noise) if noise else None
+    except (KeyError, TypeError, IndexError) as error:
+        raise ValueError(f"{path} is no verdict of this case: {error}; diagnose it again") from None
+
+
+def record_of(case: "Case", told: str, sample_rate_hz: float | None) -> Record:
+    """A record of the case by name, or a file with columns named as the case's inputs and outputs."""
+    from workbench.records.files import read_record
+
+    own = {record.name: record for record in (*case.fit, *case.validation)}
+    if told in own:
+        return own[told]
+    if not Path(told).is_file():
+        raise ValueError(f"{told!r} is neither a file nor a record of the case, which are {', '.join(own)}")
+    read = read_record(told, sample_rate_hz=sample_rate_hz)
+    return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
+
+
+def _with_inputs(read: Record, names: tuple[str, ...]) -> Record:
+    """The record with the channels of these names as inputs; where no others are there, as outputs too."""
+    channels = (*read.input_channels, *read.output_channels)
+    rows = (*read.inputs, *read.outputs)
+    into = [i for i, channel in enumerate(channels) if channel.name in names]
+    out = [i for i in range(len(channels)) if i not in into] or into
+    return replace(
+        read,
+        inputs=np.array([rows[i] for i in into]),
+        input_channels=tuple(channels[i] for i in into),
+        outputs=np.array([rows[i] for i in out]),
+        output_channels=tuple(channels[i] for i in out),
+    )

@@ -1,0 +1,67 @@
+"""`workbench predict`: what the next test of a case will show, with bands."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig, record_of
+from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short, write_json
+
+RecordName = Annotated[
+    str, typer.Argument(metavar="RECORD", help="File with a column for each input, or a record of the case by name.")
+]
+Rate = Annotated[float | None, typer.Option(help="Sampling rate, where the file has no time axis.")]
+Draws = Annotated[int, typer.Option(help="Possible rigs from which the bands are read.")]
+Seed = Annotated[int, typer.Option(help="Of the draws and of the noise.")]
+
+
+@guarded
+def predict(
+    case: CasePath,
+    record: RecordName,
+    verdict: VerdictPath = None,
+    sample_rate_hz: Rate = None,
+    draws: Draws = 200,
+    seed: Seed = 0,
+    workers: Workers = None,
+    json_path: JsonPath = None,
+    page: PagePath = None,
+) -> None:
+    """Predict the readings of a test to come, with bands that hold 95 % of them over time and by frequency.
+
+    Example: workbench predict cases/arm planned.csv --verdict verdict.json
+    """
+    from workbench.cases.case import read_case
+    from workbench.robust.prediction import predict as run
+    from workbench.study.prediction_page import prediction_page
+    from workbench.study.whole_file import check_target
+
+    check_target(json_path)
+    found = read_case(case)
+    planned = record_of(found, record, sample_rate_hz)
+    with progress_bar() as progress:
+        report = reporter(progress, "reading")
+        possible, noise = possible_rig(
+            found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
+        )
+        told = run(
+            possible, planned, noise_std=noise, draws=draws, seed=seed,
+            report=lambda what, share: report(what, 0.7 + 0.3 * share),
+        )  # fmt: skip
+    head, *rest = str(told).splitlines()
+    say(head, bold=True)
+    for line in rest:
+        say(line)
+    write_json(
+        json_path,
+        {
+            "record": told.name,
+            "sensors": [channel.name for channel in told.channels],
+            **{name: getattr(told, name) for name in ("time", "lower", "median", "upper", "frequencies_hz")},
+            **{f"spectrum_{name}": getattr(told, f"spectrum_{name}") for name in ("lower", "median", "upper")},
+            "notes": told.notes,
+        },
+    )
+    target = page or Path("out") / f"{found.name}-prediction.html"
+    say(f"  page       {short(prediction_page(told, target, name=found.name, folder=case))}")

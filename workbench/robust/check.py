@@ -1,0 +1,188 @@
+"""Whether a test came out as predicted, and the log of tests that a model has passed."""
+
+import csv
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from workbench.arrays import Floats
+from workbench.records.record import Record
+from workbench.robust.prediction import LEVEL, Prediction
+from workbench.structure.modes import frozen
+from workbench.structure.printed import Printed
+
+UNLIKELY = 0.01  # share of tests of a true model that come out worse, below which the model does not hold
+COLUMNS = ("checked", "record", "readings", "coverage", "expected_least", "worst_sensor", "worst_coverage", "holds")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PredictionCheck(Printed):
+    """How much of a new record lies inside the bands that were predicted.
+
+    Attributes:
+        name: of the record.
+        sensors: (n_outputs,) names.
+        readings: how many were checked.
+        coverage: (n_outputs,) share of readings inside the bands over time.
+        band_coverage: (n_outputs, n_bands) share of Fourier amplitudes inside theirs, by frequency band.
+        bands_hz: (n_bands, 2) Hz.
+        expected: (n_draws, n_outputs, 1 + n_bands) the same shares of readings that the model itself gives.
+    """
+
+    name: str
+    sensors: tuple[str, ...]
+    readings: int
+    coverage: Floats
+    band_coverage: Floats
+    bands_hz: Floats
+    expected: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("coverage", "band_coverage", "bands_hz", "expected"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def overall(self) -> float:
+        """Share of all readings inside the bands over time."""
+        return float(self.coverage.mean())
+
+    @property
+    def expected_least(self) -> float:
+        """Overall share that a test of a true model falls below only once in a hundred."""
+        return float(np.quantile(self.expected[:, :, 0].mean(axis=1), UNLIKELY))
+
+    @property
+    def probability(self) -> float:
+        """Share of tests of a true model whose worst sensor, over time or in a band, comes out no better."""
+        found = np.column_stack([self.coverage, self.band_coverage])
+        over_time = np.mean(self.expected[:, :, 0].min(axis=1) <= found[:, 0].min())
+        if found.shape[1] == 1:
+            return float(over_time)
+        # bands hold few frequencies: the mean over sensors of each tells more than the least of all
+        in_bands = np.mean(self.expected[:, :, 1:].mean(axis=1).min(axis=1) <= found[:, 1:].mean(axis=0).min())
+        return float(min(over_time, in_bands))
+
+    @property
+    def holds(self) -> bool:
+        """Whether the record is one that the model, with its uncertainty, gives."""
+        return self.probability > UNLIKELY
+
+    @property
+    def sentence(self) -> str:
+        """The check in one sentence."""
+        text = (
+            f"{100 * self.overall:.3g} % of the readings of {self.name} lie inside the {100 * LEVEL:g} % bands, at"
+            f" least {100 * self.expected_least:.3g} % expected"
+        )
+        if self.holds:
+            return f"The model holds: {text}."
+        j = int(np.argmin(self.coverage))
+        text += f"; worst is sensor {self.sensors[j]} with {100 * self.coverage[j]:.3g} %"
+        if self.bands_hz.size:
+            low, high = self.bands_hz[int(np.argmin(self.band_coverage.mean(axis=0)))]
+            text += f", and the band from {low:.4g} to {high:.4g} Hz"
+        return f"The model does not hold: {text}."
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        bands = [f"{low:.3g} to {high:.3g} Hz [%]" for low, high in self.bands_hz]
+        rows = [
+            (name, f"{100 * share:.3g}", *(f"{100 * s:.3g}" for s in of_band))
+            for name, share, of_band in zip(self.sensors, self.coverage, self.band_coverage)
+        ]
+        return self.sentence, ("sensor", "over time [%]", *bands), rows, ()
+
+
+def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
+    """How much of a record lies inside the bands that were predicted for its inputs.
+
+    Args:
+        prediction: of this test.
+        record: what was measured, its sensors named as the rig's.
+
+    Raises:
+        ValueError: sensors that are missing, or another length or sampling rate.
+    """
+    there = {channel.name: row for channel, row in zip(record.output_channels, record.outputs)}
+    names = [channel.name for channel in prediction.channels]
+    missing = [name for name in names if name not in there]
+    if missing:
+        raise ValueError(
+            f"record {record.name!r} has no output {missing[0]!r}: it has {', '.join(there)}; the prediction is of"
+            f" {', '.join(names)}"
+        )
+    expected = (prediction.time.size, prediction.sample_time)
+    if record.n_samples != expected[0] or abs(record.sample_time / expected[1] - 1.0) > 1e-6:
+        raise ValueError(
+            f"record {record.name!r} has {record.n_samples} samples of {record.sample_time:g} s; the prediction"
+            f" {expected[0]} of {expected[1]:g} s. Predict with this record's own inputs"
+        )
+    outputs = np.array([there[name] for name in names])
+    shares = prediction.coverage(outputs)
+    return PredictionCheck(
+        record.name,
+        tuple(names),
+        outputs.size,
+        shares[:, 0],
+        shares[:, 1:],
+        prediction.bands_hz,
+        prediction.expected,
+    )
+
+
+def log_test(path: str | Path, check: PredictionCheck) -> Path:
+    """Append a check to a log of tests (CSV), whole or not at all: one write, safe beside other writers.
+
+    Raises:
+        ValueError: a file that is no such log.
+    """
+    path = Path(path)
+    _check_log(path)
+    j = int(np.argmin(check.coverage))
+    row = (
+        datetime.now(UTC).isoformat(timespec="seconds"),
+        check.name,
+        check.readings,
+        f"{check.overall:.4f}",
+        f"{check.expected_least:.4f}",
+        check.sensors[j],
+        f"{check.coverage[j]:.4f}",
+        "yes" if check.holds else "no",
+    )
+    lines = [row] if path.exists() else [COLUMNS, row]
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+    try:
+        os.write(handle, "".join(_line(line) for line in lines).encode())
+    finally:
+        os.close(handle)
+    return path
+
+
+def read_log(path: str | Path) -> list[dict[str, str]]:
+    """The tests of a log, first to last: what each column holds; none where there is no such file.
+
+    Raises:
+        ValueError: a file that is no such log.
+    """
+    path = Path(path)
+    if not path.exists():
+        return []
+    _check_log(path)
+    with path.open(encoding="utf-8", newline="") as file:
+        return [row for row in csv.DictReader(file) if row["checked"] != "checked"]
+
+
+def _check_log(path: Path) -> None:
+    if path.exists():
+        with path.open(encoding="utf-8", errors="replace", newline="") as file:
+            if tuple(next(csv.reader(file), ())) != COLUMNS:
+                raise ValueError(f"{path} is no log of tests: its first line must be {','.join(COLUMNS)}; move it away")
+
+
+def _line(values: Sequence[object]) -> str:
+    """A line of CSV; a quoted text keeps commas, and no text begins a formula."""
+    texts = [" ".join(str(value).split()) for value in values]
+    return ",".join(f'"{t.replace(chr(34), chr(34) * 2)}"' if any(c in t for c in ',"') else t for t in texts) + "\n"

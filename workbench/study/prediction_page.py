@@ -1,0 +1,47 @@
+"""The page of a prediction, and of the test that it was made for."""
+
+from pathlib import Path
+
+from workbench.draw.prediction import MOST_SENSORS, plot_prediction
+from workbench.records.record import Record
+from workbench.robust.check import PredictionCheck
+from workbench.robust.prediction import LEVEL, Prediction
+from workbench.study.page import Story, block, write_page
+from workbench.study.verdict_page import case_inputs
+
+
+def prediction_page(
+    prediction: Prediction,
+    path: Path,
+    *,
+    name: str,
+    folder: Path,
+    check: PredictionCheck | None = None,
+    measured: Record | None = None,
+) -> Path:
+    """Write the page.
+
+    Args:
+        prediction: of the test.
+        path: of the HTML file.
+        name: of the case.
+        folder: that the case was read from.
+        check, measured: the test and how it came out, where it was made.
+    """
+    draws = prediction.expected.shape[0]
+    caption = f"Bands that hold {100 * LEVEL:g} % of the readings of each sensor, from {draws} draws."
+    if len(prediction.channels) > MOST_SENSORS:
+        caption += f" The first {MOST_SENSORS} of {len(prediction.channels)} sensors are drawn."
+    shown = prediction if check is None else check
+    lead, heads, rows, notes = shown._printed()
+    story = Story(
+        title=f"{'Prediction' if check is None else 'Check'} of {prediction.name}, {name}",
+        lead=lead,
+        standing="" if check is None else "good" if check.holds else "bad",
+        lines=list(dict.fromkeys([*notes, *prediction.notes])),
+        blocks=[block(plot_prediction(prediction, measured), caption)],
+        tables=[("By sensor" if check is None else "Readings inside the bands", heads, rows)],
+        inputs=case_inputs(folder),
+        made_by=f"workbench {'predict' if check is None else 'check'} {folder} {prediction.name}",
+    )
+    return write_page(path, story)
