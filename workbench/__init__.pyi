@@ -37,7 +37,6 @@ from .identification.ring_down import ring_down as ring_down
 from .identification.shapes.eigenfunctions import eigenfunctions as eigenfunctions
 from .identification.shapes.surface_spline import surface_bands as surface_bands
 from .identification.shapes.surface_spline import surface_eigenfunctions as surface_eigenfunctions
-from .identification.signal.aliases import aliases as aliases
 from .identification.transfer import identify_transfer as identify_transfer
 from .identification.updating.distributions import mass_and_stiffness as mass_and_stiffness
 from .identification.updating.local_loss import locate_damage as locate_damage
