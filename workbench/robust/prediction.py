@@ -259,9 +259,7 @@ def _with_disturbances(rig: Rig, sent: Floats, rng: np.random.Generator) -> tupl
     return whole, np.vstack([sent, *forces])
 
 
-def _unexplained(
-    truth: Floats, share: float, frequencies: Floats, bands: Floats, rng: np.random.Generator
-) -> Floats:
+def _unexplained(truth: Floats, share: float, frequencies: Floats, bands: Floats, rng: np.random.Generator) -> Floats:
     """Δ y of a relative error Δ with E|Δ|² = share², of its own for each sensor and frequency band."""
     if share == 0:
         return np.zeros_like(truth)
