@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.cell_bounds import CellBounds
-from workbench.design.placement.certificate import certify
+from workbench.design.placement.certificate import _Search, certify
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.peak import largest
 from workbench.design.placement.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
@@ -241,6 +242,24 @@ def test_the_certificate_proves_an_optimum_and_finds_out_a_pretender():
     found_out = certify(two, limits, placement=nodes, gap=0.01)
     assert found_out.better is not None
     assert two.placed(found_out.better, "").residual_work < nodes.residual_work
+
+
+def test_cells_are_dropped_that_have_no_room_for_all(task):
+    """A linear programme has the last word: places in order in their intervals, each the spacing beyond the last."""
+    limits = Limits(effort=0.3, spacing=0.5)
+    optimum = task.placed(np.array([0.8655, 2.883, 6.2842, 9.2303]), "")
+    search, rng = _Search(task, limits, optimum, 0.05), np.random.default_rng(2)
+    cells = np.sort(rng.integers(0, 4, (60, 4)) + rng.integers(0, 13, (60, 1)), axis=1) + 15
+    kept = {tuple(cell) for cell in search._kept(cells)}
+    order = np.eye(3, 4) - np.eye(3, 4, k=1)
+    room = [
+        linprog(
+            np.zeros(4), order, -0.5 * np.ones(3), bounds=np.column_stack([search._tree.low[c], search._tree.high[c]])
+        )
+        for c in cells
+    ]
+    assert [tuple(cell) in kept for cell in cells] == [found.status == 0 for found in room]
+    assert 10 < len(kept) < 50
 
 
 def test_a_search_cut_short_says_its_gap_and_the_cell_that_holds_it(task):

@@ -164,10 +164,13 @@ class _Search:
         return Certificate(self._best, float(bound**2), self.cells, False, None, cell, spent)
 
     def _kept(self, cells: Integers) -> Integers:
-        """Cells in order, no closer than the spacing everywhere, and each interval with a place to stand."""
+        """Cells in order in which all actuators have room, and each interval a place to stand."""
         tree = self._tree
-        apart = tree.high[cells[:, 1:]] - tree.low[cells[:, :-1]] >= tree.apart
-        kept: Integers = cells[apart.all(axis=1) & tree.stands[cells].all(axis=1)]
+        room, first = tree.stands[cells].all(axis=1), np.full(len(cells), -np.inf)
+        for node in cells.T:
+            first = np.maximum(tree.low[node], first + tree.apart)
+            room &= tree.high[node] >= first
+        kept: Integers = cells[room]
         return kept
 
     def _halved(self, rows: np.ndarray) -> np.ndarray:
