@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.signal import butter, csd, sosfilt, welch
 
@@ -11,6 +12,7 @@ from workbench.draw.gap import plot_rivals
 from workbench.draw.style import COLOURS, new_figure
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.nominal import IdentifiedPrior
 from workbench.records.files import read_record
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -28,16 +30,22 @@ ROOT_SPRING = 2.498  # N m/rad between hub and link, from its builders: a start
 NECK = 0.004  # m of soft beam that stands for that spring
 BELIEVED_ABOVE_HZ = 2.0  # below it the free hub drifts with friction and offsets of its drive
 BLOCK = 1.0  # s: longer than the memory of what the model leaves
+BUILDERS = 0.05  # relative standard deviation that is believed of the builders' mass and stiffness
 FIGURES = ("hub inertia", "hub damping", "drive gain", "link damping ratio", "root stiffness")
 
 
-def arm(figures, mass=0.0, at=LENGTH):
-    """The rig from its five unknown figures, with a mass on the link at a distance from the clamp."""
+def arm(figures, mass=0.0, at=LENGTH, *, heavier=1.0, stiffer=1.0):
+    """The rig from its five unknown figures, with a mass on the link at a distance from the clamp.
+
+    The link may be heavier and stiffer than its builders say, by these factors.
+    """
     inertia, damping, gain, ratio, root = figures
     link = Beam(
         length=NECK + LENGTH,
-        mass_per_length=MASS_PER_LENGTH,
-        bending_stiffness=Profile(lambda x: np.where(x < NECK, root * NECK, BENDING_STIFFNESS), breaks=(NECK,)),
+        mass_per_length=heavier * MASS_PER_LENGTH,
+        bending_stiffness=Profile(
+            lambda x: np.where(x < NECK, root * NECK, stiffer * BENDING_STIFFNESS), breaks=(NECK,)
+        ),
         left=End(HELD, 0.0),
         right="free",
         attachments=(
@@ -87,11 +95,17 @@ def resampled(values, statistic):
     return np.quantile(statistic(drawn), (0.025, 0.975))
 
 
-def deviations(found):
-    """Standard deviations of fitted numbers whose residual is not white: scores add up over blocks."""
+def covariance(found):
+    """Covariance of fitted numbers whose residual is not white: scores add up over blocks."""
     scores = blocks(found.jac * found.fun[:, None]).sum(axis=1)
     inverse = np.linalg.inv(found.jac.T @ found.jac)
-    return np.sqrt(np.diag(inverse @ scores.T @ scores @ inverse))
+    return inverse @ scores.T @ scores @ inverse
+
+
+def interval(mass, deviation):
+    """95 % of a mass: all that the records tell of it is relative to the mass of the link."""
+    reach = 1.96 * np.hypot(deviation, BUILDERS * mass)
+    return float(mass - reach), float(mass + reach)
 
 
 def study(outcome, data: Path) -> None:
@@ -99,7 +113,7 @@ def study(outcome, data: Path) -> None:
 
     rig_fit = identified((before,), (3e-3, 5e-3, 0.05, 0.01, ROOT_SPRING))
     figures = np.exp(rig_fit.x)
-    spread = figures * deviations(rig_fit)
+    spread = figures * np.sqrt(np.diag(covariance(rig_fit)))
     outcome.table("rig", {n: [f, s] for n, f, s in zip(FIGURES, figures, spread, strict=True)})
     remainder = float(np.sqrt(np.mean(rig_fit.fun**2)))
     repeatable = float(resampled(rig_fit.fun**2, np.sqrt)[1])
@@ -109,14 +123,20 @@ def study(outcome, data: Path) -> None:
     rig = replace(rig, sensors=(replace(rig.sensors[0], noise_std=repeatable),))
     # what is taken before the model must pass through it unchanged in kind: linear effects only
     linear = tuple(k for k in CATALOGUE if not k.nonlinear and k.path != "environment" and k.name != "truncated_modes")
-    verdict = diagnose(rig, (after,), catalogue=linear, name="after")
+    doubt = block_diag(covariance(rig_fit), BUILDERS**2, BUILDERS**2)
+
+    def off(errors):
+        heavier, stiffer = np.exp(errors[5:])
+        return arm(figures * np.exp(errors[:5]), heavier=heavier, stiffer=stiffer)
+
+    verdict = diagnose(rig, (after,), catalogue=linear, name="after", identified=IdentifiedPrior.of(off, doubt))
     outcome.say(verdict.sentence)
     outcome.table("verdict", verdict.to_json())
 
     best = left(verdict.corrected, after)
     rivals = {}
     for fit in verdict.attribution.singles:
-        if fit.key != verdict.attribution.best.key:
+        if fit.effects[0].kind is not verdict.effects[0].kind:
             more = left(fit.effects[0].apply(rig), after) ** 2 - best**2
             low, _ = resampled(more, lambda mean: mean)
             rivals[fit.labels[0]] = {"more_left": float(more.mean() / np.mean(best**2)), "excluded": bool(low > 0)}
@@ -124,24 +144,34 @@ def study(outcome, data: Path) -> None:
 
     # the mass with the rig's own figures free on both tests at once, so that their doubt is in its interval
     joint = identified((before, after), (*figures, 0.01), at=LENGTH)
-    mass, doubt = float(np.exp(joint.x[5])), float(np.exp(joint.x[5]) * deviations(joint)[5])
     places = np.linspace(0.5 * LENGTH, LENGTH, 11)
-    elsewhere, masses, start = [], [], np.exp(joint.x)
+    elsewhere, masses, intervals, start = [], [], [], np.exp(joint.x)
     for at in places[::-1]:
         found = identified((before, after), start, at=float(at))
         start = np.exp(found.x)
         elsewhere.insert(0, found.fun)
-        masses.insert(0, start[5])
+        masses.insert(0, float(start[5]))
+        intervals.insert(0, interval(start[5], start[5] * np.sqrt(covariance(found)[5, 5])))
     more = [fun**2 - joint.fun**2 for fun in elsewhere]
     possible = [i for i, excess in enumerate(more) if resampled(excess, lambda mean: mean)[0] <= 0]
-    lowest = float(places[min(possible)])
-    outcome.table("mass", {"kg": mass, "std": doubt, "at": LENGTH, "not_excluded_from": lowest})
-    outcome.say(
-        f"mass added: {1e3 * mass:.2f} ± {1e3 * 1.96 * doubt:.2f} g (95 %) at the tip, {LENGTH} m from the clamp"
+    lowest, mass = float(places[min(possible)]), masses[-1]
+    anywhere = (min(intervals[i][0] for i in possible), max(intervals[i][1] for i in possible))
+    outcome.table(
+        "mass",
+        {
+            "kg": mass,
+            "at": LENGTH,
+            "ci95_at_tip": intervals[-1],
+            "not_excluded_from": lowest,
+            "kg_there": masses[min(possible)],
+            "ci95_anywhere": anywhere,
+        },
     )
+    low, high = (1e3 * end for end in intervals[-1])
+    outcome.say(f"mass added: {1e3 * mass:.1f} g ({low:.1f} to {high:.1f} g, 95 %), if at the tip, {LENGTH} m out")
     outcome.say(
-        f"places from {lowest:.3f} m to the tip cannot be excluded; at the nearest it would be"
-        f" {1e3 * masses[min(possible)]:.1f} g"
+        f"places from {lowest:.3f} m to the tip cannot be excluded: there it would be"
+        f" {1e3 * masses[min(possible)]:.1f} g; wherever it is, {1e3 * anywhere[0]:.1f} to {1e3 * anywhere[1]:.1f} g"
     )
 
     gap = {"before": float(np.std(left(rig, after))), "after": float(best.std()), "rig itself": remainder}

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
-from workbench.gap.effects.nominal import NOMINAL_ERRORS
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import placed
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.workers import Workers
@@ -39,6 +39,7 @@ def diagnose(
     settle: float = 0.0,
     free_nominal: bool = False,
     tolerance: float = TOLERANCE,
+    identified: IdentifiedPrior | None = None,
 ) -> Verdict:
     """Where a rig and records of the real structure disagree, which effect is missing, how far the gap then shrinks.
 
@@ -57,6 +58,8 @@ def diagnose(
         free_nominal: fit errors of the nominal model beside every effect from the first.
         tolerance: of the signal's rms: a gap beyond the noise that is smaller in every record is reported, and not
             explained; nor is one below a tenth of the noise.
+        identified: errors that the nominal rig has because it was itself identified: they are fitted beside the effects
+            in the end, so that intervals allow for them. Those of a rig's modes where their covariance is known.
 
     Raises:
         ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
@@ -79,7 +82,12 @@ def diagnose(
         sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
     ):
         attribution = attribute(
-            found, catalogue=catalogue, report=report, free_nominal=free_nominal, tolerance=tolerance
+            found,
+            catalogue=catalogue,
+            report=report,
+            free_nominal=free_nominal,
+            tolerance=tolerance,
+            identified=identified or IdentifiedPrior.of_modes(rig),
         )
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)

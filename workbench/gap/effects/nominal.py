@@ -1,18 +1,20 @@
 """Small errors of the nominal model: uncertain parameters with normal priors, marginalised beside every effect."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter
 from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Structure
-from workbench.structure.modes import Shapes
+from workbench.structure.modes import PointShapes, Shapes
 from workbench.structure.profile import Profile
 
 FEW = 9  # cosines that may be as large as one another; of more, those beyond SMOOTH half waves fall off by the square,
@@ -20,6 +22,7 @@ SMOOTH = 3  # as those of any function do that has a slope at its ends
 PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
 MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
 JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a jump
+SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
 WIDEST = 8.0  # prior deviations: bounds, far outside of what a nominal model can be off by
 
 
@@ -69,7 +72,48 @@ def weight_of(parameter: str, prior: NominalPrior) -> float:
     return min(1.0, (SMOOTH / max(int(parameter.split("_")[1]), 1)) ** 2)
 
 
-def _parameters(rig: Rig, prior: NominalPrior) -> tuple[Parameter, ...]:
+@dataclass(frozen=True, eq=False)
+class IdentifiedPrior:
+    """Errors of a nominal rig that was itself identified: e = R z, z normal of unit covariance, R Rᵀ that of e.
+
+    Attributes:
+        make: errors (n_figures,) of what was identified -> the rig that has them.
+        root: (n_figures, n_free) R.
+    """
+
+    make: Callable[[Floats], Rig]
+    root: Floats
+
+    @classmethod
+    def of(cls, make: Callable[[Floats], Rig], covariance: Floats) -> "IdentifiedPrior":
+        """Of figures with that covariance (n_figures, n_figures); directions that are sure all but left out."""
+        scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+        sizes, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
+        kept = sizes > SURE * sizes.max()
+        return cls(make, scale[:, None] * directions[:, kept] * np.sqrt(sizes[kept]))
+
+    @classmethod
+    def of_modes(cls, rig: Rig) -> "IdentifiedPrior | None":
+        """Of frequencies, damping and shapes of identified modes; None where their covariance is not known."""
+        modes, n = rig.modes, rig.modes.n_modes
+        if modes.covariance is None or not isinstance(modes.domain, NamedPoints):
+            return None
+        shapes = modes.phi(modes.domain.names)
+        blocks = [modes.covariance, *([] if modes.shape_covariance is None else modes.shape_covariance)]
+
+        def make(errors: Floats) -> Rig:
+            zeta = np.maximum(modes.zeta + errors[n : 2 * n], 0.0)
+            off = errors[2 * n :].reshape(n, -1).T if errors.size > 2 * n else 0.0
+            omega = np.maximum(modes.omega + errors[:n], 0.0)
+            return replace(rig, modes=replace(modes, omega=omega, damping=zeta, shapes=PointShapes(shapes + off)))
+
+        return cls.of(make, block_diag(*blocks))
+
+
+def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parameter, ...]:
+    if isinstance(prior, IdentifiedPrior):
+        free = range(1, prior.root.shape[1] + 1)
+        return tuple(Parameter(f"identified_{k}", "", -WIDEST, WIDEST, prior_std=1.0) for k in free)
     return tuple(_each(rig, prior))
 
 
@@ -159,8 +203,11 @@ def _scaled(shapes: Shapes, factor: float) -> Shapes:
 _solved = solved_once(_off_structure)
 
 
-def _off(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> Rig:
+def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
     """The rig with the errors in its structure, modes and sensors."""
+    if isinstance(prior, IdentifiedPrior):
+        made = prior.make(prior.root @ np.array(list(values.values())))
+        return replace(rig, modes=made.modes, structure=made.structure, actuators=made.actuators)
     rig = _solved(rig, prior, values)
     late = {f"delay_{s.name}": s for s in rig.sensors if values.get(f"delay_{s.name}")}
     if not late:
@@ -174,7 +221,7 @@ def _padded(values: Floats, size: int) -> Floats:
     return np.concatenate([values, np.zeros(max(size - values.size, 0))])[:size]
 
 
-def nominal_errors(rig: Rig, prior: NominalPrior, start: Mapping[str, float] | None = None) -> Effect:
+def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mapping[str, float] | None = None) -> Effect:
     """Errors of the nominal model, to be fitted beside effects.
 
     Args:

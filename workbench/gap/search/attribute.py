@@ -8,6 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
@@ -31,6 +32,7 @@ from workbench.rig.rig import Rig
 from workbench.threads import one_blas_thread
 
 FINALISTS = 8  # single effects that are fitted to whole records
+TOGETHER = 8  # iterations of effects and errors of an identified rig
 BRIEFLY = 2  # iterations, where there may be no effect at all
 SHOWN = 7  # others that are, where they are to be shown beside them
 A_TENTH = 1.1**2 - 1.0  # of the noise by amplitude, as a share of its power
@@ -149,6 +151,7 @@ def attribute(
     report: Callable[[str, float], None] = lambda text, share: None,
     free_nominal: bool = False,
     tolerance: float = 0.0,
+    identified: IdentifiedPrior | None = None,
 ) -> Attribution:
     """Find the effects that turn the residual of a rig on its fit records into noise.
 
@@ -163,6 +166,7 @@ def attribute(
         free_nominal: fit errors of the nominal model beside every effect from the first, for a model that is known to
             be a little off; otherwise where no single effect explains the records without.
         tolerance: of the signal's rms: a smaller gap beyond the noise is not searched for causes.
+        identified: errors of a nominal rig that was itself identified.
     """
     seen, evidence = found.seen, found.evidence
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
@@ -192,8 +196,11 @@ def attribute(
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
+    beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
+    if beside is not None:
+        best = _beside_identified(search, best, beside, seen)
     if random is None:
-        best = with_intervals(search.rig, best, search.data, workers)
+        best = with_intervals(search.rig, best, search.data, workers, wide=beside is not None)
         if outcome == "explained":
             standing = tuple(e for e in best.effects if e in seen or e.stands_out(search.rig))
             best = best.only(search.rig, standing)
@@ -214,6 +221,16 @@ def attribute(
         noise=noise,
         logged=_logged(search, best, noise) if random is None else 0.0,
     )
+
+
+def _beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:
+    """The set fitted anew beside errors of the identified rig; what was read off the records stays."""
+    others = [effect for effect in best.effects if effect not in seen]
+    if not others:
+        return best
+    both = (*others, nominal_errors(search.rig, identified))
+    found = fit(search.rig, both, search.data, iterations=TOGETHER, workers=search.workers)
+    return replace(found, effects=(*seen, *found.effects))
 
 
 def _is_small(nominal: Evidence, tolerance: float) -> bool:

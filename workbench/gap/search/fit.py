@@ -16,6 +16,7 @@ from workbench.rig.simulate import is_stepped
 HOPELESS = 1e300
 BENT, MOST_BENT = 0.1, 0.75
 SLOPE_SUBSTEPS = 2
+WIDER, WIDER_PLACE = 30.0, 1000.0  # times the steps of a fit: of numbers a hundredth, of a place a thousandth of it
 PROMISED = 0.1  # of the tolerance: a step that promises less is not worth trying
 
 
@@ -166,18 +167,32 @@ def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parame
 
 
 def slopes(
-    rig: Rig, effects: Sequence[Effect], data: FitData, held: Sequence[Effect] = (), workers: Workers = ALONE
+    rig: Rig,
+    effects: Sequence[Effect],
+    data: FitData,
+    held: Sequence[Effect] = (),
+    workers: Workers = ALONE,
+    *,
+    wide: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The residual (n_values,), and its derivative by each parameter of effects, in its free coordinate.
+
+    Args:
+        wide: by longer steps, both ways, over which errors of modes that are solved anew do not show.
 
     Raises:
         ValueError: the rig cannot be simulated with these effects.
     """
     problem = _Problem(rig, effects, data, held, workers)
+    if wide:
+        problem.steps *= [WIDER_PLACE if p.name in COORDINATES else WIDER for _, p in problem.parameters]
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
     jacobian = problem.jacobian(problem.start, *problem.near(problem.start, residual))
+    if wide:
+        problem.steps = -problem.steps
+        jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *problem.near(problem.start, residual)))
     return residual[: data.n_values], jacobian[: data.n_values]
 
 

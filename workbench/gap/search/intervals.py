@@ -14,7 +14,7 @@ ALIKE = 1e-4  # of a number, or of the extent: how far two numerical routes to t
 BLOCKS = 12  # a record: long beside the correlation of what is left, many enough to scatter
 
 
-def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE) -> Fit:
+def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE, *, wide: bool = False) -> Fit:
     """The fit with standard deviations by which 95 % intervals hold although what is left is not white.
 
     With J the sensitivities, r what is left, in units of the noise, and P the precision of the priors,
@@ -30,8 +30,9 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
         found: effects, and errors of the nominal model where they were fitted too.
         data: fit records.
         workers: processes that share the work.
+        wide: as of `slopes`.
     """
-    residual, jacobian = slopes(rig, found.effects, data, workers=workers)
+    residual, jacobian = slopes(rig, found.effects, data, workers=workers, wide=wide)
     if jacobian.shape[1] == 0:
         return found
     parameters = parameters_of(rig, found.effects)
