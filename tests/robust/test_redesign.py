@@ -119,3 +119,11 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         redesign(possible(replace(rig, actuators=rig.actuators[:1])), controller, sample_time=DT)
     with pytest.raises(ValueError, match="2 samples or more"):
         LoopTest(1, DT)
+
+
+def test_a_sensor_that_drifts_is_left_out(rig, controller):
+    drifting = possible(rig, effect("sensor_drift", "d2", drift_over_record=2.0))
+    found = redesign(drifting, controller, sample_time=DT, impulse_at=0.8, draws=2, placement=False)
+    assert found.steps[-1].name == "without d2" and found.steps[-1].kept
+    assert "d2" not in found.redesigned.sensors
+    assert found.steps[-1].loss < 0.01 * found.steps[0].loss

@@ -44,8 +44,8 @@ def redesign(
     Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05
     """
     from workbench.cases.case import read_case
+    from workbench.robust.on_rig import impulse_test
     from workbench.robust.plain_law import plain_law
-    from workbench.robust.redesign import impulse_test
     from workbench.robust.redesign import redesign as run
     from workbench.study.redesign_page import redesign_page
     from workbench.study.whole_file import check_target

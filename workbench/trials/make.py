@@ -75,6 +75,19 @@ def make_trial(
     Raises:
         ValueError: an unknown kind or class, or kinds that the bench cannot show.
     """
+    return make_trial_with_plant(seed, kinds=kinds, like=like, name=name, dirt=dirt, size=size)[:2]
+
+
+def make_trial_with_plant(
+    seed: int,
+    *,
+    kinds: Sequence[str] = (),
+    like: Case | None = None,
+    name: str = "case",
+    dirt: str = CLEAN,
+    size: float = 1.0,
+) -> tuple[Case, dict[str, Any], SolvedPlant]:
+    """The same as `make_trial`, and the real structure, so that a controller can be tried on it."""
     if dirt not in DIRT_CLASSES:
         raise ValueError(f"dirt {dirt!r} is none of {', '.join(DIRT_CLASSES)}")
     unknown = [kind for kind in kinds if kind not in DRAWS]
@@ -88,8 +101,8 @@ def make_trial(
             tests = experiments(bench, rng)
             bench, effects = _draw_effects(bench, tests["mid"], kinds, rng)
             errors = draw_dirt(dirt, size, bench, rng) if dirt not in (CLEAN, TRIPLE) else Dirt()
-            case, label = _case(bench, tests, effects, errors, rng, name)
-            return case, {**label, "class": dirt, "size": size}
+            case, label, real = _case(bench, tests, effects, errors, rng, name)
+            return case, {**label, "class": dirt, "size": size}, real
         except Unsuitable as error:
             reason = str(error)
     raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
@@ -140,7 +153,7 @@ def _case(
     dirt: Dirt,
     rng: np.random.Generator,
     name: str,
-) -> tuple[Case, dict[str, Any]]:
+) -> tuple[Case, dict[str, Any], SolvedPlant]:
     dirty = dirt.on(Plant.of(bench.rig), bench.sample_time)
     nominal = Plant.of(bench.rig).solved()
     real = hide(dirty, effects).solved()
@@ -177,7 +190,7 @@ def _case(
         "budget": _budget(figures["validate"]),
         "records": figures,
     }
-    return Case(name, bench.rig, tuple(fit), tuple(validation)), label
+    return Case(name, bench.rig, tuple(fit), tuple(validation)), label, real
 
 
 def _check_strong(

@@ -103,6 +103,103 @@ def _rates(t: float, y: Floats, dy: Floats, system: System, drive: tuple[Floats,
 
 
 @njit(cache=True)
+def aim(commands: Floats, drive: tuple[Floats, Floats], earlier: Floats, z: Floats, aims: Floats) -> None:
+    """Fill what the actuators head for (m,) by the commands at a sample (m,); earlier and z are of their hysteresis."""
+    mix, table = drive
+    m = commands.size
+    for j in range(m):
+        u = 0.0
+        for i in range(m):
+            u += mix[j, i] * commands[i]
+        u += table[j, 4] * u * abs(u)
+        if table[j, 5] > 0.0:
+            z[j] = hysteretic(z[j], u - earlier[j], table[j, 6])
+            earlier[j] = u
+            u = (1.0 - table[j, 5]) * u + table[j, 5] * z[j]
+        u *= table[j, 0]
+        u = np.sign(u) * max(abs(u) - table[j, 1], 0.0)
+        aims[j] = min(max(u, -table[j, 2]), table[j, 2])
+
+
+@njit(cache=True)
+def interval(
+    k: int,
+    y: Floats,
+    system: System,
+    delays: Floats,
+    aims: Floats,
+    headed_for: tuple[Floats, Floats, Floats],
+    held: Floats,
+    dt: float,
+    edges: Floats,
+    steps: Floats,
+    work: Floats,
+    out: Floats,
+    forces: tuple[Floats, Floats, Floats, Floats],
+) -> None:
+    """Step y over a sample interval, and fill the motion where each of its pieces begins.
+
+    Args:
+        k: the sample.
+        y: (size,) state, in place.
+        system: see `integrate`.
+        delays: (m,) s.
+        aims: (m, n_samples) what the actuators head for, by sample.
+        headed_for: targets (m,), forces before them (m,), and the time of the last change (1,), in place.
+        held: (n,) unmeasured modal forces.
+        dt: s.
+        edges, steps: see `integrate`.
+        work: (5, size) to work in.
+        out: (3, n_edges, n) displacement, velocity and acceleration where each piece begins.
+        forces: sums over the steps of the actuators' forces (m,), their squares (m,), their work by mode (n,), and the
+            largest (m,), in place; empty arrays where they are not wanted.
+    """
+    targets, before, begun = headed_for
+    trial, k1, k2, k3, k4 = work[0], work[1], work[2], work[3], work[4]
+    n, size, m = held.size, y.size, targets.size
+    lags, shapes, rates, biases = system[1]
+    start = 0.0
+    for piece in range(edges.size):
+        middle = k + 0.5 * (start + edges[piece])
+        now = (k + start) * dt
+        for j in range(m):
+            before[j] = headed(targets[j], before[j], rates[j], now - begun[0])
+            index = int(np.floor(middle - delays[j] / dt))
+            targets[j] = aims[j, index] if index >= 0 else 0.0
+        begun[0] = now
+        h = (edges[piece] - start) * dt / steps[piece]
+        for step in range(steps[piece]):
+            t = (k + start) * dt + step * h
+            _rates(t, y, k1, system, (targets, before, begun[0]), held)
+            if step == 0:
+                out[0, piece], out[1, piece], out[2, piece] = y[:n], y[n : 2 * n], k1[n : 2 * n]
+            for i in range(size):
+                trial[i] = y[i] + 0.5 * h * k1[i]
+            _rates(t + 0.5 * h, trial, k2, system, (targets, before, begun[0]), held)
+            for i in range(size):
+                trial[i] = y[i] + 0.5 * h * k2[i]
+            _rates(t + 0.5 * h, trial, k3, system, (targets, before, begun[0]), held)
+            for i in range(size):
+                trial[i] = y[i] + h * k3[i]
+            _rates(t + h, trial, k4, system, (targets, before, begun[0]), held)
+            if forces[0].size > 0:
+                for j in range(m):
+                    # by the midpoint rule
+                    force = headed(targets[j], before[j], rates[j], t + 0.5 * h - begun[0])
+                    if lags[j] > 0.0:
+                        force = y[2 * n + j] + 0.5 * h * k2[2 * n + j]
+                    force += biases[j]
+                    forces[0][j] += h * force
+                    forces[1][j] += h * force * force
+                    forces[3][j] = max(forces[3][j], abs(force))
+                    for i in range(n):
+                        forces[2][i] += force * shapes[j, i] * h * (y[n + i] + 0.5 * h * k2[n + i])
+            for i in range(size):
+                y[i] += h * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]) / 6.0
+        start = edges[piece]
+
+
+@njit(cache=True)
 def integrate(
     system: System,
     drive: tuple[Floats, Floats],
@@ -133,59 +230,20 @@ def integrate(
         (3, n_edges, n_samples, n) displacement, velocity and acceleration where each piece of a sample interval begins,
         the first of them at the sample itself.
     """
-    mix, table = drive
     dt = sample_time
     m, n_samples = commands.shape
     n = held.shape[1]
     size = 2 * n + m + system[3][0].shape[0]
-    y, trial = np.zeros(size), np.zeros(size)
-    k1, k2, k3, k4 = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    y, work = np.zeros(size), np.zeros((5, size))
     out = np.zeros((3, edges.size, n_samples, n))
     aims = np.zeros((m, n_samples))
-    targets, before, begun = np.zeros(m), np.zeros(m), 0.0
-    earlier, z = np.zeros(m), np.zeros(m)
-    rates = system[1][2]
+    now, earlier, z = np.zeros(m), np.zeros(m), np.zeros(m)
+    headed_for, none = (np.zeros(m), np.zeros(m), np.zeros(1)), (np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0))
     for k in range(n_samples):
         for j in range(m):
             for i in range(n):
                 commands[j, k] -= feedback[j, i] * y[n + i]
-        for j in range(m):
-            u = 0.0
-            for i in range(m):
-                u += mix[j, i] * commands[i, k]
-            u += table[j, 4] * u * abs(u)
-            if table[j, 5] > 0.0:
-                z[j] = hysteretic(z[j], u - earlier[j], table[j, 6])
-                earlier[j] = u
-                u = (1.0 - table[j, 5]) * u + table[j, 5] * z[j]
-            u *= table[j, 0]
-            u = np.sign(u) * max(abs(u) - table[j, 1], 0.0)
-            aims[j, k] = min(max(u, -table[j, 2]), table[j, 2])
-        start = 0.0
-        for piece in range(edges.size):
-            middle = k + 0.5 * (start + edges[piece])
-            now = (k + start) * dt
-            for j in range(m):
-                before[j] = headed(targets[j], before[j], rates[j], now - begun)
-                index = int(np.floor(middle - table[j, 3] / dt))
-                targets[j] = aims[j, index] if index >= 0 else 0.0
-            begun = now
-            h = (edges[piece] - start) * dt / steps[piece]
-            for step in range(steps[piece]):
-                t = (k + start) * dt + step * h
-                _rates(t, y, k1, system, (targets, before, begun), held[k])
-                if step == 0:
-                    out[0, piece, k], out[1, piece, k], out[2, piece, k] = y[:n], y[n : 2 * n], k1[n : 2 * n]
-                for i in range(size):
-                    trial[i] = y[i] + 0.5 * h * k1[i]
-                _rates(t + 0.5 * h, trial, k2, system, (targets, before, begun), held[k])
-                for i in range(size):
-                    trial[i] = y[i] + 0.5 * h * k2[i]
-                _rates(t + 0.5 * h, trial, k3, system, (targets, before, begun), held[k])
-                for i in range(size):
-                    trial[i] = y[i] + h * k3[i]
-                _rates(t + h, trial, k4, system, (targets, before, begun), held[k])
-                for i in range(size):
-                    y[i] += h * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]) / 6.0
-            start = edges[piece]
+        aim(commands[:, k], drive, earlier, z, now)
+        aims[:, k] = now
+        interval(k, y, system, drive[1][:, 3], aims, headed_for, held[k], dt, edges, steps, work, out[:, :, k], none)
     return out

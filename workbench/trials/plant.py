@@ -136,8 +136,35 @@ class SolvedPlant:
             rng: of the random forces; None leaves them out.
             finest: radians of the highest mode in one step.
         """
+        plant = self.plant
+        system, drive, edges, steps = self.system(sample_time, finest)
+        held = self.random_forces(commands.shape[1], sample_time, rng)
+        acting = np.array([not a.direct for a in plant.actuators], float)
+        sent = np.ascontiguousarray(commands, float).copy()
+        pieces = motion.integrate(
+            system,
+            drive,
+            sent,
+            feedback * acting[:, None] * self.at_actuators,
+            held,
+            float(sample_time),
+            edges,
+            steps,
+        )
+        return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
+
+    def random_forces(self, n_samples: int, sample_time: float, rng: np.random.Generator | None) -> np.ndarray:
+        """Unmeasured random modal forces (n_samples, n_modes), held over each sample; none without `rng`."""
+        held = np.zeros((n_samples, self.plant.n_modes))
+        if rng is not None:
+            for (_, rms, corner), shape in zip(self.plant.noises, self.at_noises, strict=True):
+                held += np.outer(rms * coloured_noise(rng, n_samples, sample_time, corner), shape)
+        return held
+
+    def system(self, sample_time: float, finest: float = FINEST) -> tuple[Any, Any, np.ndarray, np.ndarray]:
+        """The plant as `motion.integrate` takes it: system, drive, edges and steps of the pieces of an interval."""
         plant, modes = self.plant, self.modes
-        n, zeta = plant.n_modes, _damping_ratios(plant)
+        zeta = _damping_ratios(plant)
         m = len(plant.actuators)
         drives = np.array([[a.gain, a.dead_zone, a.limit, a.delay] for a in plant.actuators])
         hysteresis = np.array([[a.hysteresis_share, a.hysteresis_width] for a in plant.actuators])
@@ -150,12 +177,6 @@ class SolvedPlant:
         steps = np.ceil(turns * np.diff(np.r_[0.0, edges])).astype(np.int64)
         laws = np.array([[code, *p, *[1.0] * (3 - len(p))] for code, _, p in plant.laws]).reshape(-1, 4)
         tones = np.array([[a, 2.0 * np.pi * f, p] for _, a, f, p in plant.tones]).reshape(-1, 3)
-        held = np.zeros((commands.shape[1], n))
-        if rng is not None:
-            for (_, rms, corner), shape in zip(plant.noises, self.at_noises, strict=True):
-                held += np.outer(rms * coloured_noise(rng, commands.shape[1], sample_time, corner), shape)
-        acting = np.array([not a.direct for a in plant.actuators], float)
-        sent = np.ascontiguousarray(commands, float).copy()
         damping = 2.0 * zeta * modes.omega
         system = (
             (modes.omega**2, damping, modes.gram, float(plant.stretching), float(plant.stiffness_rate)),
@@ -169,17 +190,7 @@ class SolvedPlant:
             (laws, np.ascontiguousarray(self.at_laws)),
             (float(plant.drag), np.ascontiguousarray(self.field)),
         )
-        pieces = motion.integrate(
-            system,
-            (mix, np.c_[drives, curvature, hysteresis]),
-            sent,
-            feedback * acting[:, None] * self.at_actuators,
-            held,
-            float(sample_time),
-            edges,
-            steps,
-        )
-        return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
+        return system, (mix, np.ascontiguousarray(np.c_[drives, curvature, hysteresis])), edges, steps
 
     def truth(self, moved: ModalMotion, sample_time: float) -> np.ndarray:
         """What perfect sensors would read, each after its delay, (n_outputs, n_samples)."""
@@ -211,7 +222,7 @@ class SolvedPlant:
             row = _lag(row, sensor.time_constant, sample_time)
             row = sensor.gain * row + sensor.bias + sensor.drift * np.arange(row.size) / (row.size - 1)
             if rng is not None:
-                row = row + sensor.noise_std * _noise(rng, row.size, self.plant.noise_memory)
+                row = row + sensor.noise_std * sensor_noise(rng, row.size, self.plant.noise_memory)
             row = np.clip(row, -sensor.limit, sensor.limit)
             if sensor.step > 0:
                 mean = rng is None and sensor.noise_std > 0
@@ -239,7 +250,7 @@ def _damping_ratios(plant: Plant) -> Floats:
     return plant.damping_factor * factors * padded
 
 
-def _noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.ndarray:
+def sensor_noise(rng: np.random.Generator, n_samples: int, memory: float) -> np.ndarray:
     """Gaussian noise of unit standard deviation, e_k = memory e_{k-1} + sqrt(1 - memory²) white."""
     white = rng.standard_normal(n_samples)
     if memory == 0:

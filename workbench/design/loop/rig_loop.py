@@ -82,7 +82,7 @@ class LoopRun:
 
     @property
     def work(self) -> np.ndarray:
-        """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), exact for forces that are held over each sample."""
+        """W_r = ∫ b_rᵀ F q_r' dt (n_modes,), by the mean force over each sample: exact where it is held over it."""
         n = self.response.modes.n_modes
         modal = self.into @ self.response.forces[:, :-1]
         return np.asarray((modal * np.diff(self.response.modal[:n], axis=1)).sum(axis=1))

@@ -1,0 +1,254 @@
+"""A design on a rig: its law and estimator by the rig's own actuators and sensors, and designed anew for another."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from workbench.design.estimation.controller import Controller
+from workbench.design.estimation.digital import sampled
+from workbench.design.estimation.observers import kalman
+from workbench.design.laws.coupled import controlled_plant
+from workbench.design.laws.imsc import imsc
+from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.on_off import OnOffLaw
+from workbench.design.loop.rig_loop import LoopTest, named
+from workbench.design.placement.task import PlacementTask
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.rig.statespace import output_matrix
+from workbench.robust.compensation import Loop, without
+from workbench.robust.small_motion import loop_poles
+from workbench.structure.domain import Where
+from workbench.structure.modes import Modes, mac
+
+Design = Law | OnOffLaw | Controller | PlacementTask
+
+PERIODS = 25  # of the lowest controlled mode: the length of a test
+MOST_SAMPLES = 6000
+SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over what is stated
+ENOUGH, BETTER = 0.8, 1.02  # of the damping designed for; a faster filter must give so much more
+
+
+def law_of(design: Law | OnOffLaw | Controller) -> Law | OnOffLaw:
+    """The law of a design, on-off control among them."""
+    return design.law if isinstance(design, Controller) else design
+
+
+def controlled_by(design: Design) -> tuple[int, ...]:
+    """The controlled modes of a design, zero-based."""
+    return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else law_of(design).controlled
+
+
+def impulse_test(
+    rig: Rig,
+    controlled: Sequence[int],
+    sample_time: float,
+    impulse_at: Where | None = None,
+    *,
+    level: np.ndarray | None = None,
+    seed: int | None = 0,
+) -> LoopTest:
+    """An impulse, and the free motion after it for 25 periods of the lowest controlled mode.
+
+    Args:
+        rig: nominal.
+        controlled: zero-based modes.
+        sample_time: s.
+        impulse_at: the place; that of a hammer, or of the first actuator, unless given.
+        level: (n_outputs,) readings that the nominal rig without control then peaks at, in the median of the sensors;
+            None for a unit impulse.
+        seed: of the noise.
+    """
+    if impulse_at is None:
+        struck = next((a for a in rig.actuators if a.direct), rig.actuators[0])
+        impulse_at = struck.at
+    omega = rig.modes.omega[list(controlled)]
+    omega = omega[omega > 0]
+    if not omega.size:
+        raise DesignError("the controlled modes are all rigid, so they have no period: give a test of your own")
+    n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
+    test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
+    if level is None:
+        return test
+    shape = rig.modes.phi_at(impulse_at)
+    damped = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time)
+    omega = np.maximum(rig.modes.omega, 1e-9)[:, None]
+    motion = (
+        damped * np.sin(omega * test.time) * (shape[:, None] / omega),
+        damped * np.cos(omega * test.time) * shape[:, None],
+    )
+    peaks = []
+    for sensor, reached in zip(rig.sensors, level, strict=True):
+        derivative, order = MEASURED[sensor.quantity]
+        if order < 2:
+            row = rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
+            peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
+    return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
+
+
+def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
+    """A design on the sensors and actuators of a rig, by their names; a law alone reads a Kalman filter.
+
+    Raises:
+        DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
+    """
+    if isinstance(design, PlacementTask):
+        actuators = [a for a in rig.actuators if not a.direct]
+        design = imsc(rig.modes, design.n_controlled, actuators, weight=design.weight)
+    law = law_of(design)
+    if law.designed_by is None:
+        raise DesignError(
+            f"{law.name} was given by its gain, which no other structure can be designed from: make it by imsc,"
+            " imsc_poles, coupled_lqr, coupled_poles or on_off"
+        )
+    law = replace(law, actuators=tuple(_same_actuator(rig, a) for a in law.actuators))
+    linear = law if isinstance(law, Law) else _without_gain(law)
+    if isinstance(design, Controller):
+        if design.designed_by is None:
+            raise DesignError(
+                f"{design.name} does not tell how its estimator was designed: make it by luenberger, kalman or"
+                " filtered(law, hermite_filter(...))"
+            )
+        return Loop(rig.modes, law, replace(design, law=linear, sensors=_same_sensors(rig, design.sensors)))
+    return Loop(rig.modes, law, default_estimator(rig, linear, test))
+
+
+def _without_gain(law: OnOffLaw) -> Law:
+    return Law(np.zeros((len(law.actuators), 2 * len(law.controlled))), law.controlled, law.actuators, law.name)
+
+
+def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
+    """A Kalman filter on all sensors of motion and rate, as fast as the loop of all modes bears.
+
+    The intensity of the readings' noise is σ² T, and the modal forces are those that excite each mode within the test
+    to the speed that the impulse gives it, by a factor that leaves the loop of the nominal rig with the most damping of
+    its controlled modes, residual ones stable.
+    """
+    sensors = without([s for s in rig.sensors if MEASURED[s.quantity][1] < 2])
+    if not sensors:
+        raise DesignError("no sensor of the rig reads motion or rate, so no law can know the state; add one")
+    index = list(law.controlled)
+    at = rig.actuators[0].at if test.impulse_at is None else test.impulse_at
+    speed = np.abs(test.impulse * rig.modes.phi_at(at)[index])
+    speed = np.maximum(speed, 0.1 * speed.max())
+    push = speed**2 / (test.n_samples * test.sample_time)
+    shapes = np.abs(output_matrix(rig.modes, sensors)[:, index])
+    rates = np.array([MEASURED[s.quantity][1] for s in sensors])[:, None]
+    signal = (shapes * speed / np.maximum(rig.modes.omega[index], 1e-9) ** (1 - rates)).max(axis=1)
+    noise = np.maximum([s.noise_std for s in sensors], 1e-6 * signal) ** 2 * test.sample_time
+    damping = _design_damping(rig.modes, law)
+    best, least = None, -np.inf
+    for factor in SPEEDS:
+        try:
+            controller = kalman(rig.modes, law, sensors, disturbance=push, noise=factor * noise)
+        except DesignError:
+            continue
+        found = loop_poles(rig, sampled(controller, test.sample_time))
+        # fast enough for the damping that the law was designed for is enough; the slower one is the more robust
+        reached = float(np.minimum(found.damping[index] / damping, ENOUGH).mean())
+        if found.spectral_radius < 1.0 and reached > least * BETTER:
+            best, least = controller, reached
+    if best is None:
+        raise DesignError(
+            f"no Kalman filter on {', '.join(s.name for s in sensors)} leaves the loop of all modes stable; hand a"
+            " controller, weigh the forces more, or control fewer modes"
+        )
+    return best
+
+
+def _design_damping(modes: Modes, law: Law) -> np.ndarray:
+    """Damping ratios (n_controlled,) with exact modal coordinates fed back; those without control for a law of none."""
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    poles = np.linalg.eigvals(a - b @ law.gain)
+    poles = poles[poles.imag >= 0]
+    ratios = -poles.real / np.maximum(np.abs(poles), 1e-300)
+    order = np.argsort(np.abs(poles))[: law.n_controlled]
+    return np.maximum(np.resize(ratios[order], law.n_controlled), 1e-6)
+
+
+def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
+    for a in rig.actuators:
+        if a.name == wanted.name or (a.at == wanted.at and a.kind == wanted.kind and not a.direct):
+            return replace(a)
+    names = ", ".join(f"{a.name} at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    raise DesignError(
+        f"the law drives {wanted.name} at {rig.modes.domain.text(wanted.at)}, where the rig has no actuator: it has"
+        f" {names}; design the law for these"
+    )
+
+
+def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
+    found = []
+    for one in wanted:
+        alike = [
+            s
+            for s in rig.sensors
+            if s.quantity == one.quantity and (s.name == one.name or rig.modes.domain.separation(s.at, one.at) < 1e-9)
+        ]
+        if not alike:
+            names = ", ".join(f"{s.name} ({s.quantity})" for s in rig.sensors)
+            raise DesignError(
+                f"the controller reads {one.quantity} at {rig.modes.domain.text(one.at)}, where the rig has no such"
+                f" sensor: it has {names}; design the estimator for these"
+            )
+        found.append(alike[0])
+    return tuple(found)
+
+
+def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
+    """The same law and estimator, designed with their settings for the modes of another rig.
+
+    Args:
+        loop: as it is.
+        rig: whose actuators and sensors are taken, by name.
+        modes: of the rig in its motion.
+        removed: sensors that are not to be read.
+
+    Raises:
+        DesignError: modes that cannot be controlled or seen on that rig.
+    """
+    controlled = paired(loop.modes, modes, loop.law.controlled)
+    actuators = [named(rig.actuators, old.name) for old in loop.law.actuators]
+    assert loop.law.designed_by is not None and loop.controller.designed_by is not None
+    if isinstance(loop.law, OnOffLaw):
+        modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
+    law = loop.law.designed_by(modes, controlled=controlled, actuators=actuators)  # type: ignore[call-arg]
+    linear = law if isinstance(law, Law) else _without_gain(law)
+    sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
+    controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
+    return Loop(modes, law, controller)
+
+
+def _estimated(
+    old: Controller, modes: Modes, law: Law, sensors: Sequence[Sensor], removed: Sequence[str]
+) -> Controller:
+    assert old.designed_by is not None
+    kept = [i for i, s in enumerate(sensors) if s.name not in removed]
+    design: Any = old.designed_by
+    anew: Controller
+    if removed and np.ndim(noise := getattr(design, "keywords", {}).get("noise", 0.0)):
+        chosen = np.asarray(noise)[kept] if np.ndim(noise) == 1 else np.asarray(noise)[np.ix_(kept, kept)]
+        anew = design.func(modes, law, [sensors[i] for i in kept], **{**design.keywords, "noise": chosen})
+    else:
+        anew = design(modes, law, [sensors[i] for i in kept])
+    if anew.state.size == 0:  # a filter's own sensors stand where the rig's do
+        anew = replace(anew, sensors=tuple(sensors))
+    return anew
+
+
+def paired(nominal: Modes, modes: Modes, controlled: Sequence[int]) -> tuple[int, ...]:
+    """Which modes of a changed structure are the controlled ones, by their shapes; increasing.
+
+    Raises:
+        DesignError: more modes controlled than there are.
+    """
+    if len(controlled) > modes.n_modes:
+        raise DesignError(f"{len(controlled)} modes are controlled; the corrected rig shows {modes.n_modes}")
+    grid = nominal.domain.grid(8 * nominal.n_modes + 9)
+    alike = mac(nominal.phi(grid)[:, list(controlled)], modes.phi(grid))
+    _, found = linear_sum_assignment(-alike)
+    return tuple(sorted(int(r) for r in found))
