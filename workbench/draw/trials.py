@@ -1,6 +1,7 @@
 """Figures of blind trials."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -47,6 +48,28 @@ def plot_times(seconds: Mapping[str, Sequence[float]], limits: Mapping[str, floa
     ax.set_yticks(range(len(seconds)), [_FAMILY[family].rstrip(":") for family in seconds])
     ax.set(xlim=(0, None), ylim=(len(seconds) - 0.5, -0.5), xlabel="seconds by the clock, two cores")
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
+    return figure
+
+
+def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
+    """How many of the trials of `score_dirty` were named rightly, by class and size of the small errors beside them."""
+    classes, sizes = list(dict.fromkeys(s["class"] for s in scores)), sorted({s["size"] for s in scores})
+    figure, ax = new_figure(width=9, height=1.6 + 0.45 * len(classes))
+    for row, name in enumerate(classes):
+        for column, size in enumerate(sizes):
+            there = [s for s in scores if s["class"] == name and s["size"] == size]
+            if not there:
+                continue
+            share = sum(s["named"] for s in there) / len(there)
+            ax.barh(row + 0.27 * (column - (len(sizes) - 1) / 2), 100 * share, 0.24, color=COLOURS[column])
+            words = f"{sum(s['named'] for s in there)} of {len(there)}"
+            ax.text(101, row + 0.27 * (column - (len(sizes) - 1) / 2), words, va="center", fontsize=7)
+    for column, size in enumerate(sizes):
+        ax.barh(0, 0, color=COLOURS[column], label=f"{size:g} times a careful laboratory's errors")
+    ax.set_yticks(range(len(classes)), classes)
+    ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="verdicts that are right, %")
+    ax.set_ylabel("small errors of the test")
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes), fontsize=8)
     return figure
 
 

@@ -26,7 +26,7 @@ from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
-from workbench.gap.search.stepwise import Stepwise
+from workbench.gap.search.stepwise import Stepwise, are_common
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.threads import one_blas_thread
@@ -281,7 +281,7 @@ def _with_a_second(
     search: Search, start: Fit, singles: Sequence[Fit], weighed: Weighed, evidence: Evidence, tolerance: float
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
-    beside = Stepwise(search, tolerance)
+    beside = Stepwise(search, tolerance, singles)
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
@@ -299,8 +299,9 @@ def _with_a_second(
     explained = pairs.at_once(weighed)
     if law is not None:
         return weighed_against(law, search, pairs.decision(start))
-    if explained:
-        return pairs.decision(start)
+    decision = pairs.decision(start) if explained else None
+    if decision is not None and not (are_common(decision.best.effects) and beside.is_nothing):
+        return decision
     if len(beside.steps) == 1:
         beside.run()
     decision = beside.decision()

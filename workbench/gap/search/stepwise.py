@@ -41,6 +41,7 @@ class StepwiseSettings:
         iterations, tolerance: of the fit in each round.
         plainly: iterations of a fit without errors.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
+        singles: effects alone, as they were found without errors, that are tried as the first.
         candidates: sets fitted on whole records at each step.
         finalists, near: how many of them are fitted to all records, and times the least cost of what may come first.
         most: effects of a set; no case of the format hides more than three.
@@ -59,6 +60,7 @@ class StepwiseSettings:
         credible: times the stated noise that noise found may be; more is a gap.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         jump: times the power of the change over the span before a sample that the change after it has at a jump.
+        astray: share of the nominal gap's power from which on errors may be fitted out of step.
         damping, stiffness: common to all modes or all along, logarithm, from which on it is an effect of its own.
     """
 
@@ -89,6 +91,7 @@ class StepwiseSettings:
     plainly: int = 8
     last_iterations: int = 6
     last_tolerance: float = 1e-7
+    singles: int = 2
     candidates: int = 4
     finalists: int = 2
     near: float = 2.0
@@ -106,6 +109,7 @@ class StepwiseSettings:
     credible: float = 3.0
     no_gap: float = 0.15
     jump: float = 10.0
+    astray: float = 0.02
     damping: float = 0.5
     stiffness: float = 0.05
 
@@ -291,22 +295,38 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), errors.values)
 
 
+def are_common(effects: Sequence[Effect]) -> bool:
+    """Whether effects are the errors common to all modes and all along, each no larger than errors may be."""
+    most = {MODULUS_ERROR: SETTINGS.stiffness, MODAL_DAMPING: SETTINGS.damping}
+    return {effect.kind for effect in effects} == set(most) and all(
+        abs(np.log(effect.values["factor"])) < most[effect.kind] for effect in effects
+    )
+
+
 class Stepwise:
     """Stepwise selection of effects beside nominal errors, with going back.
 
     Attributes:
         search: what it works on.
         tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
+        singles: the likeliest effects alone, without errors, which the first one is chosen among too.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
     """
 
-    def __init__(self, search: Search, tolerance: float = 0.0) -> None:
+    def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
+        likeliest = spread_over_kinds(singles, 1)
+        self.singles = [f for f in likeliest if f.effects[0].kind not in COMMON][: SETTINGS.singles]
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.plain: Fit | None = None
         search.report("small errors of the nominal model", 0.4)
-        self.steps = [fit_jointly(search, (), on_their_sides(search, nominal_errors(search.rig, prior_of(search))))]
+        self.steps = [self._afresh(())]
+        common = next((f.effects[0] for f in likeliest[:1] if f.effects[0].kind is MODULUS_ERROR), None)
+        if common is not None and "stiffness" in prior_of(search).groups and not self.is_enough:
+            start = {"stiffness_0": float(np.log(common.values["factor"]))}
+            stiffer = fit_jointly(search, (), nominal_errors(search.rig, prior_of(search), start))
+            self.steps = [min(self.last, stiffer, key=lambda s: s.fit.cost)]
         again = on_their_sides(search, _opened(search, self.last.errors))
         if again.target.late != self.last.errors.target.late:  # what errors had hidden at first
             self.steps = [fit_jointly(search, (), again)]
@@ -352,6 +372,11 @@ class Stepwise:
         return max(float(np.maximum(self.search.nominal - self.last.noise_power, 0.0).mean()), 1e-12)
 
     @property
+    def is_nothing(self) -> bool:
+        """Whether errors of the nominal model alone explain the gap."""
+        return not self.last.effects and (self.is_quiet or self.unexplained < SETTINGS.explained)
+
+    @property
     def is_quiet(self) -> bool:
         """Whether next to nothing is left but noise of sensors and logged inputs."""
         return self.last.excess(self.last.noise_power) < SETTINGS.no_gap * float(self.last.noise_power.mean())
@@ -365,7 +390,7 @@ class Stepwise:
         enough = self.is_quiet or left < SETTINGS.explained
         if effects and (enough or (len(effects) > 1 and left < SETTINGS.in_part)):
             return Decision("explained", self.last.fit, noise=noise)
-        if enough:
+        if self.is_nothing:
             return Decision("none", self.last.fit, noise=noise)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise)
 
@@ -391,11 +416,14 @@ class Stepwise:
         enough = left - SETTINGS.promising * (left - ahead[0].cost)
         chosen = [f for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
         tried = self._fitted([candidate.effects for candidate in chosen], step, self._slopes(step))
+        # what was found before errors could bend to it
+        alone = [] if step.effects else self.search.workers.map(self._afresh, [f.effects for f in self.singles])
+        tried += alone
         tried = sorted((s for s in tried if not self._is_timing(s)), key=lambda s: s.fit.cost)
         if not tried:
             return step
         near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
-        whole = sorted((self._whole(s) for s in near), key=lambda s: s.fit.cost)
+        whole = sorted((s if s in alone else self._whole(s) for s in near), key=lambda s: s.fit.cost)
         return self._simplest(whole[0], whole[1:])
 
     def _is_worth(self, best: Step, step: Step) -> bool:
@@ -439,14 +467,27 @@ class Stepwise:
             lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2, known=known), list(sets)
         )
 
+    def _afresh(self, effects: tuple[Effect, ...]) -> Step:
+        """The effects beside errors that start from none, fitted to all records.
+
+        Where frequencies are far off, motions of whole records run out of step, and the way is told one sample ahead.
+        """
+        search = self.search
+        none = on_their_sides(search, nominal_errors(search.rig, prior_of(search)), effects)
+        found = fit_jointly(search, effects, none)
+        if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
+            return found
+        ahead = fit(search.rig, (*effects, none), search.ahead, iterations=SETTINGS.iterations, chord=True)
+        *effects, errors = ahead.effects
+        return min(found, fit_jointly(search, effects, errors), key=lambda s: s.fit.cost)
+
     def _whole(self, step: Step) -> Step:
         """The step fitted to all records.
 
         Errors that were fitted before an effect was there have bent to it, and may be in another valley, so they start
         from none; and only where that does not explain the records, from what they were, too.
         """
-        none = on_their_sides(self.search, nominal_errors(self.search.rig, prior_of(self.search)), step.effects)
-        fresh = fit_jointly(self.search, step.effects, none)
+        fresh = self._afresh(step.effects)
         if self.explains(fresh):
             return fresh
         return min(fresh, fit_jointly(self.search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)

@@ -1,0 +1,57 @@
+"""How often does the diagnosis name what hides beside the small errors of a real test, in blind trials?"""
+
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+
+from workbench.draw.trials import plot_dirt
+from workbench.trials.dirt import DIRT_CLASSES, SIZES
+from workbench.trials.hold import hold_trials
+from workbench.trials.make import draw_dirty_kinds
+from workbench.trials.scoring import NONE, tally_dirty
+
+CASES, SEED = 300, 620417
+
+
+def trial(dirt, size, kinds, seed):
+    """One blind trial: the score of the diagnosis, its sentence, and the processor time of it all, s."""
+    begun = process_time()
+    held = hold_trials(1, seed, kinds=[kinds], dirt=dirt, size=size)
+    (score,), (verdict,) = held.dirty_scores.values(), held.verdicts.values()
+    return {"score": score, "sentence": verdict["sentence"], "processor": process_time() - begun}
+
+
+def study(outcome, data: Path | None = None) -> None:
+    drawn = draw_dirty_kinds(CASES, SEED)
+    cases = [{**draw._asdict(), "kinds": list(draw.kinds), "seed": SEED + i} for i, draw in enumerate(drawn)]
+    found = outcome.run(cases, trial)
+    # a bench on which the effect would not show beside that dirt is no trial
+    held = [result for result in found if result.error is None]
+    unsuited = [result for result in found if result.error is not None and "no case with" in str(result.error)]
+    scores = [result["score"] for result in held]
+    for result in found:
+        if result.error is not None:
+            outcome.say(f"seed {result['seed']}: {result.error}")
+        elif not result["score"]["named"]:
+            score = result["score"]
+            outcome.say(f"seed {result['seed']}, {score['class']}: hidden {score['hidden']}, told {score['told']}")
+    outcome.table("scores", {result["seed"]: result["score"] for result in held})
+    by_class = {name: tally_dirty(s for s in scores if s["class"] == name) for name in DIRT_CLASSES}
+    by_size = {size: tally_dirty(s for s in scores if s["size"] == size) for size in SIZES}
+    outcome.table("by class", by_class)
+    outcome.table("by size", by_size)
+    taken = [result["processor"] for result in held]
+    times = dict(zip(("median", "nine of ten", "longest"), np.quantile(taken, (0.5, 0.9, 1.0)), strict=True))
+    outcome.table("processor time, s", {name: round(float(t), 1) for name, t in times.items()})
+
+    whole = tally_dirty(scores)
+    quiet = sum(score["hidden"] == NONE for score in scores)
+    outcome.check(f"trials of {CASES} that ended in an error", len(found) - len(held) - len(unsuited), 0)
+    outcome.check("share named", whole["named"], 0.9, at_least=True)
+    outcome.check("share with a wrong name", whole["wrong"], 0.02)
+    outcome.check(f"false alarms in {quiet} cases that hide nothing", whole["false_alarms"], 0)
+    outcome.check("share of places within 3 % of the length", whole["placed"], 0.9, at_least=True)
+    outcome.check("share of numbers within their 95 % interval", whole["covered"], 0.9, at_least=True)
+    outcome.check("share of budgets right to 0.05", whole["honest"], 0.9, at_least=True)
+    outcome.figure("named", plot_dirt(scores), "Share named rightly, by class and size of the small errors.")
