@@ -35,14 +35,11 @@ from .identification.free_decay.order import identify as identify
 from .identification.rig_from import rig_from as rig_from
 from .identification.ring_down import ring_down as ring_down
 from .identification.shapes.eigenfunctions import eigenfunctions as eigenfunctions
-from .identification.shapes.surface_spline import surface_bands as surface_bands
-from .identification.shapes.surface_spline import surface_eigenfunctions as surface_eigenfunctions
 from .identification.transfer import identify_transfer as identify_transfer
 from .identification.updating.distributions import mass_and_stiffness as mass_and_stiffness
 from .identification.updating.local_loss import locate_damage as locate_damage
 from .identification.updating.structure_fit import choose_structure as choose_structure
 from .identification.updating.structure_fit import fit_structure as fit_structure
-from .identification.updating.surface_distributions import plate_mass_and_stiffness as plate_mass_and_stiffness
 from .records.files import read_measured as read_measured
 from .records.files import read_record as read_record
 from .records.files import write_record as write_record

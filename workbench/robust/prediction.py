@@ -138,7 +138,7 @@ def predict(
             f" {MOST_NUMBERS // (n_outputs * LEAST_DRAWS)} samples at a time"
         )
     rng = np.random.default_rng(seed)
-    frequencies = np.fft.rfftfreq(n_samples, period)
+    frequencies = np.asarray(np.fft.rfftfreq(n_samples, period), float)
     bands = _bands(found.rig.modes, frequencies)
     truths, notes, away = [], [], 0
     rigs = found.draws(min(draws, most), rng)
@@ -174,7 +174,7 @@ def predict(
     sizes = np.array([amplitudes(reading) for reading in readings])
     spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
     told = Prediction(
-        start + period * np.arange(n_samples),
+        np.asarray(start + period * np.arange(n_samples), float),
         tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(found.nominal.sensors, spread)),
         middle,
         low,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.design.estimation.digital import DigitalController
-from workbench.rig.sensors import MEASURED
+from workbench.rig.sensors import MEASURED, Sensor
 from workbench.trials import motion
 from workbench.trials.plant import FINEST, SolvedPlant, sensor_noise
 
@@ -145,7 +145,7 @@ class _Reading:
             out[j] = self._one(j, sensor, float(truth[j, -1]), k)
         return out[self.read]
 
-    def _one(self, j, sensor, true: float, k: int) -> float:
+    def _one(self, j: int, sensor: Sensor, true: float, k: int) -> float:
         y = true
         if sensor.time_constant > 0:
             if k == 0:

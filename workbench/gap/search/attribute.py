@@ -297,10 +297,10 @@ def _with_a_second(
     law = one_law(search, evidence)
     pairs = Pairs(search)
     explained = pairs.at_once(weighed)
+    decision = pairs.decision(start)
     if law is not None:
-        return weighed_against(law, search, pairs.decision(start))
-    decision = pairs.decision(start) if explained else None
-    if decision is not None and not (are_common(decision.best.effects) and beside.is_nothing):
+        return weighed_against(law, search, decision)
+    if explained and not (are_common(decision.best.effects) and beside.is_nothing):
         return decision
     if len(beside.steps) == 1:
         beside.run()

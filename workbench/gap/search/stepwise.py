@@ -478,8 +478,7 @@ class Stepwise:
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
             return found
         ahead = fit(search.rig, (*effects, none), search.ahead, iterations=SETTINGS.iterations, chord=True)
-        *effects, errors = ahead.effects
-        return min(found, fit_jointly(search, effects, errors), key=lambda s: s.fit.cost)
+        return min(found, fit_jointly(search, ahead.effects[:-1], ahead.effects[-1]), key=lambda s: s.fit.cost)
 
     def _whole(self, step: Step) -> Step:
         """The step fitted to all records.
