@@ -164,6 +164,7 @@ def test_place_does_better_than_even_places(rig, tmp_path):
     assert best["effort"] <= 1.5 * even["effort"] * (1 + 1e-6)
 
 
+@pytest.mark.slow
 def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     found = tmp_path / "places.json"
     limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--proof", 0.05)

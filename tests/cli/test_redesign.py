@@ -40,6 +40,7 @@ def case(tmp_path_factory):
     return folder, verdict
 
 
+@pytest.mark.slow
 def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     folder, verdict = case
     page, told = tmp_path / "p.html", tmp_path / "r.json"

@@ -76,6 +76,7 @@ def test_a_law_beyond_the_catalogue_is_unknown_and_shown(kind, exponent):
     assert shown["at"] == pytest.approx(verdict.where.at, abs=0.05 * case.rig.modes.length)
 
 
+@pytest.mark.slow
 def test_a_weak_law_beyond_the_catalogue_does_not_pass_for_one_of_it():
     """A clearance leaves no more than the noise here; a power of the displacement is likelier by far."""
     case, _ = make_trial(441050, kinds=("quadratic_spring",))
@@ -124,6 +125,7 @@ def test_an_effect_of_the_users_own_joins_the_catalogue():
     assert mine.name not in {kind.name for kind in CATALOGUE}
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_true():
     """Fits of many noisy copies scatter as one fit says they do."""
     case, _ = make_trial(14)

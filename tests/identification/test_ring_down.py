@@ -123,6 +123,7 @@ def test_swept_record_is_remarked():
     assert any("of the motion, is not white" in note for note in told.notes)
 
 
+@pytest.mark.slow
 def test_short_random_response_is_refused_or_remarked():
     n, pole = 1000, np.exp((-0.24 + 8.0j) * 0.02)
     for seed in range(4):

@@ -38,6 +38,7 @@ def noisy(h, seed, fraction=0.01):
     return h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape)), std
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
 def test_modes_of_the_band_whatever_lies_beyond(quantity):
     modes, h, channels = beam(quantity)
@@ -136,6 +137,7 @@ def one_by_one(rng, n=10):
 CROWDED_HZ = np.array([39.4, 108.6, 212.9])
 
 
+@pytest.mark.slow
 def test_points_that_disagree_make_one_mode_of_a_crowd():
     """Modes that all points share took up the disagreement, by three to five beside each other."""
     lines, h = one_by_one(np.random.default_rng(1))

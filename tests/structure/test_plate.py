@@ -118,6 +118,7 @@ def test_elements_that_converge_from_below_and_this_method_enclose_a_cantilever(
     np.testing.assert_allclose((4.0 * fine - coarse) / 3.0, ritz, rtol=2e-3)
 
 
+@pytest.mark.slow
 def test_three_points_at_once_have_the_frequencies_that_their_receptances_give():
     """det(I + (k - ω² m) H(ω)) = 0, with H a double series in closed form, its tail by an integral."""
     places = np.array([(0.31, 0.42), (0.66, 0.42), (0.52, 0.77)])
@@ -213,6 +214,7 @@ def test_shear_tension_stiffens_one_diagonal_and_softens_the_other():
     assert np.abs(sheared[0] / bare - 1.0).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_modes_are_orthonormal_with_the_mass():
     plate = square(CANTILEVER, mass_per_area=lambda x, y: 1.0 + x * y, attachments=[PointMass((0.9, 0.3), 0.2)])
     modes = plate.modes(4)

@@ -217,7 +217,7 @@ def test_silence_is_right_only_where_nothing_hides():
 @pytest.mark.parametrize(
     "kinds",
     [
-        [("point_damper",), (), ("sensor_gain",)],
+        pytest.param([("point_damper",), (), ("sensor_gain",)], marks=pytest.mark.slow),
         pytest.param(
             [("actuator_saturation",), ("ground_spring", "sensor_lag"), ("cross_talk",)], marks=pytest.mark.slow
         ),

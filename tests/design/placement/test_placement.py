@@ -195,6 +195,7 @@ def test_fast_figures_are_the_careful_ones(task):
     np.testing.assert_allclose(spent, careful.effort, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "limits",
     [

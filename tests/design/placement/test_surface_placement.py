@@ -64,6 +64,7 @@ def test_a_plate_is_placed_as_well_as_by_a_fine_grid_and_outside_the_zone(task):
     assert [len(actuator.at) for actuator in best.law.actuators] == [2, 2]
 
 
+@pytest.mark.slow
 def test_a_proof_among_candidates_finds_what_a_search_of_all_finds(task, monkeypatch):
     along = np.linspace(0.1, 0.8, 6)
     candidates = tuple((float(x), float(y)) for x in 1.3 * along for y in along)

@@ -79,6 +79,7 @@ def test_small_errors_alone_are_no_effect(rig, measured, records):
     np.testing.assert_allclose(found, DAMPING[:3], rtol=0.02)
 
 
+@pytest.mark.slow
 def test_friction_beside_small_errors(rig, measured, records):
     """Fitted before it is known, the damping ratios would take the friction for theirs."""
     truth = CoulombFriction(1.37, 0.004, 1e-3)

@@ -22,6 +22,7 @@ def test_linear_record_is_silent():
         assert (np.nanmax(np.abs(found.omega - truth.omega) / found.omega_std)) < 5
 
 
+@pytest.mark.slow
 def test_duffing_oscillator_follows_its_backbone():
     """ω(A) = ω0 (1 + 3 κ A² / (8 ω0²)) for x'' + 2 ζ ω0 x' + ω0² x + κ x³ = 0 (Nayfeh & Mook 1979, 2.3)."""
     omega, zeta, kappa = 10.0, 0.004, 6.0

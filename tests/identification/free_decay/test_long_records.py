@@ -56,6 +56,7 @@ def test_a_record_without_noise(truth):
     assert np.allclose(found.modes.omega, truth.omega, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_records_together_tell_more(truth):
     noise = 3e-3
     pair = [free_decay(truth, sample_time=1.0, n_samples=n, noise_std=noise, seed=n) for n in (8000, 6000)]
@@ -98,6 +99,7 @@ def test_noise_that_is_not_white_holds_no_modes(truth, record):
     assert found.modes.n_modes >= 6
 
 
+@pytest.mark.slow
 def test_a_mode_at_half_the_sample_rate_keeps_no_other_from_being_fitted():
     truth = modes([0.1, 0.1003, 0.2, 0.3, 0.49995], [0.002, 0.002, 0.004, 0.001, 0.01], 6)
     record = free_decay(truth, sample_time=1.0, n_samples=5000, noise_std=0.01, seed=1)

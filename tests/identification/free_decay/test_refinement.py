@@ -81,6 +81,7 @@ def coverage(truth, draws):
     return np.array(figures), np.concatenate(shapes)
 
 
+@pytest.mark.slow
 def test_errors_are_as_large_as_they_are_said_to_be(truth):
     figures, shapes = coverage(truth, 60)
     # 480 normalised errors of unit variance: their mean square strays from 1 by 0.065 (one sigma)

@@ -40,6 +40,7 @@ def test_the_curve_is_that_of_eigenfunctions(beam):
     assert (bands.width > 1.96).all()
 
 
+@pytest.mark.slow
 def test_bands_hold_the_true_curve_as_often_as_they_say(beam):
     truth, inside, whole, predicted = beam.phi(X), [], [], []
     for seed in range(100):

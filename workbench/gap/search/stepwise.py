@@ -40,6 +40,7 @@ class StepwiseSettings:
         settled, last_settled: share of what is left that a round must have taken away for another; in the last fit.
         iterations, tolerance: of the fit in each round.
         plainly: iterations of a fit without errors.
+        hopeful: times the noise power that such a fit may leave of the quick records, to be fitted to all.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
         singles: effects alone, as they were found without errors, that are tried as the first.
         candidates: sets fitted on whole records at each step.
@@ -89,6 +90,7 @@ class StepwiseSettings:
     iterations: int = 4
     tolerance: float = 1e-4
     plainly: int = 8
+    hopeful: float = 2.0
     last_iterations: int = 6
     last_tolerance: float = 1e-7
     singles: int = 2
@@ -516,13 +518,20 @@ class Stepwise:
 
         They say the same with fewer numbers than errors of their own for every mode and wave.
         """
-        if not step.effects or not self.explains(step):
+        if not step.effects or self.unexplained > SETTINGS.explained:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         common = [Effect(kind, None, {"factor": 1.0}) for kind in COMMON]
         named = {effect.kind for effect in step.effects}
-        for extra in ((), *((effect,) for effect in common if effect.kind not in named)):
-            found = fit(search.rig, (*step.effects, *extra), search.data.stepped(FINE), iterations=SETTINGS.plainly)
+        sets = [step.effects, *((*step.effects, effect) for effect in common if effect.kind not in named)]
+        if len(step.effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
+            fewer = list(_each_left_out(step.effects))
+            sets += [*fewer, *(s for given in (step.effects, *fewer) for s in simpler_sets(given, search.rig))]
+        quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=SETTINGS.plainly), sets)
+        hopeful = [f for f in quickly if f.cost < SETTINGS.hopeful]
+        for candidate in sorted(hopeful, key=lambda f: f.n_parameters):
+            data = search.data.stepped(FINE)
+            found = fit(search.rig, candidate.effects, data, iterations=SETTINGS.plainly)
             if search.explains(found):
                 return found
         return None
