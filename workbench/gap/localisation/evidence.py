@@ -32,6 +32,7 @@ STILL = 1e-6  # of what moves most: a point, or what is between two, that no for
 BROAD, NARROW = 0.1, 0.03  # of a rectangle's diagonal: between tops of its profile, and once they are refined
 FINER = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
 POINTS_TRIED, PAIRS_TRIED = 4, 4  # named points, and pairs of them, whose motion is looked at
+ALIKE = 1e-4  # 1 - cos² of the angle between the motions of two pairs of points: less is one place
 CROWD = 12  # named points, of which all are looked at
 
 
@@ -188,7 +189,22 @@ class Evidence:
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
         most = len(points) if len(points) <= CROWD else POINTS_TRIED
-        return tuple(ranked[i] for i in sorted((*points[:most], *pairs[:PAIRS_TRIED])))
+        return tuple(ranked[i] for i in sorted((*points[:most], *self._unlike(ranked, pairs))))
+
+    def _unlike(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
+        """The first few pairs that move unlike one another: the two ends of a stiff floor are one place, and would
+        crowd out others."""
+        kept: list[int] = []
+        shapes: list[np.ndarray] = []
+        for i in pairs:
+            shape = self.rig.modes.phi_at(ranked[i])
+            shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
+            if all((shape @ other) ** 2 < 1.0 - ALIKE for other in shapes):
+                kept.append(i)
+                shapes.append(shape)
+            if len(kept) == PAIRS_TRIED:
+                break
+        return kept
 
     @property
     def _along(self) -> int:

@@ -33,6 +33,7 @@ class Fit:
         falling: share of the cost that the last iteration took away; 0 where the fit came to rest.
         covariance: (n, n) of the free coordinates of all parameters, in the order of `parameters_of`; None before
             `with_intervals`.
+        stepping: (n_records,) mean square error of the steps of time, in units of the noise, where it was measured.
     """
 
     effects: tuple[Effect, ...]
@@ -42,6 +43,7 @@ class Fit:
     status: str
     falling: float = 0.0
     covariance: np.ndarray | None = None
+    stepping: np.ndarray | float = 0.0
 
     def only(self, rig: Rig, kept: Sequence[Effect]) -> "Fit":
         """The fit with some of its effects left out, and the covariance of the others."""

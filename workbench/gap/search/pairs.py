@@ -11,7 +11,7 @@ from workbench.gap.search.beside_random import NEAR
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.outcome import Decision, unexplained
-from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more, pairs_at_once
+from workbench.gap.search.pursuit import is_hopeful, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import Search, in_one_valley
 from workbench.structure.domain import Between
@@ -102,7 +102,7 @@ class Pairs:
     def _explained_by(self, ahead: Sequence[Fit]) -> bool:
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
         domain = self.search.rig.modes.domain
-        hopeful = [f for f in ahead if f.cost < HOPEFUL]
+        hopeful = [f for f in ahead if is_hopeful(self.search, f)]
         fresh = [f for f in hopeful if not any(in_one_valley(f, other, domain) for other in self.followed)]
         most = MORE if self.found else FINALISTS
         self.followed += fresh[:most]

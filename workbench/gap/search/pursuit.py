@@ -16,7 +16,8 @@ FINE = 8  # substeps of a sample
 TARGETS_A_KIND = 3  # of single effects that are tried
 TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
 FAR_BEHIND = 10.0  # times the least promise: what is not fitted to its end
-HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records
+HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records, or this share of
+HOPEFUL_SHARE = 0.05  # what the nominal rig leaves there, where steps of half a sample cost more than a small noise
 LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
 AT_HAND = 10.0  # times the noise: so near, whole records tell the way
 CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
@@ -48,6 +49,11 @@ def pairs_at_once(search: Search, weighed: Weighed) -> list[Fit]:
         weighed: with nothing given.
     """
     return fitted_ahead(search, weighed.likeliest_pairs(TRIED))
+
+
+def is_hopeful(search: Search, candidate: Fit) -> bool:
+    """Whether a fit one sample ahead may explain whole records."""
+    return candidate.cost < max(HOPEFUL, HOPEFUL_SHARE * search.nominal_ahead)
 
 
 def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:

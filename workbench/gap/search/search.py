@@ -15,7 +15,7 @@ from workbench.gap.prediction.noise import logging_noise_power
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.fit import HOPELESS, Fit, sensitivity
+from workbench.gap.search.fit import HOPELESS, Fit, cost_of, sensitivity
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain
 
@@ -66,7 +66,8 @@ class Search:
         left = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
         slack = SLACK + 5.0 * np.sqrt(2.0 / per_record) + INTEGRATION_SHARE * self.nominal.mean(axis=1)
-        return bool((left < 1.0 + slack).all() and left.mean() < self.enough)
+        slack = slack + candidate.stepping
+        return bool((left < 1.0 + slack).all() and left.mean() < self.enough + np.mean(candidate.stepping))
 
     @property
     def enough(self) -> float:
@@ -140,6 +141,11 @@ class Search:
     def first_ahead(self) -> FitData:
         """The most telling record, likewise."""
         return self._ahead(self.first)
+
+    @cached_property
+    def nominal_ahead(self) -> float:
+        """What the nominal rig leaves of predictions one sample ahead, per value, in units of the noise."""
+        return cost_of(self.rig, self.held, self.ahead)
 
     def _ahead(self, data: FitData) -> FitData:
         data = data.following(self.rig)

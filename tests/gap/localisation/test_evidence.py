@@ -1,0 +1,33 @@
+"""Where a missing force may be, before any effect is guessed."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.residuals import FitData
+from workbench.rig.actuators import Actuator
+from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.modes import Modes, PointShapes
+
+
+def test_pairs_of_points_that_move_alike_do_not_crowd_out_others():
+    """Five floors of three points each, all of a floor moving as one: nine pairs for every two floors."""
+    rng = np.random.default_rng(4)
+    floors = rng.standard_normal((5, 4))
+    names = tuple(f"{end}{floor}" for floor in range(5) for end in "abc")
+    points = NamedPoints(names, rng.standard_normal((15, 3)), ("x",) * 15)
+    modes = Modes([20.0, 33.0, 51.0, 70.0], [0.01] * 4, PointShapes(np.repeat(floors, 3, axis=0)), points)
+    sensors = tuple(Sensor(f"a{i}", f"a{i}", "acceleration", noise_std=0.02) for i in range(5))
+    rig = Rig(modes, (Actuator("F", "b1"),), sensors)
+    real = replace(rig, elements=(CubicSpring(Between("a0", "a3"), 300.0),))
+    clean = simulate(real, 5.0 * rng.standard_normal((1, 1500)), sample_time=0.01, name="one")
+    noisy = replace(clean, outputs=clean.outputs + 0.02 * rng.standard_normal(clean.outputs.shape))
+    evidence = Evidence.of(rig, FitData((noisy,), np.full(5, 0.02)))
+    pairs = [{int(name[1]) for name in where} for where in evidence.peaks if isinstance(where, Between)]
+    assert {0, 3} in pairs
+    assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 4
