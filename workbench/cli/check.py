@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig, record_of
+from workbench.cli.possible import CasePath, VerdictPath, Workers, predicted, record_of
 from workbench.cli.predict import Draws, Rate, RecordName, Seed
 from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short, write_json
 
@@ -33,7 +33,6 @@ def check(
 
     from workbench.cases.case import read_case
     from workbench.robust.check import check_prediction, log_test, read_log
-    from workbench.robust.prediction import predict
     from workbench.study.prediction_page import prediction_page
     from workbench.study.whole_file import check_target
 
@@ -47,13 +46,7 @@ def check(
         raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; check one that was not")
     with progress_bar() as progress:
         report = reporter(progress, "reading")
-        possible, noise = possible_rig(
-            found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
-        )
-        told = predict(
-            possible, measured, noise_std=noise, draws=draws, seed=seed,
-            report=lambda what, share: report(what, 0.7 + 0.3 * share),
-        )  # fmt: skip
+        told = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers, report=report)
     result = check_prediction(told, measured)
     head, *rest = str(result).splitlines()
     say(head, bold=True)

@@ -15,6 +15,7 @@ from workbench.rig.rig import Rig
 if TYPE_CHECKING:
     from workbench.cases.case import Case
     from workbench.robust.posterior import UncertainRig
+    from workbench.robust.prediction import Prediction
 
 CasePath = Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")]
 VerdictPath = Annotated[
@@ -36,6 +37,26 @@ def possible_rig(
         case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report
     )  # fmt: skip
     return UncertainRig.of(told), told.budget.noise_found or None
+
+
+def predicted(
+    case: "Case",
+    record: Record,
+    verdict: Path | None,
+    *,
+    draws: int,
+    seed: int,
+    workers: int | None,
+    report: Callable[[str, float], None],
+) -> "Prediction":
+    """What a record shows on the rigs that a diagnosis of the case leaves possible, with bands."""
+    from workbench.robust.prediction import predict
+
+    possible, noise = possible_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
+    return predict(
+        possible, record, noise_std=noise, draws=draws, seed=seed,
+        report=lambda what, done: report(what, 0.7 + 0.3 * done),
+    )  # fmt: skip
 
 
 def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...] | None]":

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig, record_of
+from workbench.cli.possible import CasePath, VerdictPath, Workers, predicted, record_of
 from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short, write_json
 
 RecordName = Annotated[
@@ -33,7 +33,6 @@ def predict(
     Example: workbench predict cases/arm planned.csv --verdict verdict.json
     """
     from workbench.cases.case import read_case
-    from workbench.robust.prediction import predict as run
     from workbench.study.prediction_page import prediction_page
     from workbench.study.whole_file import check_target
 
@@ -42,13 +41,7 @@ def predict(
     planned = record_of(found, record, sample_rate_hz)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
-        possible, noise = possible_rig(
-            found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
-        )
-        told = run(
-            possible, planned, noise_std=noise, draws=draws, seed=seed,
-            report=lambda what, share: report(what, 0.7 + 0.3 * share),
-        )  # fmt: skip
+        told = predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers, report=report)
     head, *rest = str(told).splitlines()
     say(head, bold=True)
     for line in rest:

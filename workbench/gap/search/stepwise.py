@@ -376,7 +376,12 @@ class Stepwise:
     @property
     def is_nothing(self) -> bool:
         """Whether errors of the nominal model alone explain the gap."""
-        return not self.last.effects and (self.is_quiet or self.unexplained < SETTINGS.explained)
+        return not self.last.effects and self.is_closed
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the last set leaves next to nothing but noise, or next to nothing of the gap."""
+        return self.is_quiet or self.unexplained < SETTINGS.explained
 
     @property
     def is_quiet(self) -> bool:
@@ -389,8 +394,7 @@ class Stepwise:
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         if self.plain is not None:
             return Decision("explained", self.plain, noise=noise)
-        enough = self.is_quiet or left < SETTINGS.explained
-        if effects and (enough or (len(effects) > 1 and left < SETTINGS.in_part)):
+        if effects and (self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)):
             return Decision("explained", self.last.fit, noise=noise)
         if self.is_nothing:
             return Decision("none", self.last.fit, noise=noise)
