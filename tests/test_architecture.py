@@ -1,6 +1,7 @@
 """Imports run from the ground floor up, those inside functions too."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import workbench
@@ -39,13 +40,19 @@ ENGINES = {
 }
 
 
+@cache
 def modules():
+    """Each file's name, the modules that it imports, those inside functions too, and the names that it calls."""
+    found = []
     for path in sorted(ROOT.rglob("*.py")):
-        yield path.relative_to(ROOT).as_posix(), ast.parse(path.read_text(encoding="utf-8"))
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        called = {getattr(node.func, "id", "") for node in nodes if isinstance(node, ast.Call)}
+        found.append((path.relative_to(ROOT).as_posix(), tuple(imports(nodes)), called))
+    return found
 
 
-def imports(tree):
-    for node in ast.walk(tree):
+def imports(nodes):
+    for node in nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -62,10 +69,10 @@ def room(name: str) -> str:
 
 def test_a_room_imports_only_from_floors_below():
     wrong = []
-    for name, tree in modules():
+    for name, targets, _ in modules():
         if name in ("__init__.py", "__main__.py"):
             continue
-        for target in imports(tree):
+        for target in targets:
             parts = target.split(".")
             if parts[0] != "workbench" or len(parts) < 2 or parts[1] == room(name):
                 continue
@@ -82,11 +89,11 @@ def inner_floor(parts: tuple[str, ...]) -> int:
 
 def test_imports_run_one_way_inside_a_room():
     wrong = []
-    for name, tree in modules():
+    for name, targets, _ in modules():
         parts = tuple(name.removesuffix(".py").split("/"))
         if parts[0] not in INSIDE or len(parts) < 2:
             continue
-        for target in imports(tree):
+        for target in targets:
             there = tuple(target.split(".")[1:])
             if len(there) > 1 and there[0] == parts[0] and inner_floor(there) > inner_floor(parts):
                 wrong.append(f"{name} imports {target}")
@@ -102,9 +109,9 @@ def test_every_room_inside_a_room_is_named():
 def test_no_file_imports_a_rooms_init():
     wrong = [
         f"{name} imports {target}"
-        for name, tree in modules()
+        for name, targets, _ in modules()
         if name != "__init__.py"
-        for target in imports(tree)
+        for target in targets
         if target == "workbench"
         or (
             target.startswith("workbench.")
@@ -117,9 +124,9 @@ def test_no_file_imports_a_rooms_init():
 
 def test_no_circle_of_imports():
     graph = {}
-    for name, tree in modules():
+    for name, targets, _ in modules():
         module = "workbench." + name.removesuffix(".py").replace("/", ".")
-        graph[module] = {t for t in imports(tree) if t.startswith("workbench.")}
+        graph[module] = {t for t in targets if t.startswith("workbench.")}
     done, path = set(), []
 
     def visit(module):
@@ -139,8 +146,8 @@ def test_no_circle_of_imports():
 def test_each_engine_has_one_door():
     wrong = [
         f"{name} imports {engine}"
-        for name, tree in modules()
-        for target in imports(tree)
+        for name, targets, _ in modules()
+        for target in targets
         for engine, doors in ENGINES.items()
         if target.split(".")[0] == engine
         and not any(name.startswith(door) for door in doors)
@@ -150,10 +157,5 @@ def test_each_engine_has_one_door():
 
 
 def test_only_the_command_prints():
-    wrong = [
-        name
-        for name, tree in modules()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "print" and not name.startswith("cli/")
-    ]
+    wrong = [name for name, _, called in modules() if "print" in called and not name.startswith("cli/")]
     assert not wrong, wrong

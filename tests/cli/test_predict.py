@@ -17,26 +17,16 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.robust.posterior import UncertainRig
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 NOISE = 1e-4
 
 
 @pytest.fixture
-def case(tmp_path, monkeypatch):
+def case(tmp_path, monkeypatch, hinged_beam):
     """A case whose actuator is late, its verdict, and two tests that came later: one like it, one that is not."""
     monkeypatch.chdir(tmp_path)
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
     sensors = [Sensor(f"d{i}", x, noise_std=NOISE) for i, x in enumerate((0.3, 1.1))]
-    rig = Rig(beam.modes(4), (Actuator("F1", 0.45),), tuple(sensors), structure=beam)
+    rig = Rig(hinged_beam.modes(4), (Actuator("F1", 0.45),), tuple(sensors), structure=hinged_beam)
     late = Effect(kind_named("actuator_delay"), "all", {"delay": 0.02})
     rng = np.random.default_rng(0)
 

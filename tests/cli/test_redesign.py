@@ -14,23 +14,13 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.robust.posterior import UncertainRig
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 
 @pytest.fixture(scope="module")
-def case(tmp_path_factory):
+def case(tmp_path_factory, hinged_beam):
     """A case whose actuators are late, and its verdict as the diagnosis writes it."""
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
     sensors = [Sensor(f"d{i}", x, noise_std=1e-5) for i, x in enumerate((0.3, 0.7, 1.1, 1.6))]
-    rig = Rig(beam.modes(5), (Actuator("F1", 0.45), Actuator("F2", 1.2)), tuple(sensors), structure=beam)
+    rig = Rig(hinged_beam.modes(5), (Actuator("F1", 0.45), Actuator("F2", 1.2)), tuple(sensors), structure=hinged_beam)
     late = Effect(kind_named("actuator_delay"), "all", {"delay": 0.04})
     inputs = np.random.default_rng(0).normal(size=(2, 400))
     folder = tmp_path_factory.mktemp("case") / "late"

@@ -8,27 +8,17 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 NOISE = 1e-5
 
 
 @pytest.fixture(scope="session")
-def hinged_rig():
+def hinged_rig(hinged_beam):
     """The rig as so many modes and actuators make it."""
 
     def make(n_modes: int = 6, actuators: tuple[Actuator, ...] = (Actuator("F", 0.45),)) -> Rig:
-        beam = Beam(
-            length=2.0,
-            mass_per_length=1.0,
-            bending_stiffness=4.0,
-            left="hinged",
-            right="hinged",
-            damping=ModalDamping(0.01),
-        )
         sensors = tuple(Sensor(f"d{i + 1}", x, noise_std=NOISE) for i, x in enumerate((0.3, 0.7, 1.1, 1.6)))
-        return Rig(beam.modes(n_modes), actuators, sensors, structure=beam)
+        return Rig(hinged_beam.modes(n_modes), actuators, sensors, structure=hinged_beam)
 
     return make
 

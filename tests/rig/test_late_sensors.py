@@ -10,24 +10,14 @@ from workbench.rig.elements import CubicSpring
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 FINE = 10
 
 
 @pytest.fixture(scope="module")
-def rig():
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
+def rig(hinged_beam):
     sensors = [Sensor(quantity, 0.7, quantity) for quantity in ("displacement", "velocity", "acceleration")]
-    return Rig(beam.modes(4), [Actuator("F", 0.45)], sensors)
+    return Rig(hinged_beam.modes(4), [Actuator("F", 0.45)], sensors)
 
 
 @pytest.mark.parametrize("elements", [(), (CubicSpring(1.1, 50.0),)], ids=["linear", "cubic"])

@@ -12,8 +12,6 @@ from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 from workbench.trials.controlled import control_plant
 from workbench.trials.plant import Plant
 
@@ -25,18 +23,15 @@ DRIVES = {
 
 
 @pytest.mark.parametrize("drive", DRIVES)
-def test_two_numerical_routes_agree_on_a_controlled_structure(drive):
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
+def test_two_numerical_routes_agree_on_a_controlled_structure(hinged_beam, drive):
     sensors = (Sensor("d1", 0.3, delay=0.4 * DT), Sensor("d2", 0.9, gain=1.1), Sensor("v1", 1.4, "velocity", bias=0.02))
     inputs = (Actuator("F1", 0.45), Actuator("F2", 1.2), Actuator("hammer", 0.8, direct=True))
-    rig = Rig(beam.modes(4), inputs, tuple(replace(s, delay=0.0, gain=1.0, bias=0.0) for s in sensors), structure=beam)
+    rig = Rig(
+        hinged_beam.modes(4),
+        inputs,
+        tuple(replace(s, delay=0.0, gain=1.0, bias=0.0) for s in sensors),
+        structure=hinged_beam,
+    )
     law = imsc(rig.modes, 2, inputs[:2], weight=0.05)
     controller = sampled(kalman(rig.modes, law, rig.sensors, disturbance=1.0, noise=1e-3), DT)
     real = replace(rig, sensors=sensors, actuators=(*(replace(a, **DRIVES[drive]) for a in inputs[:2]), inputs[2]))

@@ -296,26 +296,157 @@ def spread_forces(
                 out[r] -= coupling[r, s] * v[s]
 
 
-@njit(cache=True, nogil=True)
-def _widened(values: Floats, n: int, rest: float) -> Floats:
-    wide = np.full(n, rest)
-    wide[: values.size] = values
-    return wide
+@njit(cache=True, nogil=True, fastmath=FAST)
+def drifted_propagators(
+    omega: Floats, c: Floats, h: float, factor: float, shapes: Floats, linear: tuple[Floats, Floats, Floats]
+) -> None:
+    """Fill propagators (2, 4, n_modes) at `factor` times the stiffness, and the reactions of the elements to them.
+
+    The reactions, two of (n_elements, n_elements), are displacement and velocity of element i after a substep by a
+    force of element j that has risen to one at its end.
+    """
+    e, aw, av = linear
+    propagators(omega * math.sqrt(max(factor, 1e-6)), c, h, e)
+    for i in range(shapes.shape[0]):
+        for j in range(shapes.shape[0]):
+            aw[i, j] = 0.0
+            av[i, j] = 0.0
+            for r in range(omega.size):
+                aw[i, j] += shapes[i, r] * e[0, 3, r] * shapes[j, r]
+                av[i, j] += shapes[i, r] * e[1, 3, r] * shapes[j, r]
+
+
+# Neither called nor counting references to its arrays: either would cost as much as the work of a substep.
+@njit(cache=True, nogil=True, fastmath=FAST, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
+def advance(
+    linear: tuple[Floats, Floats, Floats],
+    drives: tuple[Floats, Floats],
+    elements: tuple[Integers, Floats, Floats],
+    along: tuple[float, Floats, Floats, Floats, Floats, Floats],
+    motion: tuple[Floats, Floats, Floats],
+    points: tuple[Floats, Floats, Floats, Floats],
+    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
+) -> None:
+    """Advance the modes, a whole number of LANES, and the elements of a rig by a substep.
+
+    Args:
+        linear: propagators and reactions, as `drifted_propagators` fills them.
+        drives: modal forces (n_modes,) at the start and the end, straight between.
+        elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of those at points.
+        along: of what acts all along, as `spread_forces` takes it.
+        motion: q, q' and the modal forces of all elements, (n_modes,): updated.
+        points: forces, forces a substep before, displacements and hysteretic displacements, (n_elements,): updated.
+        work: free displacements and rates (n_elements,); q, q' and forces (n_modes,), the forces of what acts all
+            along last. Those are kept from one substep to the next.
+    """
+    e, aw, av = linear
+    drive, drive_end = drives
+    kinds, shapes, parameters = elements
+    stretch, stretching, drag_shapes, drag_weights, push, coupling = along
+    q, v, old = motion
+    point, earlier, w_old, z = points
+    w_free, v_free, base_q, base_v, new, spread = work
+    n, n_elements = LANES * (q.size // LANES), kinds.size
+    distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
+    for r in range(n):
+        start, end = old[r] + drive[r], drive_end[r]
+        base_q[r] = e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
+        base_v[r] = e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
+    if n_elements == 0 and not distributed:
+        for r in range(n):
+            q[r] = base_q[r]
+            v[r] = base_v[r]
+        return
+    for i in range(n_elements):
+        guess = 2.0 * point[i] - earlier[i]
+        earlier[i], point[i] = point[i], guess
+    for sweep in range(2 if distributed else 1):
+        for i in range(n_elements):
+            w, u = 0.0, 0.0
+            for r in range(n):
+                w += shapes[i, r] * (base_q[r] + e[0, 3, r] * spread[r])
+                u += shapes[i, r] * (base_v[r] + e[1, 3, r] * spread[r])
+            w_free[i], v_free[i] = w, u
+        settled = False
+        if n_elements == 1:
+            point[0] = solve_element(
+                kinds[0], parameters, 0, w_free[0], v_free[0], aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
+            )
+            settled = True
+        elif n_elements == 2:
+            f, g, settled = solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, point[0], point[1])
+            if settled:
+                point[0], point[1] = f, g
+        if n_elements > 1 and not settled:
+            solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
+        for r in range(n):
+            new[r] = spread[r]
+        for i in range(n_elements):
+            force = point[i]
+            for r in range(n):
+                new[r] += shapes[i, r] * force
+        for r in range(n):
+            q[r] = base_q[r] + e[0, 3, r] * new[r]
+            v[r] = base_v[r] + e[1, 3, r] * new[r]
+        if distributed and sweep == 0:
+            # the forces that depend on the whole shape, from the motion just predicted
+            spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
+    for r in range(n):
+        old[r] = new[r]
+    for i in range(n_elements):
+        w = w_free[i]
+        for j in range(n_elements):
+            w += aw[i, j] * point[j]
+        if kinds[i] == BOUC_WEN:
+            z[i], _ = yield_update(z[i], w - w_old[i], parameters[i, 1])
+        w_old[i] = w
 
 
 @njit(cache=True, nogil=True)
-def _widened_rows(values: Floats, n: int) -> Floats:
-    wide = np.zeros((n, values.shape[1]))
-    wide[: values.shape[0]] = values
-    return wide
+def at_rest(
+    n: int, n_elements: int
+) -> tuple[
+    tuple[Floats, Floats, Floats],
+    tuple[Floats, Floats],
+    tuple[Floats, Floats, Floats],
+    tuple[Floats, Floats, Floats, Floats],
+    tuple[Floats, Floats, Floats, Floats, Floats, Floats],
+]:
+    """Arrays that `advance` takes: linear, drives, motion, points, work."""
+    linear = np.empty((2, 4, n)), np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
+    motion = np.zeros(n), np.zeros(n), np.zeros(n)
+    points = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
+    work = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
+    return linear, (np.zeros(n), np.zeros(n)), motion, points, work
 
 
 @njit(cache=True, nogil=True)
-def _widened_square(values: Floats, n: int) -> Floats:
-    if values.size == 0:
-        return values
-    wide = np.zeros((n, n))
-    wide[: values.shape[0], : values.shape[1]] = values
+def whole_lanes(
+    omega: Floats, c: Floats, coupling: Floats, stretching: Floats, drag_shapes: Floats, shapes: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """The same with modes at rest added, to a whole number of LANES."""
+    n = LANES * ((omega.size + LANES - 1) // LANES)
+    wide, damping, elements = np.ones(n), np.zeros(n), np.zeros((shapes.shape[0], n))
+    for r in range(omega.size):
+        wide[r], damping[r] = omega[r], c[r]
+        for i in range(shapes.shape[0]):
+            elements[i, r] = shapes[i, r]
+    return (
+        wide,
+        damping,
+        _widened(coupling, n, n if coupling.size > 0 else 0),
+        _widened(stretching, n, n if stretching.size > 0 else 0),
+        _widened(drag_shapes, n, drag_shapes.shape[1]),
+        elements,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _widened(values: Floats, n: int, columns: int) -> Floats:
+    wide = np.zeros((n, columns))
+    for r in range(values.shape[0]):
+        for s in range(values.shape[1]):
+            wide[r, s] = values[r, s]
     return wide
 
 
@@ -357,43 +488,28 @@ def step_record(
     """
     n_modes, n_elements, n_inputs = omega.size, kinds.size, starts.shape[0]
     n_samples = measured.shape[1] if measured.size > 0 else q_out.shape[1]
-    n = LANES * ((n_modes + LANES - 1) // LANES)
-    omega, c, coupling = _widened(omega, n, 1.0), _widened(c, n, 0.0), _widened_square(coupling, n)
-    stretching, drag_shapes = _widened_square(stretching, n), _widened_rows(drag_shapes, n)
-    shapes, into = _widened_rows(shapes.T, n).T.copy(), _widened_rows(participation, n).T.copy()
-    n_sensors = measured.shape[0]
+    omega, c, coupling, stretching, drag_shapes, shapes = whole_lanes(
+        omega, c, coupling, stretching, drag_shapes, shapes
+    )
+    n = LANES * (omega.size // LANES)  # so the compiler sees it
+    into, n_sensors = np.zeros((n_inputs, n)), measured.shape[0]
     seen, held = np.zeros((n_sensors, n)), np.zeros((2, n_sensors, n))
+    for r in range(n_modes):
+        for j in range(n_inputs):
+            into[j, r] = participation[r, j]
+        for j in range(n_sensors):
+            seen[j, r], held[0, j, r], held[1, j, r] = reading[j, r], gain[0, r, j], gain[1, r, j]
     accelerations = False
     for j in range(n_sensors):
         accelerations |= orders[j] == 2
-        for r in range(n_modes):
-            seen[j, r] = reading[j, r]
-            held[:, j, r] = gain[:, r, j]
     h = dt / n_sub
-    e = np.empty((2, 4, n))
-    propagators(omega, c, h, e)
-    q, v, base_q, base_v = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    old, new, spread = np.zeros(n), np.zeros(n), np.zeros(n)
-    drive, drive_end = np.zeros(n), np.zeros(n)
-    point, earlier = np.zeros(n_elements), np.zeros(n_elements)
-    w_free, v_free, w_old, z = np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements), np.zeros(n_elements)
-    aw, av = np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
-    distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
-    changed, push = np.empty(n), np.empty(drag_weights.size)
+    linear, drives, motion, points, work = at_rest(n, n_elements)
+    (drive, drive_end), (q, v, old), w_old, accelerated = drives, motion, points[2], np.zeros(n)
+    elements = kinds, shapes, parameters
+    along = stretch, stretching, drag_shapes, drag_weights, np.empty(drag_weights.size), coupling
     for k in range(n_samples):
-        if rate != 0.0:
-            scale = math.sqrt(max(1.0 + rate * (k + 0.5) * dt, 1e-6))
-            for r in range(n):
-                changed[r] = omega[r] * scale
-            propagators(changed, c, h, e)
         if k == 0 or rate != 0.0:
-            for i in range(n_elements):
-                for j in range(n_elements):
-                    aw[i, j] = 0.0
-                    av[i, j] = 0.0
-                    for r in range(n):
-                        aw[i, j] += shapes[i, r] * e[0, 3, r] * shapes[j, r]
-                        av[i, j] += shapes[i, r] * e[1, 3, r] * shapes[j, r]
+            drifted_propagators(omega, c, h, 1.0 + rate * (k + 0.5) * dt, shapes, linear)
         if measured.size == 0:
             for r in range(n_modes):
                 q_out[r, k] = q[r]
@@ -403,12 +519,12 @@ def step_record(
             if accelerations:
                 stiffer = 1.0 + rate * k * dt
                 for r in range(n):
-                    new[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
+                    accelerated[r] = old[r] - stiffer * omega[r] ** 2 * q[r] - c[r] * v[r]
             for j in range(n_sensors):
-                motion = q if orders[j] == 0 else v if orders[j] == 1 else new
+                moved = q if orders[j] == 0 else v if orders[j] == 1 else accelerated
                 read = 0.0
                 for r in range(n):
-                    read += seen[j, r] * motion[r]
+                    read += seen[j, r] * moved[r]
                 error_out[j, k] = measured[j, k] - read
             for j in range(n_sensors):
                 error = error_out[j, k]
@@ -430,64 +546,15 @@ def step_record(
                 for r in range(n):
                     drive[r] += into[j, r] * first
                     drive_end[r] += into[j, r] * last
-            for r in range(n):
-                start, end = old[r] + drive[r], drive_end[r]
-                base_q[r] = e[0, 0, r] * q[r] + e[0, 1, r] * v[r] + e[0, 2, r] * start + e[0, 3, r] * end
-                base_v[r] = e[1, 0, r] * q[r] + e[1, 1, r] * v[r] + e[1, 2, r] * start + e[1, 3, r] * end
-            if n_elements == 0 and not distributed:
-                for r in range(n):
-                    q[r] = base_q[r]
-                    v[r] = base_v[r]
-                continue
-            for i in range(n_elements):
-                guess = 2.0 * point[i] - earlier[i]
-                earlier[i], point[i] = point[i], guess
-            for sweep in range(2 if distributed else 1):
-                for i in range(n_elements):
-                    w, u = 0.0, 0.0
-                    for r in range(n):
-                        w += shapes[i, r] * (base_q[r] + e[0, 3, r] * spread[r])
-                        u += shapes[i, r] * (base_v[r] + e[1, 3, r] * spread[r])
-                    w_free[i], v_free[i] = w, u
-                settled = False
-                if n_elements == 1:
-                    point[0] = solve_element(
-                        kinds[0], parameters, 0, w_free[0], v_free[0], aw[0, 0], av[0, 0], z[0], w_old[0], point[0]
-                    )
-                    settled = True
-                elif n_elements == 2:
-                    f, g, settled = solve_pair(kinds, parameters, w_free, v_free, aw, av, z, w_old, point[0], point[1])
-                    if settled:
-                        point[0], point[1] = f, g
-                if n_elements > 1 and not settled:
-                    solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z, w_old, point)
-                for r in range(n):
-                    new[r] = spread[r]
-                for i in range(n_elements):
-                    force = point[i]
-                    for r in range(n):
-                        new[r] += shapes[i, r] * force
-                for r in range(n):
-                    q[r] = base_q[r] + e[0, 3, r] * new[r]
-                    v[r] = base_v[r] + e[1, 3, r] * new[r]
-                if distributed and sweep == 0:
-                    # the forces that depend on the whole shape, from the motion just predicted
-                    spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
-            for r in range(n):
-                old[r] = new[r]
-            for i in range(n_elements):
-                w = w_free[i]
-                for j in range(n_elements):
-                    w += aw[i, j] * point[j]
-                if kinds[i] == BOUC_WEN:
-                    z[i], _ = yield_update(z[i], w - w_old[i], parameters[i, 1])
-                w_old[i] = w
+            advance(linear, drives, elements, along, motion, points, work)
 
 
 def make_stepper(law: Callable[[float, float, Floats], float]) -> Callable[..., None]:
     """`step_record` with force(w, v, parameters) = `law` for the elements of kind USER, compiled for it."""
     scope = dict(globals(), user_law=njit(nogil=True)(law))
-    for name in ("element_force", "solve_element", "solve_pair", "solve_in_turn", "step_record"):
-        scope[name] = njit(nogil=True)(FunctionType(globals()[name].py_func.__code__, scope, name))
+    for name in ("element_force", "solve_element", "solve_pair", "solve_in_turn", "advance", "step_record"):
+        compiled = globals()[name]
+        options = {key: value for key, value in compiled.targetoptions.items() if key != "nopython"}
+        scope[name] = njit(**options)(FunctionType(compiled.py_func.__code__, scope, name))
     stepper: Callable[..., None] = scope["step_record"]
     return stepper

@@ -22,8 +22,6 @@ from workbench.design.laws.law import DesignError, Law
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 from workbench.structure.modes import Modes
 
 RATE = 200.0
@@ -34,12 +32,8 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="no C compiler, cc,
 
 
 @pytest.fixture(scope="module")
-def modes():
-    beam = Beam(
-        length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="hinged", right="hinged",
-        damping=ModalDamping(0.01),
-    )  # fmt: skip
-    return beam.modes(5)
+def modes(hinged_beam):
+    return hinged_beam.modes(5)
 
 
 @pytest.fixture(scope="module")

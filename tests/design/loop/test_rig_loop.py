@@ -17,24 +17,14 @@ from workbench.rig.elements import AirDrag, BoucWen, CoulombFriction, CubicSprin
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Beam
 
 DT = 0.005
 
 
 @pytest.fixture(scope="module")
-def rig():
-    beam = Beam(
-        length=2.0,
-        mass_per_length=1.0,
-        bending_stiffness=4.0,
-        left="hinged",
-        right="hinged",
-        damping=ModalDamping(0.01),
-    )
+def rig(hinged_beam):
     sensors = [Sensor(f"{q[0]}{i}", x, q) for q in ("displacement", "velocity") for i, x in enumerate((0.3, 0.7, 1.6))]
-    return Rig(beam.modes(5), (Actuator("F1", 0.45), Actuator("F2", 1.2)), tuple(sensors), structure=beam)
+    return Rig(hinged_beam.modes(5), (Actuator("F1", 0.45), Actuator("F2", 1.2)), tuple(sensors), structure=hinged_beam)
 
 
 def restless(rig: Rig, gain: float = 2.0) -> DigitalController:

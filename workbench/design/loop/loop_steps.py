@@ -10,16 +10,7 @@ from numba import njit
 
 from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import ONSET
-from workbench.rig.stepping import (
-    BOUC_WEN,
-    FAST,
-    propagators,
-    solve_element,
-    solve_in_turn,
-    solve_pair,
-    spread_forces,
-    yield_update,
-)
+from workbench.rig.stepping import FAST, LANES, advance, at_rest, drifted_propagators, whole_lanes, yield_update
 
 # As `loop_record` and `_commands` describe them.
 StructureArrays = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
@@ -43,6 +34,17 @@ def _headed(u: float, drive: Floats, j: int, z: Floats, before: Floats) -> float
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
+def _row(of_state: Floats, of_reading: Floats, i: int, z: Floats, y: Floats) -> float:
+    """What a row of two matrices makes of a state and a reading."""
+    s = 0.0
+    for m in range(z.size):
+        s += of_state[i, m] * z[m]
+    for m in range(y.size):
+        s += of_reading[i, m] * y[m]
+    return s
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
 def _commands(
     controller: ControllerArrays, k: int, reading: Floats, z: Floats, z_next: Floats, v: Floats, command: Floats
 ) -> None:
@@ -50,28 +52,19 @@ def _commands(
     (a, b, c, d, e), (offset, scale, limit, rate, dead, bias), (spread, on, band), (push, cf, df, force, smooth) = (
         controller
     )
-    nz, ny, nu = a.shape[0], b.shape[1], limit.size
-    n_out, n_friction = c.shape[0], force.size
+    nu = limit.size
     y = scale * (reading - offset)
     w = np.zeros(nu)
-    for i in range(n_out):
-        s = 0.0
-        for m in range(nz):
-            s += c[i, m] * z[m]
-        for m in range(ny):
-            s += d[i, m] * y[m]
+    for i in range(c.shape[0]):
+        s = _row(c, d, i, z, y)
         if on.size > 0:
             if abs(s) > band[i]:
                 for j in range(nu):
                     w[j] -= spread[j, i] * math.copysign(on[i], s)
         else:
             w[i] = s
-    for i in range(n_friction):
-        s = 0.0
-        for m in range(nz):
-            s += cf[i, m] * z[m]
-        for m in range(ny):
-            s += df[i, m] * y[m]
+    for i in range(force.size):
+        s = _row(cf, df, i, z, y)
         for j in range(nu):
             w[j] += push[j, i] * force[i] * math.tanh(s / smooth[i])
     for j in range(nu):
@@ -80,16 +73,11 @@ def _commands(
         v[j] = held
         onset = min(max(held / (ONSET * dead[j]), -1.0), 1.0) if dead[j] > 0.0 else 0.0
         command[j, k] = held + dead[j] * onset - bias[j]
-    for i in range(nz):
-        s = 0.0
-        for m in range(nz):
-            s += a[i, m] * z[m]
-        for m in range(ny):
-            s += b[i, m] * y[m]
+    for i in range(z.size):
+        z_next[i] = _row(a, b, i, z, y)
         for m in range(nu):
-            s += e[i, m] * v[m]
-        z_next[i] = s
-    for i in range(nz):
+            z_next[i] += e[i, m] * v[m]
+    for i in range(z.size):
         z[i] = z_next[i]
 
 
@@ -132,25 +120,18 @@ def loop_record(
     omega, damping, coupling, stiffening, stretch, stretching, drag_shapes, drag_weights = structure
     kinds, shapes, parameters = laws
     q_out, v_out, f_out, u_out, ew, ev, ef = out
-    n, n_el, nu, ny = omega.size, kinds.size, drive.shape[0], sense.shape[0]
+    n_modes, n_el, nu, ny = omega.size, kinds.size, drive.shape[0], sense.shape[0]
     n_samples, h = noise.shape[1], dt / n_sub
     n_dis = disturbance.shape[0]
-    prop = np.empty((2, 4, n))
-    propagators(omega, damping, h, prop)
-    q, v = start[0].copy(), start[1].copy()
-    old, new, spread, drives, base_q, base_v = (
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
-        np.zeros(n),
+    omega, damping, coupling, stretching, drag_shapes, shapes = whole_lanes(
+        omega, damping, coupling, stretching, drag_shapes, shapes
     )
-    changed, push = np.empty(n), np.empty(drag_weights.size)
-    point, earlier, z_el = np.zeros(n_el), np.zeros(n_el), np.zeros(n_el)
-    w_free, v_free, w_old = np.zeros(n_el), np.zeros(n_el), np.zeros(n_el)
-    aw, av = np.zeros((n_el, n_el)), np.zeros((n_el, n_el))
-    distributed = stretch != 0.0 or drag_weights.size > 0 or coupling.size > 0
+    linear, drives, motion, points, work = at_rest(LANES * (omega.size // LANES), n_el)
+    modal, (q, v, _), (point, _, w_old, _) = drives[0], motion, points
+    for r in range(n_modes):
+        q[r], v[r] = start[0, r], start[1, r]
+    elements = kinds, shapes, parameters
+    along = stretch, stretching, drag_shapes, drag_weights, np.empty(drag_weights.size), coupling
     fine = n_samples * n_sub
     held = np.zeros((nu, fine))
     target, ramp, acting, hyst, before = np.zeros(nu), np.zeros(nu), np.zeros(nu), np.zeros(nu), np.zeros(nu)
@@ -158,26 +139,15 @@ def loop_record(
     nz = controller[0][0].shape[0]
     z, z_next, followed = np.zeros(nz), np.zeros(nz), np.zeros(nu)
     for j in range(ny):
-        for r in range(n):
+        for r in range(n_modes):
             truth[j, 0] += seen[0, j, r] * q[r] + seen[1, j, r] * v[r]
         unlagged[j] = truth[j, 0]
     for i in range(n_el):
-        for r in range(n):
+        for r in range(n_modes):
             w_old[i] += shapes[i, r] * q[r]
     for k in range(n_samples):
-        if stiffening != 0.0:
-            root = math.sqrt(max(1.0 + stiffening * (k + 0.5) * dt, 1e-6))
-            for r in range(n):
-                changed[r] = omega[r] * root
-            propagators(changed, damping, h, prop)
         if k == 0 or stiffening != 0.0:
-            for i in range(n_el):
-                for j in range(n_el):
-                    aw[i, j] = 0.0
-                    av[i, j] = 0.0
-                    for r in range(n):
-                        aw[i, j] += shapes[i, r] * prop[0, 3, r] * shapes[j, r]
-                        av[i, j] += shapes[i, r] * prop[1, 3, r] * shapes[j, r]
+            drifted_propagators(omega, damping, h, 1.0 + stiffening * (k + 0.5) * dt, shapes, linear)
         # --- read
         for j in range(ny):
             y = truth[j, k * n_sub]
@@ -191,14 +161,14 @@ def loop_record(
             reading[j] = sense[j, 6] * np.round(y / sense[j, 6]) if sense[j, 6] > 0.0 else y
         # --- command
         _commands(controller, k, reading, z, z_next, followed, u_out)
-        for r in range(n):
+        for r in range(n_modes):
             q_out[r, k] = q[r]
             v_out[r, k] = v[r]
             if not abs(q[r]) <= RUN_AWAY:
                 return False
         for i in range(n_el):
             speed = 0.0
-            for r in range(n):
+            for r in range(n_modes):
                 speed += shapes[i, r] * v[r]
             ew[i, k], ev[i, k], ef[i, k] = w_old[i], speed, point[i]
         # --- act and move
@@ -207,11 +177,11 @@ def loop_record(
             target[j] = _headed(u_out[j, k], drive, j, hyst, before)
         for sub in range(n_sub):
             now = k * n_sub + sub
-            for r in range(n):
-                drives[r] = 0.0
+            for r in range(n_modes):
+                modal[r] = 0.0
             for j in range(n_dis):
-                for r in range(n):
-                    drives[r] += at[r, j] * disturbance[j, k]
+                for r in range(n_modes):
+                    modal[r] += at[r, j] * disturbance[j, k]
             for j in range(nu):
                 held[j, now] = target[j]
                 if drive[j, 6] < math.inf:
@@ -234,71 +204,12 @@ def loop_record(
                     force += left * (1.0 - fade) * drive[j, 4] / h
                 force += drive[j, 5]
                 f_out[j, k] += force / n_sub
-                for r in range(n):
-                    drives[r] += into[r, j] * force
-            for r in range(n):
-                first, last = old[r] + drives[r], drives[r]
-                base_q[r] = prop[0, 0, r] * q[r] + prop[0, 1, r] * v[r] + prop[0, 2, r] * first + prop[0, 3, r] * last
-                base_v[r] = prop[1, 0, r] * q[r] + prop[1, 1, r] * v[r] + prop[1, 2, r] * first + prop[1, 3, r] * last
-            if n_el == 0 and not distributed:
-                for r in range(n):
-                    q[r], v[r] = base_q[r], base_v[r]
-            else:
-                for i in range(n_el):
-                    guess = 2.0 * point[i] - earlier[i]
-                    earlier[i], point[i] = point[i], guess
-                for sweep in range(2 if distributed else 1):
-                    for i in range(n_el):
-                        w, u = 0.0, 0.0
-                        for r in range(n):
-                            w += shapes[i, r] * (base_q[r] + prop[0, 3, r] * spread[r])
-                            u += shapes[i, r] * (base_v[r] + prop[1, 3, r] * spread[r])
-                        w_free[i], v_free[i] = w, u
-                    settled = n_el == 0
-                    if n_el == 1:
-                        point[0] = solve_element(
-                            kinds[0],
-                            parameters,
-                            0,
-                            w_free[0],
-                            v_free[0],
-                            aw[0, 0],
-                            av[0, 0],
-                            z_el[0],
-                            w_old[0],
-                            point[0],
-                        )
-                        settled = True
-                    elif n_el == 2:
-                        one, two, settled = solve_pair(
-                            kinds, parameters, w_free, v_free, aw, av, z_el, w_old, point[0], point[1]
-                        )
-                        if settled:
-                            point[0], point[1] = one, two
-                    if not settled:
-                        solve_in_turn(kinds, parameters, w_free, v_free, aw, av, z_el, w_old, point)
-                    for r in range(n):
-                        new[r] = spread[r]
-                    for i in range(n_el):
-                        for r in range(n):
-                            new[r] += shapes[i, r] * point[i]
-                    for r in range(n):
-                        q[r] = base_q[r] + prop[0, 3, r] * new[r]
-                        v[r] = base_v[r] + prop[1, 3, r] * new[r]
-                    if distributed and sweep == 0:
-                        spread_forces(q, v, stretch, stretching, drag_shapes, drag_weights, push, coupling, spread)
-                for r in range(n):
-                    old[r] = new[r]
-                for i in range(n_el):
-                    w = w_free[i]
-                    for j in range(n_el):
-                        w += aw[i, j] * point[j]
-                    if kinds[i] == BOUC_WEN:
-                        z_el[i], _ = yield_update(z_el[i], w - w_old[i], parameters[i, 1])
-                    w_old[i] = w
+                for r in range(n_modes):
+                    modal[r] += into[r, j] * force
+            advance(linear, (modal, modal), elements, along, motion, points, work)
             for j in range(ny):
                 y = 0.0
-                for r in range(n):
+                for r in range(n_modes):
                     y += seen[0, j, r] * q[r] + seen[1, j, r] * v[r]
                 truth[j, now + 1] = y
                 if sense[j, 4] > 0.0:
