@@ -201,7 +201,7 @@ def unknown_forces(structure: Structure):
 WAYS = {
     "one ring-down": one,
     "three ring-downs together": together,
-    "a hand on it before, let go at a time not told": held_before,
+    "held before, released at a time not given": held_before,
     "one sensor only": lambda structure: one(structure, ("acceleration",)),
     "displacement, velocity and acceleration": lambda structure: one(structure, tuple(DERIVATIVE)),
     "noise that is not white": lambda structure: one(structure, tail=TAIL),
@@ -233,20 +233,20 @@ def study(outcome, data: Path | None = None) -> None:
     summary = {way: summed(way, rows[way]) for way in WAYS}
     outcome.table("records", summary)
     for way, totals in summary.items():
-        outcome.check(f"{way}: share of the modes told that are there", totals["precision"], 0.98, at_least=True)
-        outcome.check(f"{way}: share of the modes there that are told", totals["recall"], 0.98, at_least=True)
+        outcome.check(f"{way}: precision", totals["precision"], 0.98, at_least=True)
+        outcome.check(f"{way}: recall", totals["recall"], 0.98, at_least=True)
         if way == "unknown forces":
             continue
-        outcome.check(f"{way}: rms error over the least possible", totals["over_bound"], 1.1)
-        outcome.check(f"{way}: share of 95 % intervals that hold the truth", totals["inside"], 0.92, at_least=True)
+        outcome.check(f"{way}: rms error over the Cramér-Rao bound", totals["over_bound"], 1.1)
+        outcome.check(f"{way}: coverage of 95 % intervals", totals["inside"], 0.92, at_least=True)
     unknown = summary["unknown forces"]
     outcome.say(
         f"under unknown forces {100 * unknown['recall']:.0f} % of the modes are found, and 95 % intervals hold the"
         f" truth in {100 * unknown['inside']:.0f} %"
     )
     worst = max(errors, key=lambda way: summary[way]["over_bound"] * (way != "unknown forces"))
-    outcome.say(f"rms error over the least possible: at most {summary[worst]['over_bound']:.3g} ({worst})")
-    late = np.array([row["late"] for row in rows["a hand on it before, let go at a time not told"]])
+    outcome.say(f"rms error over the Cramér-Rao bound: at most {summary[worst]['over_bound']:.3g} ({worst})")
+    late = np.array([row["late"] for row in rows["held before, released at a time not given"]])
     outcome.table("start", {"late_in_shortest_periods": late})
     near = float((np.abs(late) < 1.0).mean())
     outcome.check("start of the decay: share found to the shortest period", near, 0.95, at_least=True)
@@ -257,8 +257,8 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.figure(
         "errors",
         records_errors(errors, summary),
-        "Error of each frequency and damping ratio, in the least standard error possible, by the kind of record. Grey:"
-        " what a perfect method would show.",
+        "Error of each frequency and damping ratio, in standard errors by the Cramér-Rao bound, by the kind of record."
+        " Grey: what a perfect method would show.",
     )
 
 
@@ -278,16 +278,16 @@ def summed(way: str, rows: list[dict]) -> dict:
 def by_amplitude(outcome) -> None:
     """A mass on a hardening spring beside linear ones: x'' + 2ζω x' + ω² x + κ x³ = 0, ω(A) = ω + 3κA²/8ω."""
     omega, zeta, kappa, time = 10.0, 0.004, 6.0, 0.02 * np.arange(3000)
-    swing = solve_ivp(
+    motion = solve_ivp(
         lambda t, y: [y[1], -2.0 * zeta * omega * y[1] - omega**2 * y[0] - kappa * y[0] ** 3],
         (0.0, time[-1]), [1.0, 0.0], t_eval=time, method="DOP853", rtol=1e-8, atol=1e-10,
     ).y[0]  # fmt: skip
     noise = 1e-3 * np.random.default_rng(FIRST_SEED).standard_normal(time.size)
-    decay = ring_down(Record(0.02, (swing + noise)[None], (Channel("x", "displacement"),)), n_modes=1).by_amplitude
+    decay = ring_down(Record(0.02, (motion + noise)[None], (Channel("x", "displacement"),)), n_modes=1).by_amplitude
     backbone = omega + 3.0 * kappa * decay.amplitude[:, 0] ** 2 / (8.0 * omega)
     apart = np.nanmax(np.abs(decay.omega[:, 0] - backbone)) / np.nanmax(backbone - omega)
     outcome.table("backbone", {"amplitude": decay.amplitude[:, 0], "omega": decay.omega[:, 0], "exact": backbone})
-    outcome.check("hardening spring: dependence on amplitude not seen", 0 if decay.depends.all() else 1, 0)
+    outcome.check("hardening spring: dependence on amplitude missed", 0 if decay.depends.all() else 1, 0)
     outcome.check("hardening spring: error of the backbone over its rise", apart, 0.1)
     alarms = 0
     for k in range(DRAWS):
@@ -295,7 +295,8 @@ def by_amplitude(outcome) -> None:
         alarms += int(amplitude_dependence(record, identify(record).refined).depends.any())
     outcome.check("linear structures said to depend on amplitude", alarms, 0)
     outcome.say(
-        f"a backbone is read to {100 * apart:.2g} % of its rise; of {DRAWS} linear structures {alarms} seem bent"
+        f"a backbone is read to {100 * apart:.2g} % of its rise; of {DRAWS} linear structures {alarms} seem to depend"
+        " on amplitude"
     )
 
 
@@ -306,6 +307,6 @@ def arm(outcome, data: Path) -> None:
     found = decay.modes.frequencies_hz
     apart = [float(np.abs(found / seen - 1.0).min()) for seen in SEEN_ON_THE_ARM]
     outcome.table("arm", {"start": decay.records[0].start_time, "frequencies_hz": found, "zeta": decay.modes.zeta})
-    outcome.check("arm: frequencies seen by eye and the nearest found, relative", max(apart), 0.02)
+    outcome.check("arm: frequencies picked by eye and the nearest identified, relative", max(apart), 0.02)
     outcome.say(f"the hand leaves the arm at {decay.records[0].start_time:.3f} s; modes at "
                 + ", ".join(f"{f:.4g}" for f in found) + " Hz")  # fmt: skip

@@ -62,7 +62,9 @@ ROWS = {
     "95 % intervals": lambda r: min(c["value"] for c in r["checks"] if c["name"].endswith("from below")),
     "200 sensors": lambda r: _largest(r, "modes", "at full size"),
     "the same, processor time": lambda r: _largest(r, "processor seconds"),
-    "eight kinds of record": lambda r: _largest(r, "rms error over the least possible"),
+    "eight kinds of record": lambda r: max(
+        row["over_bound"] for row in r["records"].values() if row["bound"] == "Cramér-Rao"
+    ),
     "every law with every way": lambda r: _largest(r, "crowded: cost of IMSC"),
     "a fifth of the stiffness": lambda r: min(c["value"] for c in r["checks"] if "found and placed" in c["name"]),
     "worst mode of fifty": lambda r: _largest(r, "median worst mode over the best peer's"),
