@@ -6,7 +6,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.signal import butter, filtfilt
 
-from workbench.draw.gap import plot_budget, plot_missing_force, plot_responses
+from workbench.draw.gap import plot_budget, plot_responses, plot_unmodelled_force
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -119,7 +119,7 @@ def study(outcome, data: Path) -> None:
     kinds = {effect.kind.name for each in verdicts.values() for effect in each.effects if not effect.kind.first}
     friction_alone = kinds <= {"coulomb_friction", "two_way_friction", "actuator_bias"}
     outcome.check("effects named that are neither friction nor a constant force", int(not friction_alone), 0)
-    outcome.figure("force", plot_missing_force(verdict), "The force that mass and viscous friction lack.")
+    outcome.figure("force", plot_unmodelled_force(verdict), "Force beyond mass and viscous friction.")
     outcome.figure("budget", plot_budget(verdict.budget), "What causes the gap of the model, on the record held out.")
     rigs = {"mass and viscous friction": verdict.nominal, "corrected": verdict.corrected}
     both = records["velocity"]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.optimize import least_squares
 
-from workbench.draw.gap import plot_budget, plot_missing_force
+from workbench.draw.gap import plot_budget, plot_unmodelled_force
 from workbench.gap.diagnose import diagnose
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -91,5 +91,5 @@ def study(outcome, data: Path) -> None:
     outcome.table("rmse", errors)
     outcome.check("held-out multisines: RMSE after, V", errors["multisines"]["after"], 0.5e-3)
     outcome.check("arrow: RMSE after, V", errors["arrow"]["after"], 0.8e-3)
-    outcome.figure("force", plot_missing_force(verdict), "The force that the linear model lacks, against the motion.")
+    outcome.figure("force", plot_unmodelled_force(verdict), "Force beyond the linear model, against the motion.")
     outcome.figure("budget", plot_budget(verdict.budget), "What causes the gap of the linear model, held out.")

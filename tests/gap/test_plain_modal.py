@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from workbench.cases.case import read_case
-from workbench.draw.gap import plot_missing_force, plot_where
+from workbench.draw.gap import plot_unmodelled_force, plot_where
 from workbench.gap.diagnose import diagnose
 
 MASS, DAMPING, STIFFNESS, CUBIC = 2.0, 1.6, 800.0, 4e5
@@ -62,4 +62,4 @@ def test_a_hardening_spring_is_named_at_the_input_where_it_stands(case):
     assert " at F " in verdict.sentence and "x =" not in verdict.sentence
     labels = [text.get_text() for text in plot_where(verdict).axes[5].get_xticklabels()]
     assert labels == ["F", "w"]
-    assert "at F" in plot_missing_force(verdict).axes[0].get_xlabel()
+    assert "at F" in plot_unmodelled_force(verdict).axes[0].get_xlabel()

@@ -9,7 +9,7 @@ import pytest
 from workbench.draw.style import new_figure
 from workbench.study.catalogue import StudyError, describe
 from workbench.study.outcome import Outcome, plain
-from workbench.study.page import Story, study_page, write_page
+from workbench.study.page import PageContent, study_page, write_page
 
 
 class Tags(HTMLParser):
@@ -71,7 +71,7 @@ def test_a_page_is_one_file_and_escapes_what_it_is_told(tmp_path):
 
 
 def test_hostile_table_cells_are_escaped(tmp_path):
-    path = write_page(tmp_path / "p.html", Story("t", tables=[("<b>", ("<i>",), [("</td><img src=x>",)])]))
+    path = write_page(tmp_path / "p.html", PageContent("t", tables=[("<b>", ("<i>",), [("</td><img src=x>",)])]))
     tags = Tags()
     tags.feed(path.read_text(encoding="utf-8"))
     assert not {"b", "i", "img"} & {tag for tag, _ in tags.found}

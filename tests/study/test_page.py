@@ -15,8 +15,8 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
-from workbench.study.page import Story, block, story_of, write_page
-from workbench.study.report import story_in
+from workbench.study.page import PageContent, block, page_content_of, write_page
+from workbench.study.report import page_content_in
 
 WIDTHS = (390, 1200)
 HOSTILE = "</script><script>document.title='taken'</script><img src=x onerror=\"document.title='taken'\">"
@@ -58,7 +58,7 @@ def page(tmp_path_factory):
     response = respond(close_loop(modes, law), impulse_state(modes, 6.3), np.linspace(0.0, 20.0, 201))
     sensors = [Sensor("y1", 4.0, "displacement")]
     sampled = SampledModes(modes.omega, modes.zeta, modes.phi([2.0, 5.0, 8.0]) * (1 + 0.3j), [2.0, 5.0, 8.0])
-    story = Story(
+    page_content = PageContent(
         title="Is it " + HOSTILE + "?",
         lead=HOSTILE,
         lines=(HOSTILE,),
@@ -71,7 +71,7 @@ def page(tmp_path_factory):
         inputs={"case.toml": HOSTILE},
         made_by="workbench study " + HOSTILE,
     )
-    return write_page(tmp_path_factory.mktemp("page") / "p.html", story)
+    return write_page(tmp_path_factory.mktemp("page") / "p.html", page_content)
 
 
 @pytest.mark.parametrize("width", WIDTHS)
@@ -156,26 +156,26 @@ def test_tables_sort_and_the_page_follows_light_dark_and_paper(page, look):
 def test_a_damaged_figure_leaves_the_others_drawn(page, look, drawn, tmp_path):
     content = json.loads(page.with_suffix(".page.json").read_text())
     content["blocks"] = [{"caption": "damaged", "figure": {}}, {"caption": "moved", "motion": 3}, content["blocks"][0]]
-    browser = look(write_page(tmp_path / "p.html", story_of(content)).as_uri(), 1200)
+    browser = look(write_page(tmp_path / "p.html", page_content_of(content)).as_uri(), 1200)
     drawn(browser, 4)
     damaged = [stage.text for stage in browser.find_elements("css selector", ".stage")]
     assert damaged[:2] == ["This figure is damaged."] * 2
     assert len(browser.get_log("browser")) == 2
 
 
-def test_the_story_beside_the_page_makes_the_same_page_again(page, tmp_path):
-    again = write_page(tmp_path / "p.html", story_in(page.with_suffix(".page.json")))
+def test_the_content_beside_the_page_makes_the_same_page_again(page, tmp_path):
+    again = write_page(tmp_path / "p.html", page_content_in(page.with_suffix(".page.json")))
     assert again.read_bytes() == page.read_bytes()
 
 
 @pytest.mark.parametrize("name", ["title", "blocks", "tables", "versions"])
-def test_a_damaged_story_is_refused(page, name):
+def test_a_damaged_content_is_refused(page, name):
     content = json.loads(page.with_suffix(".page.json").read_text())
     with pytest.raises(ValueError, match=name):
-        story_of({**content, name: 3})
+        page_content_of({**content, name: 3})
     del content[name]
     with pytest.raises(ValueError, match=name):
-        story_of(content)
+        page_content_of(content)
 
 
 def test_a_figure_becomes_its_numbers():

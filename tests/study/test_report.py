@@ -6,7 +6,7 @@ import pytest
 
 from workbench.study.cases import StudyError
 from workbench.study.page import write_page
-from workbench.study.report import story_about, story_in
+from workbench.study.report import page_content_about, page_content_in
 
 VERDICT = {
     "case": "arm", "outcome": "explained", "sentence": "A spring explains it.", "nearest": [], "notes": ["a note"],
@@ -42,66 +42,66 @@ def written(tmp_path, content, name="file.json"):
     return path
 
 
-def test_a_verdict_tells_its_story(tmp_path):
-    story = story_in(written(tmp_path, VERDICT))
-    assert story.title == "Diagnosis of arm" and story.lead == "A spring explains it."
-    assert story.lines == ["a note", "Strike it."]
-    assert story.tables[0][2] == [["ground spring", "stiffness", "2.00", "0.10", 3.0]] and story.standing == "good"
-    assert story.tables[1][2] == [["r", 0.5, 0.02, 0.01]]
-    boxes = [mark["boxes"][0][3] for mark in story.blocks[0]["figure"]["panels"][0]["marks"]]
+def test_a_verdict_makes_a_page(tmp_path):
+    shown = page_content_in(written(tmp_path, VERDICT))
+    assert shown.title == "Diagnosis of arm" and shown.lead == "A spring explains it."
+    assert shown.lines == ["a note", "Strike it."]
+    assert shown.tables[0][2] == [["ground spring", "stiffness", "2.00", "0.10", 3.0]] and shown.standing == "good"
+    assert shown.tables[1][2] == [["r", 0.5, 0.02, 0.01]]
+    boxes = [mark["boxes"][0][3] for mark in shown.blocks[0]["figure"]["panels"][0]["marks"]]
     assert boxes == [0.5, 0.02, 0.01]
 
 
 def test_identified_modes_swing(tmp_path):
-    [moving, damping] = story_in(written(tmp_path, IDENTIFIED)).blocks
+    [moving, damping] = page_content_in(written(tmp_path, IDENTIFIED)).blocks
     [track] = moving["motion"]["tracks"]
     assert track["x"] == [1.0, 2.0] and track["frequencies_hz"] == [3.0] and "figure" in damping
     assert track["imaginary"] == [[0.0], [0.1]]
 
 
 def test_a_design_shows_what_it_spills(tmp_path):
-    story = story_in(written(tmp_path, DESIGNED))
+    shown = page_content_in(written(tmp_path, DESIGNED))
     heads = ("law", "cost", "effort", "peak force", "W_R", "loop")
-    assert story.tables == [("Laws", heads, [["IMSC", 1.0, 2.0, 3.0, 0.75, "stable"]])]
-    [bars] = [m for m in story.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "bars"]
+    assert shown.tables == [("Laws", heads, [["IMSC", 1.0, 2.0, 3.0, 0.75, "stable"]])]
+    [bars] = [m for m in shown.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "bars"]
     assert [box[3] for box in bars["boxes"]] == [0.25, 0.5]
 
 
 def test_a_design_says_which_loops_are_unstable(tmp_path):
     sensed = [{"design": name, "margin": margin, "stable": margin > 0, "robustness": None}
               for name, margin in (("IMSC, filter", 0.1), ("IMSC, observer", -0.2))]  # fmt: skip
-    story = story_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
-    assert story.lead.startswith("Unstable on the full plant: IMSC, observer.") and story.standing == "part"
-    page = write_page(tmp_path / "p.html", story).read_text(encoding="utf-8")
+    shown = page_content_in(written(tmp_path, {**DESIGNED, "through_sensors": sensed}))
+    assert shown.lead.startswith("Unstable on the full plant: IMSC, observer.") and shown.standing == "part"
+    page = write_page(tmp_path / "p.html", shown).read_text(encoding="utf-8")
     assert '<p class="lead part">' in page
 
 
 def test_a_placement_shows_where_and_how_surely(tmp_path):
-    story = story_in(written(tmp_path, PLACED))
-    assert story.lead.startswith("Actuators at 2, 6 m leave spillover work W_R = 0.25. ")
-    assert story.lead.endswith("No placement within the limits has W_R below 0.2.")
-    [places] = [m for m in story.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "line"]
+    shown = page_content_in(written(tmp_path, PLACED))
+    assert shown.lead.startswith("Actuators at 2, 6 m leave spillover work W_R = 0.25. ")
+    assert shown.lead.endswith("No placement within the limits has W_R below 0.2.")
+    [places] = [m for m in shown.blocks[0]["figure"]["panels"][0]["marks"] if m["kind"] == "line"]
     assert places["x"] == [2.0, 6.0]
 
 
 def test_one_sensor_has_no_shape_and_remarks_are_kept(tmp_path):
     one = {**IDENTIFIED, "positions": [None], "shapes_real": [[1.0]], "shapes_imag": [[0.0]]}
-    story = story_in(written(tmp_path, {**one, "heading": "1 sensor", "lines": ["mode 1: mains hum?"]}))
-    assert story.lead == "1 sensor" and story.lines == ["mode 1: mains hum?"]
-    assert all("motion" not in one for one in story.blocks)
+    shown = page_content_in(written(tmp_path, {**one, "heading": "1 sensor", "lines": ["mode 1: mains hum?"]}))
+    assert shown.lead == "1 sensor" and shown.lines == ["mode 1: mains hum?"]
+    assert all("motion" not in one for one in shown.blocks)
 
 
 def test_whole_numbers_of_a_design_make_a_page(tmp_path):
     law = {"law": "a", "cost": 1, "effort": 1, "peak_force": 1, "work": [1, 2], "poles_real": [-1], "poles_imag": [1]}
-    page = write_page(tmp_path / "p.html", story_in(written(tmp_path, {"laws": [law]})))
+    page = write_page(tmp_path / "p.html", page_content_in(written(tmp_path, {"laws": [law]})))
     assert "W_R" in page.read_text(encoding="utf-8")
 
 
 def test_results_of_a_study_and_any_rows_become_tables(tmp_path):
-    story = story_in(written(tmp_path, STUDIED))
-    assert story.tables[0] == ("front", ("x", "y", "z"), [["1", "<b>", ""], ["2", "", "1, 2"]])
-    assert story.tables[1][2] == [["c", 0.5, "≤ 1", True]] and story.lines == ["a line"]
-    rows = story_in(written(tmp_path, [{"a": 1}], "rows.json"))
+    shown = page_content_in(written(tmp_path, STUDIED))
+    assert shown.tables[0] == ("front", ("x", "y", "z"), [["1", "<b>", ""], ["2", "", "1, 2"]])
+    assert shown.tables[1][2] == [["c", 0.5, "≤ 1", True]] and shown.lines == ["a line"]
+    rows = page_content_in(written(tmp_path, [{"a": 1}], "rows.json"))
     assert rows.title == "rows" and rows.tables == [("rows", ("a",), [["1"]])]
 
 
@@ -125,7 +125,7 @@ def test_results_of_a_study_and_any_rows_become_tables(tmp_path):
 )
 def test_what_is_something_else_is_refused(tmp_path, content, words):
     with pytest.raises(StudyError, match=words):
-        story_in(written(tmp_path, content))
+        page_content_in(written(tmp_path, content))
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -133,11 +133,11 @@ def test_what_is_something_else_is_refused(tmp_path, content, words):
 def test_no_wrong_part_ends_in_anything_but_a_story_or_a_refusal(tmp_path, kind, fault):
     for name in KINDS[kind]:
         try:
-            story = story_in(written(tmp_path, {**KINDS[kind], name: fault}))
+            shown = page_content_in(written(tmp_path, {**KINDS[kind], name: fault}))
         except StudyError:
             continue
-        assert all(isinstance(line, str) for line in (story.title, story.lead, *story.lines))
-        assert all(len(row) == len(heads) for _, heads, rows in story.tables for row in rows)
+        assert all(isinstance(line, str) for line in (shown.title, shown.lead, *shown.lines))
+        assert all(len(row) == len(heads) for _, heads, rows in shown.tables for row in rows)
 
 
 def test_a_study_that_has_not_run_says_so(tmp_path, monkeypatch):
@@ -145,6 +145,6 @@ def test_a_study_that_has_not_run_says_so(tmp_path, monkeypatch):
     (tmp_path / "studies/some.py").write_text('"""Why?"""\ndef study(outcome, data=None): ...\n')
     monkeypatch.chdir(tmp_path)
     with pytest.raises(StudyError, match="study some has left no page here; run it: workbench study some"):
-        story_about("some")
+        page_content_about("some")
     with pytest.raises(StudyError, match="no study is called 'other'"):
-        story_about("other")
+        page_content_about("other")

@@ -66,14 +66,14 @@ def _check_against_predictor(kinds: tuple[str, ...], seed: int) -> None:
 
 
 @pytest.mark.parametrize("kinds", QUICK, ids=lambda kinds: "+".join(kinds) or "none")
-def test_two_numerical_routes_tell_the_same_story(kinds):
+def test_two_numerical_routes_agree(kinds):
     _check_against_predictor(kinds, seed=11)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "random_disturbance"])
 @pytest.mark.parametrize("seed", [21, 22])
-def test_two_numerical_routes_tell_the_same_story_of_every_kind(kind, seed):
+def test_two_numerical_routes_agree_of_every_kind(kind, seed):
     _check_against_predictor((kind,), seed)
 
 

@@ -48,7 +48,7 @@ def table_of(path: Path) -> dict[str, Any]:
 
 
 def check_keys(entry: dict[str, Any], allowed: Iterable[str], where: str) -> None:
-    """Refuse a key that nothing would read: a misspelt one would change the case unseen.
+    """Refuse a key that nothing would read: a misspelt one would change the case unnoticed.
 
     Raises:
         CaseError: naming the key, and the one that was meant.

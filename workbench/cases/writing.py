@@ -69,7 +69,7 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
         return [_plate(structure, rig.modes.n_modes), *_ports(rig, at=lambda where: {"at": list(where)})]
     if not isinstance(points, NamedPoints):
         raise ValueError(
-            "a case folder tells a beam, a rod, a plate, or modes at named points; this is a membrane, or a rig"
+            "a case folder describes a beam, a rod, a plate, or modes at named points; this is a membrane, or a rig"
             " without its structure"
         )
     if points.positions is not None:

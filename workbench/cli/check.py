@@ -46,11 +46,11 @@ def check(
         raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; check one that was not")
     with progress_bar() as progress:
         report = reporter(progress, "reading")
-        told = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers, report=report)
-    result = check_prediction(told, measured)
+        prediction = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers, report=report)
+    result = check_prediction(prediction, measured)
     head, *rest = str(result).splitlines()
     say(head, bold=True)
-    for line in (*rest, *told.notes):
+    for line in (*rest, *prediction.notes):
         say(line)
     log_test(log, result)
     tests = read_log(log)
@@ -70,5 +70,5 @@ def check(
         },
     )
     target = page or Path("out") / f"{found.name}-check.html"
-    shown = prediction_page(told, target, name=found.name, folder=case, check=result, measured=measured)
+    shown = prediction_page(prediction, target, name=found.name, folder=case, check=result, measured=measured)
     say(f"  page       {short(shown)}")

@@ -37,6 +37,6 @@ def look(
     console.print(table)
     for remark in seen.remarks:
         say(f"  {remark}")
-    say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', seen.story))}")
+    say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', seen.page_content))}")
     command = seen.command + (f" --sample-rate-hz {sample_rate_hz:g}" if sample_rate_hz else "")
     say(f"  go on    {command}")

@@ -33,10 +33,10 @@ def possible_rig(
 
     if verdict is not None:
         return read_verdict(verdict, case.rig)
-    told = diagnose(
+    verdict = diagnose(
         case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report
     )  # fmt: skip
-    return UncertainRig.of(told), told.budget.noise_found or None
+    return UncertainRig.of(verdict), verdict.budget.noise_found or None
 
 
 def predicted(
@@ -68,8 +68,8 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
     from workbench.robust.posterior import UncertainRig
 
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
-        posterior, noise = told["posterior"], told.get("noise", {}).get("found")
+        content = json.loads(path.read_text(encoding="utf-8"))
+        posterior, noise = content["posterior"], content.get("noise", {}).get("found")
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
         raise ValueError(
             f"{path} holds no verdict with its uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
@@ -80,16 +80,16 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
         raise ValueError(f"{path} is no verdict of this case: {error}; diagnose it again") from None
 
 
-def record_of(case: "Case", told: str, sample_rate_hz: float | None) -> Record:
+def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:
     """A record of the case by name, or a file with columns named as the case's inputs and outputs."""
     from workbench.records.files import read_record
 
     own = {record.name: record for record in (*case.fit, *case.validation)}
-    if told in own:
-        return own[told]
-    if not Path(told).is_file():
-        raise ValueError(f"{told!r} is neither a file nor a record of the case, which are {', '.join(own)}")
-    read = read_record(told, sample_rate_hz=sample_rate_hz)
+    if name in own:
+        return own[name]
+    if not Path(name).is_file():
+        raise ValueError(f"{name!r} is neither a file nor a record of the case, which are {', '.join(own)}")
+    read = read_record(name, sample_rate_hz=sample_rate_hz)
     return _with_inputs(read, tuple(actuator.name for actuator in case.rig.actuators))
 
 

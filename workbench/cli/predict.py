@@ -41,20 +41,20 @@ def predict(
     planned = record_of(found, record, sample_rate_hz)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
-        told = predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers, report=report)
-    head, *rest = str(told).splitlines()
+        prediction = predicted(found, planned, verdict, draws=draws, seed=seed, workers=workers, report=report)
+    head, *rest = str(prediction).splitlines()
     say(head, bold=True)
     for line in rest:
         say(line)
     write_json(
         json_path,
         {
-            "record": told.name,
-            "sensors": [channel.name for channel in told.channels],
-            **{name: getattr(told, name) for name in ("time", "lower", "median", "upper", "frequencies_hz")},
-            **{f"spectrum_{name}": getattr(told, f"spectrum_{name}") for name in ("lower", "median", "upper")},
-            "notes": told.notes,
+            "record": prediction.name,
+            "sensors": [channel.name for channel in prediction.channels],
+            **{name: getattr(prediction, name) for name in ("time", "lower", "median", "upper", "frequencies_hz")},
+            **{f"spectrum_{name}": getattr(prediction, f"spectrum_{name}") for name in ("lower", "median", "upper")},
+            "notes": prediction.notes,
         },
     )
     target = page or Path("out") / f"{found.name}-prediction.html"
-    say(f"  page       {short(prediction_page(told, target, name=found.name, folder=case))}")
+    say(f"  page       {short(prediction_page(prediction, target, name=found.name, folder=case))}")

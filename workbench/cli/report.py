@@ -20,12 +20,12 @@ def report(
     Example: workbench report verdict.json
     """
     from workbench.study.page import write_page
-    from workbench.study.report import story_about
+    from workbench.study.report import page_content_about
 
-    name, story = story_about(what)
-    say(story.title, bold=True)
-    for line in (*filter(None, [story.lead]), *story.lines):
+    name, page_content = page_content_about(what)
+    say(page_content.title, bold=True)
+    for line in (*filter(None, [page_content.lead]), *page_content.lines):
         say(f"  {line}")
-    target = write_page(page or Path("out") / f"{name}.html", story)
+    target = write_page(page or Path("out") / f"{name}.html", page_content)
     say(f"  page  {short(target)}")
     say(f"  data  {short(target.with_suffix('.page.json'))}")

@@ -139,20 +139,20 @@ def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mappi
     rng, x = np.random.default_rng(0), np.linspace(-4.0, 4.0, 201)
     bell = 0.36 * np.exp(-0.5 * x**2)
     for row, (kind, apart) in enumerate(errors.items()):
-        told, spread = summary[kind], np.clip(apart, -4.0, 4.0)
+        totals, spread = summary[kind], np.clip(apart, -4.0, 4.0)
         ax.fill_between(x, row - bell, row + bell, color=GREY, alpha=0.25, lw=0)
         at = row + rng.uniform(-0.3, 0.3, spread.size) * np.exp(-0.5 * spread**2)
         ax.plot(spread, at, "o", ms=3, color=COLOURS[0], alpha=0.6, mew=0)
-        least = "the least" if told["bound"] == "Cramér-Rao" else "its own error"
-        text = f"{told['over_bound']:.2f} times {least}\n{100 * told['inside']:.0f} % in their intervals"
+        least = "the bound" if totals["bound"] == "Cramér-Rao" else "its own error"
+        text = f"{totals['over_bound']:.2f} times {least}\n{100 * totals['inside']:.0f} % in their intervals"
         ax.text(4.15, row, text, va="center", fontsize=8.5)
     ax.set_yticks(range(len(errors)), list(errors))
     ax.set_ylim(len(errors) - 0.5, -0.5)
     ax.set_xlim(-4.0, 6.2)
     ax.set_xticks(range(-4, 5, 2))
-    ax.set_xlabel("error of a frequency or damping ratio [least standard error possible]")
+    ax.set_xlabel("error of a frequency or damping ratio [standard errors by the Cramér-Rao bound]")
     handles = [
-        Line2D([], [], marker="o", lw=0, color=COLOURS[0], ms=4, label="a figure of one record"),
+        Line2D([], [], marker="o", lw=0, color=COLOURS[0], ms=4, label="one estimate"),
         Line2D([], [], color=GREY, alpha=0.4, lw=8, label="what a method that attains the bound would show"),
     ]
     figure.legend(handles=handles, loc="outside upper left", ncols=2)

@@ -262,14 +262,14 @@ def plot_robustness(scales: Sequence[float], shares: dict[str, Any], spreads: di
 
 
 def plot_drift(rows: Sequence[dict[str, Any]]) -> Figure:
-    """Frequencies found in the loop over the true ones, and excess cost of the old law, as the stiffness drifts."""
+    """Frequencies identified in the loop over the nominal, and excess cost of the old law, as the stiffness drifts."""
     figure, axes = new_figure(1, 2, width=11, height=4.3)
     drift = [100 * (row["stiffness"] - 1) for row in rows]
     first = np.array(rows[0]["omega"])
     for r in range(first.size):
         axes[0].plot(drift, [row["omega"][r] / first[r] for row in rows], color=GREY, label="true" if r == 0 else None)
         found = [row["found"][r] / first[r] for row in rows]
-        axes[0].plot(drift, found, "osD"[r % 3], color=COLOURS[r], label=f"mode {r + 1}, found in the loop")
+        axes[0].plot(drift, found, "osD"[r % 3], color=COLOURS[r], label=f"mode {r + 1}, identified in the loop")
     axes[0].set(xlabel="drift of the stiffness [%]", ylabel="frequency over the nominal one")
     axes[0].legend()
     for key, label, mark in (
@@ -292,7 +292,7 @@ def plot_switching(law: OnOffLaw, switched: Switched, which: int = 0) -> Figure:
     for stretch in stretches:
         if stretch.sliding:
             inside = (response.time >= stretch.start) & (response.time <= stretch.end)
-            axes[0].plot(q[inside], v[inside], color=COLOURS[1], linewidth=3.5, label="slides along the edge")
+            axes[0].plot(q[inside], v[inside], color=COLOURS[1], linewidth=3.5, label="sliding mode")
     reach = np.array([q.min(), q.max()])
     edges = [edge - relay.slope * reach for edge in (-relay.dead_band, relay.dead_band)]
     axes[0].fill_between(reach, *edges, color=GREY, alpha=0.25, label="dead band: no force")

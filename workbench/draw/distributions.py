@@ -21,9 +21,9 @@ def stiffness_found(cases: Mapping[str, Case]) -> Figure:
         length = found.best.structure.length
         x = np.linspace(0.0, length, 801)
         low, high = found.best.stiffness.band(x)
-        ax.plot(x, truth(x), color=GREY, lw=4, alpha=0.6, label="true, known to nobody")
+        ax.plot(x, truth(x), color=GREY, lw=4, alpha=0.6, label="true")
         ax.fill_between(x, low, high, color=COLOURS[0], alpha=0.25, lw=0, label="95 % band")
-        ax.plot(x, found.best.stiffness(x), color=COLOURS[0], label="found")
+        ax.plot(x, found.best.stiffness(x), color=COLOURS[0], label="identified")
         ax.plot(sensors, np.zeros(sensors.size), "^", color=COLOURS[1], ms=8, clip_on=False, label="sensors")
         ax.set_title(title)
         highest = max(highest, high.max(), truth(x).max())

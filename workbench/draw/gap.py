@@ -54,7 +54,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
         ax.bar(np.arange(len(records)) + 0.27 * (i - 1), values, 0.27, color=colour, label=name)
     ax.set_xticks(np.arange(len(records)), records)
     ax.set_xlim(-1.0, max(len(records), 3) - 0.5)
-    ax.set(yscale="log", xlabel="record", ylabel="gap", title="the gap on records kept out of the fit")
+    ax.set(yscale="log", xlabel="record", ylabel="gap", title="gap on the validation records")
     ax.legend()
     return figure
 
@@ -157,7 +157,7 @@ def _there(verdict: Verdict, where: Where) -> str:
     return text if isinstance(where, Between) else f"at {text}"
 
 
-def plot_missing_force(verdict: Verdict) -> Figure:
+def plot_unmodelled_force(verdict: Verdict) -> Figure:
     """The force missing at its place beside other effects and freed figures, over displacement and velocity."""
     evidence = verdict.attribution.evidence
     chosen = [e for e in verdict.effects if e.at is not None and e.kind.path == "structure"]
@@ -178,7 +178,7 @@ def plot_missing_force(verdict: Verdict) -> Figure:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")
             ax.legend()
     axes[0].set_ylabel("unmodelled force [N]")
-    axes[0].set_title("the force that the nominal model lacks, no law assumed")
+    axes[0].set_title("unmodelled force, no law assumed")
     return figure
 
 

@@ -6,7 +6,7 @@ from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
-from workbench.gap.localisation.force_localisation import placed
+from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import Budget, budget_of
@@ -51,7 +51,7 @@ def diagnose(
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
         name: of the case.
-        report: told (what, share done) as the search proceeds.
+        report: called with (what, share done) as the search proceeds.
         workers: processes that share the work, this one included; None for one a core.
         settle: seconds at the start of each record that are simulated but not counted, where a record does not start
             at rest.
@@ -78,8 +78,8 @@ def diagnose(
     found = opened(rig, records, settle=settle, workers=sharing)
     nominal = found.nominal
     with (
-        sharing.aside(lambda: placed(nominal.without(_faulty(found.seen)))) as place,
-        sharing.aside(lambda: readiness(nominal, catalogue=catalogue)) as ready,
+        sharing.in_background(lambda: locate_force(nominal.without(_faulty(found.seen)))) as place,
+        sharing.in_background(lambda: readiness(nominal, catalogue=catalogue)) as ready,
     ):
         attribution = attribute(
             found,
@@ -111,7 +111,7 @@ def diagnose(
             outcome=outcome,
             effects=attribution.best.effects,
             alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in attribution.rivals),
-            where=locate(nominal, effects, place() if as_seen else placed(nominal.without(faulty))),
+            where=locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty))),
             shrinkage=shrinkage,
             corrected=corrected,
             nominal=rig,

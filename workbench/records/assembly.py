@@ -47,9 +47,9 @@ class Description:
     """What a file says of its signals.
 
     Attributes:
-        channels: by signal: kind, name, quantity, unit, at, noise_std, as far as told.
+        channels: by signal: kind, name, quantity, unit, at, noise_std, as far as given.
         name: of the record; None where only channels are described.
-        sampling: (start, step), s; None where the times alone tell.
+        sampling: (start, step), s; None where there are times alone.
     """
 
     channels: Mapping[str, Mapping[str, Any]]
@@ -70,10 +70,10 @@ def record_of(
 
     Args:
         path: of the file, for messages.
-        time: (n_samples,) instants, s, where the file tells them.
+        time: (n_samples,) instants, s, where the file has them.
         signals: (n_samples,) each; a name may begin with its kind, `input:` or `output:`.
         header: the description as a JSON text.
-        sample_rate_hz: where the file tells no time.
+        sample_rate_hz: where the file has no time.
         inputs: names of signals that went in, where the file does not say.
 
     Raises:
@@ -81,28 +81,28 @@ def record_of(
     """
     if not signals:
         raise RecordFileError(f"{path} holds no signals")
-    told = Description({}) if header is None else _description(path, header, signals)
+    described = Description({}) if header is None else _description(path, header, signals)
     n_samples = _n_samples(path, time, signals)
     for key, values in signals.items():
         bad = ~np.isfinite(values)
         if bad.any():
             row = int(np.argmax(bad))
             raise RecordFileError(f"{path}, channel {_name(key)!r}, row {row + 1}: {values[row]} is not a number")
-    sampling = _sampling(path, time, n_samples, told, sample_rate_hz)
-    units = _units(key for key in signals if key not in told.channels)
+    sampling = _sampling(path, time, n_samples, described, sample_rate_hz)
+    units = _units(key for key in signals if key not in described.channels)
     names = {key: split_unit(_name(key))[0] if key in units else _name(key) for key in signals}
     for name in inputs:
         if name not in names.values() and name not in map(_name, signals):
             known = ", ".join(names.values())
             raise RecordFileError(f"{path} has no channel {name!r} to be an input; it has {known}")
-    kinds = {key: "input" if names[key] in inputs or _name(key) in inputs else _kind(key, told) for key in signals}
+    kinds = {key: "input" if names[key] in inputs or _name(key) in inputs else _kind(key, described) for key in signals}
     keys = {kind: [key for key in signals if kinds[key] == kind] for kind in KINDS}
     if not keys["output"]:
         raise RecordFileError(f"{path} holds inputs only; at least one output is needed")
     rows = {kind: _rows([signals[key] for key in keys[kind]], [units.get(key) for key in keys[kind]], sampling)
             for kind in KINDS}  # fmt: skip
     channels = {
-        kind: tuple(_channel(path, names[key], told.channels.get(key, {}), units.get(key)) for key in keys[kind])
+        kind: tuple(_channel(path, names[key], described.channels.get(key, {}), units.get(key)) for key in keys[kind])
         for kind in KINDS
     }
     remarks = [_unit_remark(names[key], split_unit(_name(key))[1], unit) for key, unit in units.items()]
@@ -114,7 +114,7 @@ def record_of(
             inputs=rows["input"],
             input_channels=channels["input"],
             start_time=sampling.start,
-            name=told.name or path.stem,
+            name=described.name or path.stem,
             remarks=(*filter(None, remarks), *sampling.remarks),
         )
     except ValueError as error:
@@ -127,16 +127,16 @@ def _description(path: Path, header: str, signals: Mapping[str, np.ndarray]) -> 
         channels = {f"{c['kind']}:{c['name']}": c for c in table["channels"]}
         if "sample_time" not in table and KEY not in table:
             return Description(channels)
-        told = Description(channels, str(table["name"]), (float(table["start_time"]), float(table["sample_time"])))
+        described = Description(channels, str(table["name"]), (float(table["start_time"]), float(table["sample_time"])))
         whole = table[KEY] == checksum(table, [signals[key] for key in channels]) and len(signals) == len(channels)
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise RecordFileError(f"{path}: its description of the channels is damaged: {error}") from error
     if not whole:
         raise RecordFileError(
-            f"{path} is not as it was written: its checksum tells of a change. If that was meant, take the description"
+            f"{path} is not as it was written: its checksum shows a change. If that was meant, take the description"
             " out, and name the inputs anew"
         )
-    return told
+    return described
 
 
 def _n_samples(path: Path, time: np.ndarray | None, signals: Mapping[str, np.ndarray]) -> int:
@@ -154,8 +154,8 @@ def _name(key: str) -> str:
     return key.split(":", 1)[1] if key.startswith(("input:", "output:")) else key
 
 
-def _kind(key: str, told: Description) -> str:
-    kind = told.channels.get(key, {}).get("kind") or key.split(":", 1)[0]
+def _kind(key: str, described: Description) -> str:
+    kind = described.channels.get(key, {}).get("kind") or key.split(":", 1)[0]
     return kind if kind in KINDS else "output"
 
 
@@ -211,7 +211,7 @@ def _rows(signals: Sequence[np.ndarray], units: Sequence[Unit | None], sampling:
 
 
 def _sampling(
-    path: Path, time: np.ndarray | None, n_samples: int, told: Description, sample_rate_hz: float | None
+    path: Path, time: np.ndarray | None, n_samples: int, described: Description, sample_rate_hz: float | None
 ) -> Sampling:
     if sample_rate_hz is not None and not 0 < sample_rate_hz < np.inf:
         raise RecordFileError(f"{path}: sample_rate_hz must be positive; got {sample_rate_hz}")
@@ -221,12 +221,12 @@ def _sampling(
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {int(np.argmax(~np.isfinite(time))) + 1}: not a number")
-    sampling = _of_times(path, time, mend=told.sampling is None)
+    sampling = _of_times(path, time, mend=described.sampling is None)
     if sample_rate_hz is not None and abs(sample_rate_hz * sampling.step - 1.0) > UNIFORM:
         raise RecordFileError(f"{path} is sampled at {1 / sampling.step:g} Hz, not at {sample_rate_hz:g} Hz")
-    if told.sampling is None:
+    if described.sampling is None:
         return sampling
-    start, said = told.sampling
+    start, said = described.sampling
     step = sampling.step
     if not (abs(said - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
         raise RecordFileError(

@@ -1,8 +1,8 @@
 """Records on disk: text tables, NPZ, MAT, HDF5, UFF 58, TDMS and WAV, through one door each way.
 
 What a format has no room for (places, noise, which signals are inputs) travels as a JSON text: in a comment of a CSV,
-an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it tells a file that was
-changed since. Files of other programs have none of it: their signals are all outputs, named as the file names them.
+an entry of an NPZ or MAT, an attribute of HDF5, the description lines of a UFF. A checksum in it detects a file
+that was changed since. Files of other programs have none of it: their signals are all outputs, by the file's names.
 """
 
 from collections.abc import Iterator

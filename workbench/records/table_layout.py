@@ -1,4 +1,4 @@
-"""How a text table is laid out: what stands before its numbers, and how these are told apart.
+"""How a text table is laid out: what stands before its numbers, and how these are separated.
 
 Instruments write comments, headers of several lines, a line of units; tabs, semicolons, commas or spaces between the
 fields; a decimal comma; a date and a time of day in place of seconds. All of it shows in the lines down to the first

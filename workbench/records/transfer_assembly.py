@@ -22,7 +22,7 @@ LIKELY_RATES = ("freq", "frequency", "rate")  # where the number of samples stan
 SAMPLES = ("npts", "nfft", "n_samples")
 PLACES = ("positions", "at")
 COLUMN = re.compile(r"(.+?)[ ._]+(?:(re|real)|im|imag|imaginary)", re.IGNORECASE)
-TOLD = "transfer_header"
+DESCRIPTION = "transfer_header"
 
 
 def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
@@ -37,9 +37,9 @@ def complex_columns(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {}
     parts: dict[str, dict[bool, np.ndarray]] = {}
     for name in names[1:]:
-        told = COLUMN.fullmatch(name)
-        if told:
-            parts.setdefault(told[1], {})[told[2] is not None] = signals[name]
+        column = COLUMN.fullmatch(name)
+        if column:
+            parts.setdefault(column[1], {})[column[2] is not None] = signals[name]
     both = {name: part[True] + 1j * part[False] for name, part in parts.items() if len(part) == 2}
     return {names[0]: signals[names[0]], **both} if 2 * len(both) == len(names) - 1 else {}
 
@@ -53,7 +53,7 @@ def transfer_of(
         path: of the file, for messages.
         arrays: complex ones, one axis of each as long as there are lines, the others its points (and references); the
             lines under a name of `HERTZ` or `RADIANS`, or a sample rate.
-        sample_rate_hz: where the file tells neither; its lines then go from zero to half of it.
+        sample_rate_hz: where the file has neither; its lines then go from zero to half of it.
 
     Raises:
         RecordFileError: naming the file and the array, and what would be right.
@@ -122,19 +122,19 @@ def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> 
 def _points(
     path: Path, arrays: Mapping[str, Any], names: list[str], n_references: int
 ) -> tuple[tuple[Channel, ...], tuple[str, ...]]:
-    """Channels and references: as the file tells them, else numbered."""
-    if TOLD in arrays:
+    """Channels and references: as the file names them, else numbered."""
+    if DESCRIPTION in arrays:
         try:
-            told = json.loads(str(arrays[TOLD]))
-            channels = tuple(Channel(legible(path, str(c["name"])), str(c["quantity"])) for c in told["outputs"])
-            return channels, tuple(legible(path, str(name)) for name in told["references"])
+            described = json.loads(str(arrays[DESCRIPTION]))
+            channels = tuple(Channel(legible(path, str(c["name"])), str(c["quantity"])) for c in described["outputs"])
+            return channels, tuple(legible(path, str(name)) for name in described["references"])
         except RecordFileError:
             raise
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise RecordFileError(f"{path}: its description of the points is damaged: {error}") from error
     at = [np.ravel(arrays[name]) for name in PLACES if name in arrays]
     if at and at[0].shape != (len(names),):
-        raise RecordFileError(f"{path} tells {at[0].size} places of {len(names)} points; give each its own")
+        raise RecordFileError(f"{path} gives {at[0].size} places of {len(names)} points; give each its own")
     places = [float(x) for x in at[0]] if at else [None] * len(names)
     channels = tuple(Channel(legible(path, name), at=x) for name, x in zip(names, places, strict=True))
     return channels, tuple(f"input {i + 1}" for i in range(n_references))

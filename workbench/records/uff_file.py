@@ -11,7 +11,7 @@ from workbench.records.confined import load_confined
 from workbench.records.file_error import RecordFileError
 from workbench.records.limits import DEFAULT, Limits
 from workbench.records.named_arrays import HEADER
-from workbench.records.transfer_assembly import TOLD
+from workbench.records.transfer_assembly import DESCRIPTION
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}
@@ -88,8 +88,8 @@ def _transfer(path: Path, sets: list[dict[str, Any]]) -> dict[str, np.ndarray]:
                 f"{path} lacks the transfer function from {pair[1]} to {pair[0]}; the others are there"
             )
     values = np.array([[found[output, reference] for reference in references] for output in outputs])
-    told = {"outputs": [{"name": n, "quantity": q} for n, q in outputs.items()], "references": references}
-    return {"frequency_hz": lines, "transfer": values, TOLD: np.array(json.dumps(told))}
+    described = {"outputs": [{"name": n, "quantity": q} for n, q in outputs.items()], "references": references}
+    return {"frequency_hz": lines, "transfer": values, DESCRIPTION: np.array(json.dumps(described))}
 
 
 def as_stored(values: np.ndarray) -> np.ndarray:

@@ -89,7 +89,7 @@ class Motion:
     held: bool = False
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
-        """The motion at any time, s; worked out once, since sensors of many delays may read one motion."""
+        """The motion at any time, s; computed once, since sensors of many delays may read one motion."""
         if "_between_samples" not in self.__dict__:
             q, v, forces = self.displacement, self.velocity, self.forces
             found = BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time, held=self.held)
@@ -375,7 +375,8 @@ def _step(
     for row, element in zip(parameters, points, strict=True):
         values = LAWS[type(element)][1](element)
         row[: len(values)] = values
-    stretch = sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching))
+    # one type and one layout of every argument: the stepper is compiled anew for any other
+    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
     drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
     drag_shapes, drag_weights = along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
     known, reading, orders = outputs, NOTHING, NO_ORDERS
@@ -391,7 +392,7 @@ def _step(
         rig.stiffness_rate,
         starts[driven],
         ends[driven],
-        participation[:, driven],
+        np.ascontiguousarray(participation[:, driven]),
         stretch,
         stretching_of(rig) if stretch else np.zeros((0, 0)),
         np.ascontiguousarray(drag_shapes.T),

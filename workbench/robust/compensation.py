@@ -6,7 +6,7 @@ With X = (x, a) the controlled modes and the forces of lagging actuators, and v 
 
 is known exactly between samples. The estimate at a sample is moved ahead by each actuator's delay and half a sample,
 by the commands on their way (a predictor after Smith), and a lag is inverted on the way: v = w + λ w', w = -K x. Late
-and slow sensors are told by what they read of each mode at its frequency, H_j(iω_r) (c_q + iω_r c_v).
+and slow sensors are distinguished by what they read of each mode at its frequency, H_j(iω_r) (c_q + iω_r c_v).
 """
 
 from collections.abc import Sequence

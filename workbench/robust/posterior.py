@@ -151,27 +151,27 @@ class UncertainRig:
 
     @classmethod
     def from_json(
-        cls, nominal: Rig, told: Mapping[str, Any], *, catalogue: Sequence[Kind] = CATALOGUE
+        cls, nominal: Rig, written: Mapping[str, Any], *, catalogue: Sequence[Kind] = CATALOGUE
     ) -> "UncertainRig":
-        """What `to_json` wrote, beside the nominal rig that it was told of.
+        """What `to_json` wrote, beside the nominal rig that it belongs to.
 
         Args:
             nominal: of the case.
-            told: as written.
+            written: as written.
             catalogue: kinds by which effects are known, where kinds of your own are among them.
 
         Raises:
             ValueError: an effect of a kind that the catalogue does not hold, or a covariance of another size.
         """
         kinds = {kind.name: kind for kind in (*catalogue, *BEYOND, NOMINAL_ERRORS)}
-        unknown = [entry["kind"] for entry in told["effects"] if entry["kind"] not in kinds]
+        unknown = [entry["kind"] for entry in written["effects"] if entry["kind"] not in kinds]
         if unknown:
             raise ValueError(f"no effect is called {unknown[0]!r}; hand a catalogue that holds it")
-        effects = tuple(_effect(kinds[entry["kind"]], entry) for entry in told["effects"])
+        effects = tuple(_effect(kinds[entry["kind"]], entry) for entry in written["effects"])
         n = len(parameters_of(nominal, effects))
-        covariance = np.array(told["covariance"], float) if n else np.zeros((0, 0))
-        rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in told["rivals"])
-        return cls(nominal, effects, covariance, told["unexplained"], told["outcome"], rivals)
+        covariance = np.array(written["covariance"], float) if n else np.zeros((0, 0))
+        rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in written["rivals"])
+        return cls(nominal, effects, covariance, written["unexplained"], written["outcome"], rivals)
 
 
 def _widest(parameter: Parameter) -> float:
@@ -220,12 +220,12 @@ def _effect_json(effect: Effect) -> dict[str, Any]:
     return {"kind": effect.kind.name, "target": target, "values": values, "deviations": dict(effect.deviations)}
 
 
-def _effect(kind: Kind, told: Mapping[str, Any]) -> Effect:
-    target = told["target"]
+def _effect(kind: Kind, written: Mapping[str, Any]) -> Effect:
+    target = written["target"]
     if isinstance(target, Mapping):
         prior: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in target["prior"].items()}
         target = NominalPrior(**prior)
     elif isinstance(target, list):
         target = tuple(target)
-    values = {n: Between(*v["between"]) if isinstance(v, Mapping) else v for n, v in told["values"].items()}
-    return Effect(kind, target, values, dict(told["deviations"]))
+    values = {n: Between(*v["between"]) if isinstance(v, Mapping) else v for n, v in written["values"].items()}
+    return Effect(kind, target, values, dict(written["deviations"]))

@@ -173,7 +173,7 @@ def predict(
         readings[i] = _read(truth, found.rig, spread, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
     spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
-    told = Prediction(
+    prediction = Prediction(
         np.asarray(start + period * np.arange(n_samples), float),
         tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(found.nominal.sensors, spread)),
         middle,
@@ -188,7 +188,7 @@ def predict(
         inputs.name if isinstance(inputs, Record) else "prediction",
         tuple(notes),
     )
-    return replace(told, expected=np.array([told.coverage(reading) for reading in readings]))
+    return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))
 
 
 QUANTILES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)

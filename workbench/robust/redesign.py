@@ -176,7 +176,7 @@ def redesign(
         draws: possible rigs on which both are proved.
         seed: of the draws and of the sensors' noise.
         placement: whether to look where the actuators should stand instead.
-        report: told (what, share done).
+        report: called with (what, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, or modes that cannot be

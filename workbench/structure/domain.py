@@ -309,7 +309,7 @@ class NamedPoints:
             for i, name in zip(self.locate(names), names, strict=True):
                 if self.directions[i] not in ROTATIONS:
                     raise PlaceError(
-                        f"named points tell no slopes; {name!r} is no rotation: give a point of direction rx, ry or rz"
+                        f"named points have no slopes; {name!r} is no rotation: give a point of direction rx, ry or rz"
                     )
         return names, 0, 1.0
 

@@ -17,7 +17,7 @@ from workbench.structure.supports import Attachment, PointMass, PointSpring
 SYMMETRIC = 1e-9  # of the largest entry: more is no rounding of the program that wrote the matrix
 SINGULAR = 1e-12  # smallest pivot of K over the largest: below it the structure can move as a rigid body
 SHIFT = 1e-11  # of the highest ω², by which K is shifted where it is singular
-ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot be told from zero
+ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot be distinguished from zero
 
 Matrix: TypeAlias = sparray | spmatrix | np.ndarray
 

@@ -113,7 +113,7 @@ class _Member(Printed):
         return waves / float(waves.sum())
 
     def _graded(self, at: float, stiffness: Profile) -> list[float]:
-        """Nodes that crowd towards an attachment beside an end that is a tip: the motion there is all but singular."""
+        """Nodes graded towards an attachment beside an end that is a tip: the motion there is all but singular."""
         graded = []
         for tip, inward in ((0.0, 1.0), (self.length, -1.0)):
             away = abs(at - tip)
@@ -130,7 +130,7 @@ class _Member(Printed):
         return THINNEST[continuity] * self.length
 
     def _seen_at(self, segments: Segments, at: float, derivative: int) -> np.ndarray:
-        """The row that tells what an attachment moves by; one just beside a node hangs on it by a rigid lever."""
+        """The row that gives the motion of an attachment; one just beside a node hangs on it by a rigid lever."""
         node = segments.nodes[np.argmin(np.abs(segments.nodes - at))]
         if segments.continuity == 0 or abs(at - node) >= self._thinnest(segments.continuity):
             return segments.evaluation(at, derivative)
@@ -177,7 +177,7 @@ class _Member(Printed):
         if tension:
             rigidity += segments.assemble(lambda x: np.full(x.shape, tension), 1)
         held, essential = [], []
-        springs: list[tuple[float, np.ndarray]] = []  # stiffness, and the row that tells what it is stretched by
+        springs: list[tuple[float, np.ndarray]] = []  # stiffness, and the row that gives its elongation
         last = segments.nodes.size - 1
         for node, at, end in ((0, 0.0, self.left), (last, self.length, self.right)):
             for derivative, spring in enumerate((end.translation, end.rotation)[:order]):

@@ -54,7 +54,7 @@ class Modes(Printed):
         essential: ((x, derivative), ...) where the supports of an interval hold the shape or its slope at zero.
         covariance: (2 n_modes, 2 n_modes) of (ω, ζ), where the modes were identified; None where computed.
         shape_covariance: (n_modes, n_points, n_points) of each mode's shape at named points, where identified, each
-            mode by itself; None where computed, or where the identification tells none.
+            mode by itself; None where computed, or where the identification gives none.
 
     Raises:
         ValueError: negative or non-finite frequencies, mismatched shapes.

@@ -89,8 +89,8 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int)
     moving = [part for part in attachments if not isinstance(part, PointDamper)]
     rows = np.vstack([np.zeros((0, modes.n_modes)), *(_moved(modes, part, 0) for part in moving)])
     # each row of `rest` is the rest's static answer to one force, all of them of unit energy and apart from each other
-    _, sizes, answers = np.linalg.svd(rows[:, own:] / modes.omega[own:], full_matrices=False)
-    rest = answers[sizes > 1e-6 * sizes.max(initial=0.0)] / modes.omega[own:]
+    _, sizes, directions = np.linalg.svd(rows[:, own:] / modes.omega[own:], full_matrices=False)
+    rest = directions[sizes > 1e-6 * sizes.max(initial=0.0)] / modes.omega[own:]
     basis = np.zeros((modes.n_modes, own + len(rest)))
     basis[:own, :own] = np.eye(own)
     basis[own:, own:] = rest.T

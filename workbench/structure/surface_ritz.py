@@ -40,7 +40,7 @@ class SurfaceModes:
     Attributes:
         omega: (n_modes,) rad/s, not decreasing.
         parts: functions (k of them) and their shares (k, n_modes) in the modes.
-        error: of the frequencies, relative, as their change at the last refinements tells it.
+        error: of the frequencies, relative, by their change at the last refinements.
     """
 
     omega: np.ndarray

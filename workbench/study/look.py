@@ -16,7 +16,7 @@ from workbench.identification.signal.data_quality import data_faults
 from workbench.identification.signal.decay import decay_start
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
-from workbench.study.page import Story, block
+from workbench.study.page import PageContent, block
 
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
@@ -36,14 +36,14 @@ class Look:
         rows: one a channel, under `HEADINGS`.
         remarks: faults of the data and what else to know.
         command: the command to go on with.
-        story: the page of it.
+        page_content: the page of it.
     """
 
     heading: str
     rows: tuple[tuple[str, ...], ...]
     remarks: tuple[str, ...]
     command: str
-    story: Story
+    page_content: PageContent
 
 
 def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
@@ -84,7 +84,7 @@ def _record(record: Record, path: Path) -> Look:
         options += ["--outputs", ",".join(kept)]
     moving = record.only([name for name in record.output_names if name not in faulty]) if kept or forces else record
     driven = moving.n_inputs == 1 and bool(np.ptp(moving.inputs)) and moving.n_samples >= 16 * SEGMENTS
-    story = Story(
+    page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
         lines=[*remarks, f"Go on with: {_command(path, options)}"],
@@ -96,7 +96,7 @@ def _record(record: Record, path: Path) -> Look:
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
-    return Look(heading, rows, tuple(remarks), _command(path, options), story)
+    return Look(heading, rows, tuple(remarks), _command(path, options), page_content)
 
 
 def _transfer(measured: TransferFunctions, path: Path) -> Look:
@@ -112,7 +112,7 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
         f"transfer functions of {n} output{'s' * (n > 1)} and {m} input{'s' * (m > 1)}, {lines.size} lines from"
         f" {lines[0]:.6g} to {lines[-1]:.6g} Hz"
     )
-    story = Story(
+    page_content = PageContent(
         title=f"What {path.name} holds",
         lead=heading,
         lines=[f"Go on with: {_command(path, [])}"],
@@ -120,7 +120,7 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
         tables=[("Channels", HEADINGS, rows)],
         made_by=f"workbench look {path}",
     )
-    return Look(heading, tuple(rows), (), _command(path, []), story)
+    return Look(heading, tuple(rows), (), _command(path, []), page_content)
 
 
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:

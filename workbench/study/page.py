@@ -26,7 +26,7 @@ Table = tuple[str, Sequence[str], Sequence[Sequence[object]]]  # title, heads, r
 
 
 @dataclass(frozen=True)
-class Story:
+class PageContent:
     """All that a page shows, as plain values: the page can be made again from it.
 
     Attributes:
@@ -54,8 +54,8 @@ class Story:
         return {"format": FORMAT, **asdict(self)}
 
 
-def story_of(content: dict[str, Any]) -> Story:
-    """The story that `Story.to_json` wrote.
+def page_content_of(content: dict[str, Any]) -> PageContent:
+    """The content that `PageContent.to_json` wrote.
 
     Raises:
         StudyError: a file of another format, or one that has been damaged.
@@ -68,7 +68,7 @@ def story_of(content: dict[str, Any]) -> Story:
     if content.get("format") != FORMAT or bad:
         raise StudyError(f"this is no {FORMAT!r}: its {bad[0] if bad else 'format'} is missing or damaged")
     standing = content.get("standing", "")  # pages of earlier versions have none
-    return Story(**{name: content[name] for name in shape}, standing=standing if standing in STANDINGS else "")
+    return PageContent(**{name: content[name] for name in shape}, standing=standing if standing in STANDINGS else "")
 
 
 def _is_table(table: object) -> bool:
@@ -83,25 +83,25 @@ def block(shown: Shown, caption: str) -> dict[str, Any]:
     return {**({"motion": dict(shown)} if isinstance(shown, Mapping) else drawable(shown)), "caption": caption}
 
 
-def write_page(path: Path, story: Story) -> Path:
-    """Write a story as a page, and as JSON beside it (.page.json); every text is escaped."""
+def write_page(path: Path, page_content: PageContent) -> Path:
+    """Write content as a page, and as JSON beside it (.page.json); every text is escaped."""
     environment = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     template = environment.from_string((ASSETS / "page.html").read_text(encoding="utf-8"))
-    moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in story.blocks]
+    moving = [{key: one[key] for key in ("figure", "motion") if key in one} for one in page_content.blocks]
     html = template.render(
         **{
-            name: getattr(story, name)
+            name: getattr(page_content, name)
             for name in ("title", "lead", "lines", "blocks", "inputs", "made_by", "standing", "versions")
         },
         tables=[
             {"title": title, "heads": heads, "rows": [[_cell(cell) for cell in row] for row in rows[:MOST_ROWS]]}
-            for title, heads, rows in story.tables
+            for title, heads, rows in page_content.tables
         ],
         css=asset("page.css"),
         scripts=Markup("\n").join(map(asset, SCRIPTS)),
         data=in_script(moving),
     )
-    write_whole(path.with_suffix(".page.json"), json.dumps(story.to_json(), separators=(",", ":")) + "\n")
+    write_whole(path.with_suffix(".page.json"), json.dumps(page_content.to_json(), separators=(",", ":")) + "\n")
     return write_whole(path, html)
 
 
@@ -125,7 +125,7 @@ def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | No
         for c in outcome.checks
     ]
     runs = [(name, *_table_of(found.rows())) for name, found in outcome.runs.items()]
-    story = Story(
+    page_content = PageContent(
         title=outcome.title or outcome.name,
         lines=tuple(outcome.lines),
         blocks=[block(shown, caption) for shown, caption in outcome.shown],
@@ -137,7 +137,7 @@ def study_page(outcome: Outcome, folder: Path, *, inputs: Mapping[str, str] | No
         inputs=inputs or {},
         made_by=made_by or f"workbench study {outcome.name}",
     )
-    return write_page(folder / f"{outcome.name}.html", story)
+    return write_page(folder / f"{outcome.name}.html", page_content)
 
 
 def tables_of(content: Mapping[str, Any]) -> list[Table]:

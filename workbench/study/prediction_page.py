@@ -6,7 +6,7 @@ from workbench.draw.prediction import MOST_SENSORS, plot_prediction
 from workbench.records.record import Record
 from workbench.robust.check import PredictionCheck
 from workbench.robust.prediction import LEVEL, Prediction
-from workbench.study.page import Story, block, write_page
+from workbench.study.page import PageContent, block, write_page
 from workbench.study.verdict_page import case_inputs
 
 
@@ -34,7 +34,7 @@ def prediction_page(
         caption += f" The first {MOST_SENSORS} of {len(prediction.channels)} sensors are drawn."
     shown = prediction if check is None else check
     lead, heads, rows, notes = shown._printed()
-    story = Story(
+    page_content = PageContent(
         title=f"{'Prediction' if check is None else 'Check'} of {prediction.name}, {name}",
         lead=lead,
         standing="" if check is None else "good" if check.holds else "bad",
@@ -44,4 +44,4 @@ def prediction_page(
         inputs=case_inputs(folder),
         made_by=f"workbench {'predict' if check is None else 'check'} {folder} {prediction.name}",
     )
-    return write_page(path, story)
+    return write_page(path, page_content)

@@ -17,7 +17,7 @@ from workbench.robust.proof import Proof, interval
 from workbench.robust.redesign import Redesign
 from workbench.structure.domain import Interval, Where
 from workbench.study.outcome import Shown
-from workbench.study.page import Story, Table, block, write_page
+from workbench.study.page import PageContent, Table, block, write_page
 from workbench.study.verdict_page import case_inputs
 
 MOST = 3000  # samples of a record that are replayed
@@ -58,7 +58,7 @@ def redesign_page(
         ),
     ]
     moved = [] if found.relocation is None else [found.relocation.sentence]
-    story = Story(
+    page_content = PageContent(
         title=f"Redesign for {name}",
         lead=found.sentence,
         standing="good" if found.safe else "bad" if found.proof.share_stable < 0.95 else "part",
@@ -68,7 +68,7 @@ def redesign_page(
         inputs={} if folder is None else case_inputs(folder),
         made_by=f"workbench redesign {folder or name}",
     )
-    return write_page(path, story)
+    return write_page(path, page_content)
 
 
 def _figures(found: Redesign) -> list[tuple[str, ...]]:

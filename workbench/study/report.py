@@ -15,7 +15,7 @@ from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_p
 from workbench.structure.modes import SampledModes, mac
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study, output_root
-from workbench.study.page import FORMAT, Story, Table, block, story_of, tables_of, to_its_error
+from workbench.study.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
 from workbench.study.verdict_page import STANDING_OF, case_inputs, moving_modes
 
 TURN = 2.0 * np.pi
@@ -23,25 +23,25 @@ MOST_BYTES = 200_000_000
 ON_AXIS = 1e-9  # rad/s from the imaginary axis within which a pole is undamped
 
 
-def story_about(what: str) -> tuple[str, Story]:
-    """The name and the story of a JSON file, a case folder, or a study by name.
+def page_content_about(what: str) -> tuple[str, PageContent]:
+    """The name and the page content of a JSON file, a case folder, or a study by name.
 
     Raises:
         StudyError: none of these, a study that has not run here, or a file that holds something else.
     """
     path = Path(what)
     if path.is_dir():
-        return path.resolve().name, case_story(path)
+        return path.resolve().name, case_page_content(path)
     if path.suffix == ".json":
-        return path.name.removesuffix(".json").removesuffix(".page"), story_in(path)
+        return path.name.removesuffix(".json").removesuffix(".page"), page_content_in(path)
     study = find_study(what)
     kept = output_root(study) / "out" / f"{study.name}.page.json"
     if not kept.is_file():
         raise StudyError(f"study {study.name} has left no page here; run it: workbench study {what}")
-    return study.name, story_in(kept)
+    return study.name, page_content_in(kept)
 
 
-def case_story(folder: Path) -> Story:
+def case_page_content(folder: Path) -> PageContent:
     """What a case holds before any diagnosis: its nominal model, in motion, and its records beside what that says."""
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
@@ -52,7 +52,7 @@ def case_story(folder: Path) -> Story:
         for r in records
     ]
     modes = list(zip(range(1, rig.modes.n_modes + 1), rig.modes.frequencies_hz.tolist(), rig.modes.zeta.tolist()))
-    return Story(
+    return PageContent(
         title=f"Case {case.name}, before any diagnosis",
         lines=(f"{len(rig.actuators)} inputs, {len(rig.sensors)} sensors, {len(records)} records.",),
         blocks=[*moving_modes(rig, {"nominal": rig.modes}), block(beside, caption)],
@@ -65,8 +65,8 @@ def case_story(folder: Path) -> Story:
     )
 
 
-def story_in(path: Path) -> Story:
-    """The story that a JSON file holds, or that is made of it.
+def page_content_in(path: Path) -> PageContent:
+    """The content that a JSON file holds, or that is made of it.
 
     Raises:
         StudyError: no such file, no JSON, or JSON of something else.
@@ -86,15 +86,15 @@ def story_in(path: Path) -> Story:
     if "format" in content:
         if content["format"] != FORMAT:
             raise StudyError(f"{path} has the format {content['format']!r:.60}; this workbench reads {FORMAT!r}")
-        return story_of(content)
+        return page_content_of(content)
     write = next((write for key, write in KINDS.items() if key in content), _anything)
     try:
         parts = write(content)
     except (KeyError, TypeError, AttributeError, ValueError, IndexError, ArithmeticError) as error:
         looks = (write.__doc__ or "").rstrip(".")
         raise StudyError(f"{path} looks like {looks[:1].lower()}{looks[1:]}, but is damaged: {error!r:.120}") from error
-    story = {"title": path.stem.replace("_", " "), "tables": _tables(content), **parts}
-    return Story(made_by=f"workbench report {path.name}", **story)
+    page_content = {"title": path.stem.replace("_", " "), "tables": _tables(content), **parts}
+    return PageContent(made_by=f"workbench report {path.name}", **page_content)
 
 
 def _refuse(word: str) -> NoReturn:

@@ -10,7 +10,7 @@ import numpy as np
 
 from workbench.cases.case import Case
 from workbench.draw.distortion import plot_distortion
-from workbench.draw.gap import plot_budget, plot_missing_force, plot_responses, plot_rivals, plot_where
+from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
@@ -18,7 +18,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
-from workbench.study.page import Story, Table, block, to_its_error, write_page
+from workbench.study.page import PageContent, Table, block, to_its_error, write_page
 
 MOVING = (
     "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."
@@ -64,7 +64,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
                 " unknown force at each place would explain it, before any effect is guessed.",
             ),
             (
-                plot_missing_force(verdict),
+                plot_unmodelled_force(verdict),
                 "The unmodelled force reconstructed from the records, over the motion at its place.",
             ),
         ]
@@ -103,7 +103,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     moving = moving_modes(
         verdict.nominal, {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
     )
-    story = Story(
+    page_content = PageContent(
         title=f"Diagnosis of {verdict.case}",
         lead=verdict.sentence,
         standing=STANDING_OF[verdict.outcome],
@@ -116,7 +116,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         inputs={} if folder is None else case_inputs(folder),
         made_by=f"workbench diagnose {folder or verdict.case}",
     )
-    return write_page(path, story)
+    return write_page(path, page_content)
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:

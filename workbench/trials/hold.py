@@ -59,7 +59,7 @@ def hold_trials(
         size: of these errors; None for each of three in turn.
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
         jobs: cases diagnosed at a time, each in a process of its own.
-        report: told (what, share done).
+        report: called with (what, share done).
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
         sealed = Path(vault) / "labels.json"

@@ -338,7 +338,7 @@ def write_trials(
         kinds: what each case hides; None draws them, see `draw_kinds` and `draw_dirty_kinds`.
         dirt: class of the small errors beside what hides, of `DIRT_CLASSES`, or "all" for each in turn; None for none.
         size: of these errors; None for each of `SIZES` in turn.
-        report: told (what, share done).
+        report: called with (what, share done).
 
     Raises:
         ValueError: labels that would lie in the folder that the diagnosis reads.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from workbench.gap.localisation.receptance import Apart, Coupled, answers_of
+from workbench.gap.localisation.receptance import CoupledReceptances, UncoupledReceptances, receptances_of
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -31,10 +31,10 @@ def rig(request, hinged_rig):
 
 
 @pytest.fixture
-def answers(rig):
+def receptances(rig):
     omega = 2.0 * np.pi * TAKEN / (SAMPLES * DT)
-    found = answers_of(rig, sampled_model(rig.modes, SENSORS, NOISE, DT), omega, SAMPLES, DT)
-    assert isinstance(found, Apart if rig.modes.proportional else Coupled)
+    found = receptances_of(rig, sampled_model(rig.modes, SENSORS, NOISE, DT), omega, SAMPLES, DT)
+    assert isinstance(found, UncoupledReceptances if rig.modes.proportional else CoupledReceptances)
     return found
 
 
@@ -51,7 +51,7 @@ def equations(rig):
     return a, c / NOISE[:, None], through / NOISE[:, None]
 
 
-def test_the_spectrum_of_a_free_motion_is_that_of_its_ends(rig, answers, equations):
+def test_the_spectrum_of_a_free_motion_is_that_of_its_ends(rig, receptances, equations):
     a, c, _ = equations
     n, step = rig.modes.n_modes, expm(a * DT)
     x = start = np.random.default_rng(0).normal(size=2 * n) * np.r_[np.ones(n), rig.modes.omega]
@@ -62,14 +62,14 @@ def test_the_spectrum_of_a_free_motion_is_that_of_its_ends(rig, answers, equatio
     ends = (start - x) / np.r_[np.ones(n), np.maximum(rig.modes.omega, 0.1 * rig.modes.omega[-1])]
     spectrum = np.fft.fft(np.array(readings), axis=0)[TAKEN] / np.sqrt(SAMPLES)
     for j in range(len(SENSORS)):
-        told = answers.along(np.tile(np.eye(len(SENSORS))[j], (TAKEN.size, 1))) @ ends
-        assert np.abs(told - spectrum[:, j]).max() < 1e-6 * np.abs(spectrum[:, j]).max()
+        tail = receptances.along(np.tile(np.eye(len(SENSORS))[j], (TAKEN.size, 1))) @ ends
+        assert np.abs(tail - spectrum[:, j]).max() < 1e-6 * np.abs(spectrum[:, j]).max()
 
 
-def test_readings_of_a_force_obey_the_equations_of_motion(rig, answers, equations):
+def test_readings_of_a_force_obey_the_equations_of_motion(rig, receptances, equations):
     a, c, through = equations
     shape = rig.modes.phi(1.37)[0]
-    read = answers.to_force(shape)
+    read = receptances.to_force(shape)
     for line, taken in enumerate(TAKEN):
         rate = 2j * np.pi * taken / (SAMPLES * DT)
         state = np.linalg.solve(rate * np.eye(len(a)) - a, np.r_[np.zeros(shape.size), shape])
@@ -77,14 +77,14 @@ def test_readings_of_a_force_obey_the_equations_of_motion(rig, answers, equation
         assert np.abs(read[line] - expected).max() < 1e-6 * np.abs(expected).max()
 
 
-def test_products_are_those_of_what_is_read(answers):
+def test_products_are_those_of_what_is_read(receptances):
     rng = np.random.default_rng(1)
     left = rng.normal(size=(TAKEN.size, 4)) + 1j * rng.normal(size=(TAKEN.size, 4))
     weights = rng.uniform(0.1, 1.0, TAKEN.size)
-    tail = np.array([answers.along(np.tile(row, (TAKEN.size, 1))) for row in np.eye(4)])  # sensors first
-    own, along = answers.products(left, weights)
+    tail = np.array([receptances.along(np.tile(row, (TAKEN.size, 1))) for row in np.eye(4)])  # sensors first
+    own, along = receptances.products(left, weights)
     assert np.allclose(own, 2.0 * np.einsum("slp,l,slq->pq", tail.conj(), weights, tail).real, rtol=1e-9)
     assert np.allclose(along, 2.0 * np.einsum("slp,l,ls->p", tail.conj(), weights, left).real, rtol=1e-9)
     kept = weights > 0.5
-    own, along = answers.on(kept).products(left[kept], weights[kept])
+    own, along = receptances.on(kept).products(left[kept], weights[kept])
     assert np.allclose(along, 2.0 * np.einsum("slp,l,ls->p", tail[:, kept].conj(), weights[kept], left[kept]).real)

@@ -7,7 +7,7 @@ import pytest
 
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import lines_of
-from workbench.gap.localisation.force_localisation import placed
+from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import sampled_model
@@ -38,11 +38,11 @@ def evidence(rig, records):
 
 def where(rig, records, faulty=()):
     found = evidence(rig, records)
-    return locate(found, (), placed(found.without(faulty)))
+    return locate(found, (), locate_force(found.without(faulty)))
 
 
 def placed_by(rig, records):
-    return placed(evidence(rig, records))
+    return locate_force(evidence(rig, records))
 
 
 def test_a_tone_on_one_sensor_late_in_one_record(rig, measured):

@@ -46,33 +46,36 @@ def test_what_is_found_comes_in_the_order_of_the_items(number):
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_what_is_worked_out_aside_is_worked_out_once_beside_work_that_is_shared(number):
+def test_what_is_computed_in_the_background_is_computed_once_beside_work_that_is_shared(number):
     workers = Workers(number)
-    with workers.aside(os.getpid) as one, workers.aside(lambda: workers.map(lambda i: i**2, range(5))) as other:
+    with (
+        workers.in_background(os.getpid) as one,
+        workers.in_background(lambda: workers.map(lambda i: i**2, range(5))) as other,
+    ):
         assert workers.map(lambda i: i + 1, range(5)) == [1, 2, 3, 4, 5]
         assert other() == other() == [0, 1, 4, 9, 16]
         assert (one() == os.getpid()) == (number == 1 or not FORKS)
 
 
 @forked
-def test_work_aside_gives_way_to_others_and_its_failure_is_raised_where_it_is_asked_for(helpers):
+def test_work_in_the_background_gives_way_to_others_and_its_failure_is_raised_where_it_is_asked_for(helpers):
     def fails():
         raise ValueError(f"niceness {os.nice(0)}")
 
     nicest = min(os.nice(0) + LEFT_OVER, 19)  # 19 is the most there is
-    with TWO.aside(fails) as asked, pytest.raises(ValueError, match=rf"niceness {nicest}\b"):
+    with TWO.in_background(fails) as asked, pytest.raises(ValueError, match=rf"niceness {nicest}\b"):
         asked()
 
 
 @forked
-def test_work_aside_is_shared_further_and_given_up_with_all_who_share_it(helpers):
+def test_work_in_the_background_is_shared_further_and_given_up_with_all_who_share_it(helpers):
     source, sink = os.pipe()
 
     def stays(i):
         os.write(sink, os.getpid().to_bytes(4, "little"))
         time.sleep(60)
 
-    with TWO.aside(lambda: TWO.map(stays, range(2))):
+    with TWO.in_background(lambda: TWO.map(stays, range(2))):
         pids = {int.from_bytes(os.read(source, 4), "little") for _ in range(2)}
     assert len(pids) == 2 and os.getpid() not in pids
     deadline = time.perf_counter() + 10
@@ -90,9 +93,9 @@ def _runs(pid: int) -> bool:
 
 
 @forked
-def test_nobody_waits_for_work_aside_that_is_not_asked_for(helpers):
+def test_nobody_waits_for_work_in_the_background_that_is_not_asked_for(helpers):
     begun = time.perf_counter()
-    with pytest.raises(KeyboardInterrupt), TWO.aside(lambda: time.sleep(60)):
+    with pytest.raises(KeyboardInterrupt), TWO.in_background(lambda: time.sleep(60)):
         raise KeyboardInterrupt
     assert time.perf_counter() - begun < 30
 

@@ -21,7 +21,7 @@ def test_an_odd_law_shows_on_odd_lines_and_an_even_law_on_even_ones():
     lines = (3, 7, 9, 15)
     for law, loud, quiet in ((lambda u: u + 0.1 * u**3, "odd", "even"), (lambda u: u + 0.1 * u**2, "even", "odd")):
         found = distortion_of(record(law, lines))
-        assert found.tells_parity and list(np.flatnonzero(found.excited) + 1) == list(lines)
+        assert found.parity_resolved and list(np.flatnonzero(found.excited) + 1) == list(lines)
         assert found.rms[loud][0] > 0.1 and found.rms[quiet][0] < 3 * NOISE
     linear = distortion_of(record(lambda u: u, lines)).rms
     assert linear["excited"][0] == pytest.approx(np.sqrt(len(lines) / 2), rel=1e-3)
@@ -36,7 +36,7 @@ def test_the_power_on_even_lines_is_that_of_the_square():
 
 def test_noise_is_found_and_what_does_not_repeat_is_refused():
     found = distortion_of(record(lambda u: u, (3, 8)))
-    assert found.rms["noise"][0] == pytest.approx(NOISE, rel=0.1) and not found.tells_parity
+    assert found.rms["noise"][0] == pytest.approx(NOISE, rel=0.1) and not found.parity_resolved
     rng = np.random.default_rng(0)
     noise = rng.normal(size=(1, 500))
     with pytest.raises(ValueError, match="do not repeat"):

@@ -87,7 +87,7 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
         if strength <= UNSEEN * grid[j]:
             raise DesignError(f"no sensor sees mode {r + 1}: all stand at its nodes; move or add one")
         if modes.omega[r] == 0 and np.abs(c[:, j]).max() <= UNSEEN * grid[j]:
-            raise DesignError(f"rates alone do not tell where rigid-body mode {r + 1} is; add a displacement sensor")
+            raise DesignError(f"rates alone do not show where rigid-body mode {r + 1} is; add a displacement sensor")
     a, b = controlled_plant(modes, index, law.actuators)
     return a, b, c
 

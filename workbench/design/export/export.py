@@ -91,7 +91,7 @@ def _mat(
 ) -> dict[str, object]:
     """Variables of the MAT file: the five matrices, what is made up for, and what each signal is."""
     one = controller
-    told = {
+    content = {
         "name": one.name,
         "sample_time": one.sample_time,
         **{letter.upper(): getattr(one, letter) for letter in "abcde"},
@@ -101,8 +101,8 @@ def _mat(
         "states": np.array(states, object),
     }
     if one.relays is not None:
-        told |= {"relay_spread": one.relays.spread, "relay_force": one.relays.force}
-        told |= {"relay_dead_band": one.relays.dead_band}
+        content |= {"relay_spread": one.relays.spread, "relay_force": one.relays.force}
+        content |= {"relay_dead_band": one.relays.dead_band}
     if one.friction is not None:
-        told |= {f"friction_{name}": getattr(one.friction, name) for name in one.friction.__dataclass_fields__}
-    return told
+        content |= {f"friction_{name}": getattr(one.friction, name) for name in one.friction.__dataclass_fields__}
+    return content

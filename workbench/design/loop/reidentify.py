@@ -1,6 +1,6 @@
 """From a closed-loop record with known gains back to the structure: the simultaneous problem of Chapter 6.
 
-Modal coordinates read in the loop move as q(t) = Σ_k ψ_k e^{p_k t}. With u = -K x known, every pair tells
+Modal coordinates read in the loop move as q(t) = Σ_k ψ_k e^{p_k t}. With u = -K x known, every pair gives
 
     S ψ_k + p_k C ψ_k = -p_k² ψ_k - B K (ψ_k, p_k ψ_k),
 
@@ -59,7 +59,7 @@ def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> Re
         shapes: (n_controlled, n_controlled) complex, modal coordinates in rows, one column a pole.
 
     Raises:
-        DesignError: as many poles as controlled modes are needed; shapes too alike to tell modes apart.
+        DesignError: as many poles as controlled modes are needed; shapes too alike to distinguish modes.
     """
     poles, shapes = np.asarray(poles, complex), np.asarray(shapes, complex)
     n = law.n_controlled
@@ -74,7 +74,7 @@ def open_loop(modes: Modes, law: Law, poles: ArrayLike, shapes: ArrayLike) -> Re
     scale = np.linalg.norm(left, axis=1, keepdims=True)
     if not np.linalg.cond(left / scale) < ILL_CONDITIONED:
         raise DesignError(
-            "the closed-loop shapes are too alike to tell the modes apart; read them longer or excite all"
+            "the closed-loop shapes are too alike to distinguish the modes; read them longer or excite all"
         )
     found = np.linalg.solve((left / scale).T, right.T).T / scale.T
     return Reidentified(found[:, :n], found[:, n:])

@@ -113,7 +113,7 @@ def _crossing(
 def _turns(omega: float, c: float, w: float, dw: float, horizon: float) -> Iterator[float]:
     """Zeros up to the horizon of w'' + c w' + ω² w = 0 from (w, w') = (w, dw), then the horizon.
 
-    An oscillation's later swings are no larger than its first two, so three zeros tell of every crossing.
+    An oscillation's later extremes are no larger than its first two, so three zeros show every crossing.
     """
     sigma = 0.5 * c
     found: list[float] = []

@@ -114,7 +114,7 @@ class CellBounds:
             np.linalg.norm(np.einsum("skl,il->isk", np.abs(inverses), table.most_bend[:, :n]), axis=2),
             np.array([limit for _, limit in squares]),
             float(limits.condition),
-            np.ascontiguousarray(forces if np.isfinite(limits.peak_force) else forces[:, :0]),
+            np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
             float(limits.peak_force),
         )
 
@@ -219,7 +219,7 @@ def _bounds(
     least_y, shift, cost, score = np.empty((n_residual, n_columns)), np.empty(n), np.empty(n), np.empty(n)
     directions, slacks = np.empty((n_squares + 1, n)), np.empty(n_squares + 1)
     corner = np.empty((n, n))
-    weighed, u, v, carried = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
+    weighted, u, v, carried = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
     for cell in range(n_cells):
         node = cells[cell]
         lower[cell], work[cell] = 0.0, np.inf
@@ -280,17 +280,17 @@ def _bounds(
                     d = 0.0
                     for k in range(n):
                         d += m[i, k] * roots[s, k, c]
-                    weighed[i, c] = d
+                    weighted[i, c] = d
                     a += d * d
                 if a > size:
                     column, size = c, a
             for i in range(n):
-                v[i] = weighed[i, column]
+                v[i] = weighted[i, column]
             a = 0.0
             for c in range(n):
                 u[c] = 0.0
                 for i in range(n):
-                    u[c] += weighed[i, c] * v[i]
+                    u[c] += weighted[i, c] * v[i]
                 a += u[c] ** 2
             if not regular[s]:
                 continue
@@ -302,7 +302,7 @@ def _bounds(
             for i in range(n):
                 v[i] = 0.0
                 for c in range(n):
-                    v[i] += weighed[i, c] * u[c]
+                    v[i] += weighted[i, c] * u[c]
                 d += v[i] ** 2
                 e += abs(v[i]) * 0.5 * h[i] ** 2 * root_bend[node[i], s]
                 for c in range(n):
@@ -356,7 +356,7 @@ def _bounds(
                     d = 0.0
                     for k in range(n):
                         d += m[i, k] * roots[s, k, c]
-                    weighed[i, c] = d
+                    weighted[i, c] = d
                     energy += d * d
             energy = np.sqrt(energy)
             for j in range(n):
@@ -366,12 +366,12 @@ def _bounds(
                 for k in range(n):
                     carried[k] = 0.0
                     for j in range(n):
-                        carried[k] += error[k, j] * abs(weighed[j, c])
+                        carried[k] += error[k, j] * abs(weighted[j, c])
                 for i in range(n):
-                    share = weighed[i, c] / energy
+                    share = weighted[i, c] / energy
                     for j in range(n):
-                        directions[s, j] -= share * rate[i, j] * weighed[j, c]
-                        remainder += abs(share) * (curved[i, j] * abs(weighed[j, c]) + change[i, j] * carried[j])
+                        directions[s, j] -= share * rate[i, j] * weighted[j, c]
+                        remainder += abs(share) * (curved[i, j] * abs(weighted[j, c]) + change[i, j] * carried[j])
             slacks[s] = slacks[s] - energy + remainder
             reach = 0.0
             for j in range(n):

@@ -113,7 +113,7 @@ def compare(
 def through_sensors(
     modes: Modes, laws: Sequence[Law], places: Sequence[float], mass_per_length: ProfileLike | None
 ) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
-    """Each law on what sensors of displacement and velocity at the places tell: a modal filter, a Luenberger observer.
+    """Each law on what sensors of displacement and velocity at the places read: a modal filter, a Luenberger observer.
 
     Args:
         modes: controlled and residual.

@@ -203,16 +203,16 @@ def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np
     index = list(law.controlled)
     start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
     gramian = solve_continuous_lyapunov(a - b @ law.gain, -np.outer(start, start))
-    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + _weighed(law.gain, weight)
+    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + _weighted(law.gain, weight)
     return float(np.trace(q @ gramian))
 
 
-def _weighed(gain: Floats, weight: float | Floats) -> Floats:
+def _weighted(gain: Floats, weight: float | Floats) -> Floats:
     return gain.T @ weight @ gain if isinstance(weight, np.ndarray) and weight.ndim else weight * gain.T @ gain
 
 
 def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:
-    """`quadratic_cost` with modal forces weighed, R fᵀf, f = B F."""
+    """`quadratic_cost` with modal forces weighted, R fᵀf, f = B F."""
     b = input_matrix(modes, law.actuators)[list(law.controlled)]
     return quadratic_cost(modes, law, state, weight * b.T @ b)
 

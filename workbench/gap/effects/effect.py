@@ -206,7 +206,7 @@ class Effect:
 
 
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
-    """What tells a set of effects from another, numbers and order apart."""
+    """What distinguishes a set of effects from another, but for numbers and order."""
     return tuple(sorted(effect.label for effect in effects))
 
 

@@ -1,4 +1,4 @@
-"""Limiting cases: the simpler effect is meant where the records cannot tell it from one that contains it."""
+"""Limiting cases: the simpler effect is meant where the records cannot distinguish it from one that contains it."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace

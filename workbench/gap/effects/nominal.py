@@ -77,8 +77,8 @@ class IdentifiedPrior:
     """Errors of a nominal rig that was itself identified: e = R z, z normal of unit covariance, R Rᵀ that of e.
 
     Attributes:
-        make: errors (n_figures,) of what was identified -> the rig that has them.
-        root: (n_figures, n_free) R.
+        make: errors (n_parameters,) of what was identified -> the rig that has them.
+        root: (n_parameters, n_free) R.
     """
 
     make: Callable[[Floats], Rig]
@@ -86,7 +86,7 @@ class IdentifiedPrior:
 
     @classmethod
     def of(cls, make: Callable[[Floats], Rig], covariance: Floats) -> "IdentifiedPrior":
-        """Of figures with that covariance (n_figures, n_figures); directions that are sure all but left out."""
+        """Of parameters with that covariance (n_parameters, n_parameters), without directions that are all but sure."""
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         sizes, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
         kept = sizes > SURE * sizes.max()

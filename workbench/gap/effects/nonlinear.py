@@ -227,7 +227,7 @@ def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
 
 
 def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
-    """Its numbers, without a smoothing speed too small for the records to tell."""
+    """Its numbers, without a smoothing speed too small for the records to show."""
     speed = friction.values["smoothing_speed"]
     sudden = friction.deviations.get("smoothing_speed", 0.0) > speed
     return {name: v for name, v in friction.numbers.items() if name != "smoothing_speed" or not sudden}

@@ -286,8 +286,8 @@ def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple
 
     def where_there_is_room(rig: Rig) -> tuple[str, ...]:
         domain = rig.modes.domain
-        crowded = isinstance(domain, NamedPoints) and len(domain.names) <= len(rig.actuators) + len(rig.sensors)
-        return () if crowded else targets(rig)
+        points_alone = isinstance(domain, NamedPoints) and len(domain.names) <= len(rig.actuators) + len(rig.sensors)
+        return () if points_alone else targets(rig)
 
     return where_there_is_room
 

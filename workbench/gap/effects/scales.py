@@ -1,4 +1,4 @@
-"""The sizes that a rig has of itself: bounds and starts of effects are told by them, whatever the units."""
+"""The sizes that a rig has of itself: bounds and starts of effects are relative to them, whatever the units."""
 
 from dataclasses import dataclass
 from functools import lru_cache

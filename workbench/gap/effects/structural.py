@@ -51,7 +51,7 @@ def _attachments(structure: object) -> tuple[Attachment, ...]:
 
 @lru_cache(maxsize=16)
 def _bare_modes(kind: Any, facts: tuple[tuple[str, Any], ...], n_modes: int) -> Modes:
-    """Modes of a plate or membrane without attachments, as many as tell what one does to the lowest `n_modes`."""
+    """Modes of a plate or membrane without attachments, as many as describe what one does to the lowest `n_modes`."""
     surface = kind(**{**dict(facts), "edges": dict(dict(facts)["edges"])})
     in_closed_form = getattr(surface, "is_navier", False)
     modes: Modes = surface.modes((MANY if in_closed_form else FEWER) * n_modes, tolerance=ROUGHLY)
@@ -252,7 +252,7 @@ def _softened(rig: Rig, _: object, values: dict[str, float]) -> Rig:
     name, length = stiffness_name(member), member.length
     start, stop = values["at"] - 0.5 * values["width"], values["at"] + 0.5 * values["width"]
     if start < -EDGE * length or stop > (1.0 + EDGE) * length:
-        # what lies beyond the end changes nothing: place and width could not be told apart
+        # what lies beyond the end changes nothing: place and width could not be distinguished
         raise ValueError(f"the stretch from {start:.4g} to {stop:.4g} reaches beyond the structure")
     profile = getattr(member, name).scaled(1.0 - values["loss"], max(start, 0.0), min(stop, length))
     return resolved(rig, replace(member, **{name: profile}))

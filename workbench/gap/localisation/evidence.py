@@ -33,7 +33,7 @@ BROAD, NARROW = 0.1, 0.03  # of a rectangle's diagonal: between tops of its prof
 FINER = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
 POINTS_TRIED, PAIRS_TRIED = 4, 4  # named points, and pairs of them, whose motion is looked at
 ALIKE = 1e-4  # 1 - cos² of the angle between the motions of two pairs of points: less is one place
-CROWD = 12  # named points, of which all are looked at
+MANY_POINTS = 12  # named points, of which all are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,8 @@ class Evidence:
         motions: its motion, one a record.
         residuals: (n_sensors, n_samples) a record, in the sensors' units.
         n_places: where a force is looked for.
-        told: places of the force, where they are known from elsewhere.
-        sized: its rms, N, and correlation time, in samples, likewise.
+        given_places: places of the force, where they are known from elsewhere.
+        given_size: its rms, N, and correlation time, in samples, likewise.
         workers: processes that share the work.
     """
 
@@ -73,8 +73,8 @@ class Evidence:
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
     n_places: int = PLACES
-    told: tuple[Where, ...] = ()
-    sized: tuple[float, float] | None = None
+    given_places: tuple[Where, ...] = ()
+    given_size: tuple[float, float] | None = None
     workers: Workers = ALONE
 
     @classmethod
@@ -98,7 +98,7 @@ class Evidence:
 
     def of_force_at(self, *places: Where) -> "Evidence":
         """The same evidence of a force at places that are known."""
-        return replace(self, told=places, sized=self.size)
+        return replace(self, given_places=places, given_size=self.size)
 
     @property
     def domain(self) -> Domain:
@@ -131,15 +131,15 @@ class Evidence:
         if isinstance(self.domain, Interval):
             return [float(x) for x in self.places[::2]]
         if isinstance(self.domain, NamedPoints):
-            crowded = len(self.domain.names) > CROWD
-            return [p for p in self.peaks if not isinstance(p, Between)] if crowded else self.domain.grid()
+            many = len(self.domain.names) > MANY_POINTS
+            return [p for p in self.peaks if not isinstance(p, Between)] if many else self.domain.grid()
         return self.domain.grid(6)
 
     @cached_property
     def size(self) -> tuple[float, float]:
         """Rms, N, and correlation time, in samples, of the unmodelled force: the likeliest of a coarse grid."""
-        if self.sized is not None:
-            return self.sized
+        if self.given_size is not None:
+            return self.given_size
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
         sizes = [(share * self.data.force_rms, memory) for memory in MEMORIES for share in LEVELS]
 
@@ -156,7 +156,7 @@ class Evidence:
         if isinstance(self.domain, Interval):
             every_fifth: Sequence[Any] = self.places[::5]
             return every_fifth
-        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= CROWD:
+        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= MANY_POINTS:
             return self.domain.grid()
         return self._screened[:MOST_PEAKS]
 
@@ -188,12 +188,12 @@ class Evidence:
             return self._tops_over(self.domain, ranked)
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
-        most = len(points) if len(points) <= CROWD else POINTS_TRIED
+        most = len(points) if len(points) <= MANY_POINTS else POINTS_TRIED
         return tuple(ranked[i] for i in sorted((*points[:most], *self._unlike(ranked, pairs))))
 
     def _unlike(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
         """The first few pairs that move unlike one another: the two ends of a stiff floor are one place, and would
-        crowd out others."""
+        displace others."""
         kept: list[int] = []
         shapes: list[np.ndarray] = []
         for i in pairs:
@@ -234,8 +234,8 @@ class Evidence:
     @cached_property
     def peaks(self) -> tuple[Any, ...]:
         """The likeliest places of an unmodelled force, best first, refined between the grid points."""
-        if self.told:
-            return self.told
+        if self.given_places:
+            return self.given_places
         if not isinstance(self.domain, Interval):
             return self._screened
         profile, places = self.profile, np.asarray(self.places, float)

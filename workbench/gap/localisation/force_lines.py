@@ -17,7 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.localisation.receptance import Answers, answers_of, real_product
+from workbench.gap.localisation.receptance import Receptances, real_product, receptances_of
 from workbench.gap.prediction.unmodelled_force import SampledModel
 from workbench.rig.rig import Rig
 
@@ -25,9 +25,9 @@ TOP = 0.9  # of half the sample rate: above, what is folded down is no longer sm
 MOST_LINES = 8192  # of a record: of a longer one every so many, which costs precision alone
 WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
 CHANCE = 2.0  # deviations by which noise may pass for a force in them
-COUNTING = 0.02  # weight below which a line tells nothing
+COUNTING = 0.02  # weight below which a line is left out
 SCREENED = 300  # lines, the strongest, where many places are compared
-ROUNDS = 4  # of the spectrum of the force, each weighed by the one before
+ROUNDS = 4  # of the spectrum of the force, each weighted by the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,18 +35,18 @@ class Lines:
     """A record's residual at the lines of its spectrum, in units of the noise, and what it is made of.
 
     Attributes:
-        answers: of the rig, to forces and to states at the ends.
+        receptances: of the rig, to forces and to states at the ends.
         left: (n_lines, n_sensors) the residual; its noise has unit variance.
         weights: (n_lines,).
     """
 
-    answers: Answers
+    receptances: Receptances
     left: np.ndarray
     weights: np.ndarray
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.answers.products(self.left, self.weights)
+        return self.receptances.products(self.left, self.weights)
 
     @property
     def freedom(self) -> int:
@@ -59,10 +59,10 @@ class Lines:
         """Sum of squares of the residual."""
         return float(2.0 * self.weights @ np.sum(np.abs(self.left) ** 2, axis=1))
 
-    def weighed(self, weights: np.ndarray) -> "Lines":
-        """The lines by other weights (n_lines,), without those that tell nothing."""
+    def weighted(self, weights: np.ndarray) -> "Lines":
+        """The lines by other weights (n_lines,), without those that count for nothing."""
         kept = weights > COUNTING
-        return Lines(self.answers.on(kept), self.left[kept], weights[kept])
+        return Lines(self.receptances.on(kept), self.left[kept], weights[kept])
 
     def misfit(self, shape: np.ndarray) -> float:
         """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
@@ -72,8 +72,8 @@ class Lines:
         end, along = self._end(u * root[:, None], a)
         return self.power - 2.0 * float(np.sum(np.abs(a) ** 2)) - float(along @ end)
 
-    def telling(self, shape: np.ndarray) -> np.ndarray:
-        """Share (n_lines,) of a force there in what is read along it: how much each line tells of its place."""
+    def force_share(self, shape: np.ndarray) -> np.ndarray:
+        """Share (n_lines,) of a force there in what is read along it: the weight of each line."""
         u, a, power = self._along(shape)
         share, sure = np.ones_like(power), np.ones_like(power)
         for _ in range(ROUNDS):
@@ -94,10 +94,10 @@ class Lines:
 
     def _along(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The tail and the residual along the reading of a force, and that reading's power."""
-        h = self.answers.to_force(shape)
+        h = self.receptances.to_force(shape)
         power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
         h = (h / np.sqrt(power)[:, None]).conj()
-        return self.answers.along(h), np.sum(h * self.left, axis=1), power
+        return self.receptances.along(h), np.sum(h * self.left, axis=1), power
 
 
 def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
@@ -107,8 +107,8 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
     """
     strong = np.argsort(-lines.weights * np.sum(np.abs(lines.left) ** 2, axis=1))[:SCREENED]
     power = lines.power
-    lines = Lines(lines.answers.on(strong), lines.left[strong], lines.weights[strong])
-    to_force = np.moveaxis(np.array([lines.answers.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
+    lines = Lines(lines.receptances.on(strong), lines.left[strong], lines.weights[strong])
+    to_force = np.moveaxis(np.array([lines.receptances.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
     left = np.full(len(shapes), power)
     for h, r, weight in zip(to_force, lines.left, lines.weights, strict=True):
         seen = h @ shapes.T
@@ -131,15 +131,15 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
         sample_time: s.
     """
     noise = np.sqrt(model.noise_variance)
-    made: dict[int, tuple[np.ndarray, Answers]] = {}
+    made: dict[int, tuple[np.ndarray, Receptances]] = {}
     lines = []
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
             top = max(int(0.5 * TOP * n), 2)
             taken = np.arange(1, top, 1 + top // MOST_LINES)
-            made[n] = taken, answers_of(rig, model, 2.0 * np.pi * taken / (n * sample_time), n, sample_time)
-        taken, answers = made[n]
+            made[n] = taken, receptances_of(rig, model, 2.0 * np.pi * taken / (n * sample_time), n, sample_time)
+        taken, receptances = made[n]
         left = np.fft.rfft(residual, axis=1)[:, taken].T / noise
-        lines.append(Lines(answers, left / np.sqrt(n), np.ones(taken.size)))
+        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size)))
     return lines

@@ -14,7 +14,7 @@ from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.threads import one_blas_thread
 
 VALLEYS = 3  # of the misfit that are gone into
-ROUNDS = 3  # in each: where the force is, which lines tell of it
+ROUNDS = 3  # in each: where the force is, which lines it stands out in
 BESIDE, RESOLVED = 0.95, 1e-3  # of the spacing of places
 PAIRS_SHOWN = 12  # of named points
 TWO_SIGMA = 4.0  # rise of the misfit
@@ -23,7 +23,7 @@ CHANCE = 3.0  # deviations of a sum of squares
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class ForceLocation:
     """How likely one force, of any law, is at each place, and where it is likeliest.
 
     Attributes:
@@ -33,7 +33,7 @@ class Placed:
         at_std: a quarter of the way between where the misfit is two deviations higher, m, more by what is left
             beyond the noise; on a rectangle along the longer axis of the region; 0 for named places.
         share: of the gap's power above the noise, what one force there accounts for.
-        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing tells:
+        holds: whether one force leaves nothing but noise, or next to nothing of the gap; None where nothing shows it:
             no gap, one sensor, or records too short.
     """
 
@@ -46,36 +46,39 @@ class Placed:
 
 
 @one_blas_thread
-def placed(evidence: Evidence) -> Placed:
+def locate_force(evidence: Evidence) -> ForceLocation:
     """Where one force, of any law, would make the simulation agree with the test.
 
-    One sensor tells no place: a force anywhere accounts for all that it reads. Sensors that lag are left out.
+    One sensor locates nothing: a force anywhere accounts for all that it reads. Sensors that lag are left out.
     """
     evidence = evidence.without([sensor.name for sensor in evidence.rig.sensors if sensor.time_constant > 0])
     domain, guess, places = evidence.domain, evidence.peaks[0], evidence.places
     if len(evidence.rig.sensors) < 2:
         unsure = 0.0 if isinstance(domain, NamedPoints) else domain.size / np.sqrt(12.0)
-        return Placed(places, np.zeros(len(places)), guess, unsure, 0.0, None)
+        return ForceLocation(places, np.zeros(len(places)), guess, unsure, 0.0, None)
     lines = lines_of(evidence.rig, evidence.model, evidence.residuals, evidence.data.counted[0].sample_time)
     search = _Search(evidence, lines)
-    telling = search.telling(guess)
+    informative = search.informative(guess)
     at: Any
     if isinstance(domain, Interval):
-        profile = search.along(telling, places)
-        at = min(evidence.workers.map(search.refined, _valleys(np.asarray(places, float), profile)), key=search.judged)
-        telling = search.telling(at)
-        profile, std = search.along(telling, places), search.deviation(telling, at)
+        profile = search.along(informative, places)
+        at = min(
+            evidence.workers.map(search.refined, _valleys(np.asarray(places, float), profile)),
+            key=search.unweighted_misfit,
+        )
+        informative = search.informative(at)
+        profile, std = search.along(informative, places), search.deviation(informative, at)
     elif isinstance(domain, Rectangle):
-        at, std = min(map(search.refined_over, evidence.peaks), key=lambda each: search.judged(each[0]))
-        telling = search.telling(at)
-        profile = search.screened(telling, places)
+        at, std = min(map(search.refined_over, evidence.peaks), key=lambda each: search.unweighted_misfit(each[0]))
+        informative = search.informative(at)
+        profile = search.screened(informative, places)
     else:
         places = _shown(places, evidence.profile)
-        profile = search.along(telling, places)
+        profile = search.along(informative, places)
         at, std = places[int(np.argmin(profile))], 0.0
-    lowest = min(search.misfit(telling, at), profile.min())
+    lowest = min(search.misfit(informative, at), profile.min())
     std *= np.sqrt(max(search.left(at), 0.0) + 1.0)
-    return Placed(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
+    return ForceLocation(places, -0.5 * (profile - lowest), at, std, *search.of_one_force(at))
 
 
 def _shown(places: Sequence[Any], profile: np.ndarray) -> list[Any]:
@@ -99,10 +102,10 @@ class _Search:
     def shape(self, where: Any) -> np.ndarray:
         return self.evidence.rig.modes.phi_at(where)
 
-    def telling(self, where: Any) -> list[Lines]:
-        """The lines by how much they tell of a force somewhere."""
+    def informative(self, where: Any) -> list[Lines]:
+        """The lines weighted by the share of a force somewhere in them."""
         shape = self.shape(where)
-        return [each.weighed(each.telling(shape)) for each in self.lines]
+        return [each.weighted(each.force_share(shape)) for each in self.lines]
 
     def misfit(self, lines: list[Lines], where: Any) -> float:
         shape = self.shape(where)
@@ -138,13 +141,13 @@ class _Search:
 
     def refined_over(self, top: tuple[float, float]) -> tuple[tuple[float, float], float]:
         """The bottom of a valley over a rectangle, and one standard deviation along its longer axis, m."""
-        rectangle, telling = self.evidence.domain, self.telling(top)
+        rectangle, informative = self.evidence.domain, self.informative(top)
         assert isinstance(rectangle, Rectangle)
         extent = np.array(rectangle.length)
 
         def misfit(xy: np.ndarray) -> float:
             inside = np.clip(xy, 1e-4 * extent, (1.0 - 1e-4) * extent)
-            return self.misfit(telling, (float(inside[0]), float(inside[1])))
+            return self.misfit(informative, (float(inside[0]), float(inside[1])))
 
         reach = 0.02 * rectangle.size
         simplex = np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
@@ -157,24 +160,24 @@ class _Search:
 
     def refined(self, top: float) -> float:
         """The bottom of a valley."""
-        at, telling = float(top), self.telling(top)
+        at, informative = float(top), self.informative(top)
         spacing = self.evidence.places[1] - self.evidence.places[0]
         for _ in range(ROUNDS):
             found = minimize_scalar(
                 lambda x, lines: self.misfit(lines, x),
                 bounds=self._inside(at - BESIDE * spacing, at + BESIDE * spacing),
-                args=(telling,),
+                args=(informative,),
                 method="bounded",
                 options={"xatol": RESOLVED * spacing},
             )
             moved, at = abs(found.x - at), float(found.x)
-            telling = self.telling(at)
+            informative = self.informative(at)
             if moved < RESOLVED * spacing:
                 break
         return at
 
-    def judged(self, at: Any) -> float:
-        """The misfit of a valley by all lines alike: those that one of them weighs would favour it."""
+    def unweighted_misfit(self, at: Any) -> float:
+        """The misfit of a valley by all lines alike: weights of its own would favour it."""
         return self.misfit(self.lines, at)
 
     def deviation(self, lines: list[Lines], at: float) -> float:

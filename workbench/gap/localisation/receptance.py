@@ -18,8 +18,8 @@ UNDAMPED = 1e-9j  # of the stiffness: what keeps a mode without damping finite o
 
 
 @dataclass(frozen=True, eq=False)
-class Coupled:
-    """Answers of modes that damping couples.
+class CoupledReceptances:
+    """Receptances of modes that damping couples.
 
     Attributes:
         compliance: (n_lines, n_sensors, n_modes) of modal forces.
@@ -40,12 +40,12 @@ class Coupled:
     def products(self, left: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Of T with itself and with what is left (n_lines, n_sensors), by weights of the lines."""
         tail, left = self.tail.reshape(-1, self.tail.shape[2]), left.ravel()
-        weighed = tail * np.repeat(weights, self.tail.shape[1])[:, None]
-        return real_product(weighed, tail), real_product(weighed, left)
+        weighted = tail * np.repeat(weights, self.tail.shape[1])[:, None]
+        return real_product(weighted, tail), real_product(weighted, left)
 
-    def on(self, kept: np.ndarray) -> "Coupled":
+    def on(self, kept: np.ndarray) -> "CoupledReceptances":
         """On some of the lines."""
-        return Coupled(self.compliance[kept], self.tail[kept])
+        return CoupledReceptances(self.compliance[kept], self.tail[kept])
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +66,8 @@ class _Alike:
 
 
 @dataclass(frozen=True, eq=False)
-class Apart:
-    """Answers of modes that damping leaves apart: what a sensor reads of one is its shape there, times the mode's own.
+class UncoupledReceptances:
+    """Receptances of modes that damping does not couple: a sensor reads its shape there, times the mode's own.
 
     Attributes:
         compliance: (n_lines, n_modes) of the modes themselves.
@@ -78,7 +78,7 @@ class Apart:
     sensors: tuple[_Alike, ...]
 
     def to_force(self, shape: Floats) -> Complexes:
-        """See `Coupled`."""
+        """See `CoupledReceptances`."""
         moved = self.compliance * shape
         readings = np.empty((len(moved), sum(alike.here.size for alike in self.sensors)), complex)
         for alike in self.sensors:
@@ -86,30 +86,30 @@ class Apart:
         return readings
 
     def along(self, directions: Complexes) -> Complexes:
-        """See `Coupled`."""
+        """See `CoupledReceptances`."""
         seen: list[Complexes] = [
             np.tile(directions[:, alike.here] @ alike.shapes, 2) * alike.tail for alike in self.sensors
         ]
         return sum(seen[1:], start=seen[0])
 
     def products(self, left: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `Coupled`."""
+        """See `CoupledReceptances`."""
         size = 2 * self.compliance.shape[1]
         own, along = np.zeros((size, size)), np.zeros(size)
         for alike in self.sensors:
-            weighed = weights[:, None] * alike.tail
-            own += np.tile(alike.shapes.T @ alike.shapes, (2, 2)) * real_product(weighed, alike.tail)
+            weighted = weights[:, None] * alike.tail
+            own += np.tile(alike.shapes.T @ alike.shapes, (2, 2)) * real_product(weighted, alike.tail)
             seen = np.tile(left[:, alike.here] @ alike.shapes, 2)
-            along += 2.0 * np.sum((weighed.conj() * seen).real, axis=0)
+            along += 2.0 * np.sum((weighted.conj() * seen).real, axis=0)
         return own, along
 
-    def on(self, kept: np.ndarray) -> "Apart":
-        """See `Coupled`."""
+    def on(self, kept: np.ndarray) -> "UncoupledReceptances":
+        """See `CoupledReceptances`."""
         sensors = (replace(alike, rates=alike.rates[kept], tail=alike.tail[kept]) for alike in self.sensors)
-        return Apart(self.compliance[kept], tuple(sensors))
+        return UncoupledReceptances(self.compliance[kept], tuple(sensors))
 
 
-Answers = Apart | Coupled
+Receptances = UncoupledReceptances | CoupledReceptances
 
 
 def real_product(one: Complexes, other: Complexes) -> Floats:
@@ -118,18 +118,20 @@ def real_product(one: Complexes, other: Complexes) -> Floats:
     return product
 
 
-def answers_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Answers:
-    """The answers of a rig at lines of frequency omega (n_lines,), rad/s, of a record of so many samples.
+def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int, sample_time: float) -> Receptances:
+    """The receptances of a rig at lines of frequency omega (n_lines,), rad/s, of a record of so many samples.
 
     Args:
         model: the rig's sampled form, with the variance of each sensor's noise.
     """
     z = (1.0 + abs(UNDAMPED)) * np.exp(1j * omega * sample_time)
-    turn = _apart if rig.modes.proportional else _coupled
+    turn = _uncoupled if rig.modes.proportional else _coupled
     return turn(rig, model, np.asarray(1j * omega, complex), z, np.sqrt(model.noise_variance), 1.0 / np.sqrt(n_samples))
 
 
-def _coupled(rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float) -> Coupled:
+def _coupled(
+    rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float
+) -> CoupledReceptances:
     modes = rig.modes
     dynamic = rate[:, None, None] * modes.damping
     each = np.arange(modes.n_modes)
@@ -139,10 +141,12 @@ def _coupled(rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise
     transposed = z[:, None, None] * np.eye(model.transition.shape[0]) - model.transition.T
     outputs = np.broadcast_to(model.output.T, (z.size, *model.output.T.shape))
     tail = z[:, None, None] * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2) * _velocities(rig)
-    return Coupled(compliance / noise[:, None], share * tail / noise[:, None])
+    return CoupledReceptances(compliance / noise[:, None], share * tail / noise[:, None])
 
 
-def _apart(rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float) -> Apart:
+def _uncoupled(
+    rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float
+) -> UncoupledReceptances:
     modes = rig.modes
     n, rate, z = modes.n_modes, rate[:, None], z[:, None]
     damping, stiffness = np.diag(modes.damping), modes.omega**2
@@ -161,7 +165,7 @@ def _apart(rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: 
     for order in set(orders.tolist()):
         here = np.flatnonzero(orders == order)
         sensors.append(_Alike(here, rows[here] / noise[here, None], rate[:, 0] ** order, motions[order]))
-    return Apart(compliance, tuple(sensors))
+    return UncoupledReceptances(compliance, tuple(sensors))
 
 
 def _velocities(rig: Rig) -> Floats:

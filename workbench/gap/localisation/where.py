@@ -10,7 +10,7 @@ from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.coherence import linear_share
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.localisation.force_localisation import Placed
+from workbench.gap.localisation.force_localisation import ForceLocation
 from workbench.gap.prediction.residuals import FitData
 
 MODE_SHARE = 0.05
@@ -51,7 +51,7 @@ class Where:
     record_gaps: np.ndarray
     input_levels: np.ndarray
     linear_share: float
-    place: Placed
+    place: ForceLocation
 
     @property
     def at(self) -> Any:
@@ -62,7 +62,7 @@ class Where:
         return self.place.at_std
 
 
-def locate(evidence: Evidence, effects: Sequence[Effect], place: Placed) -> Where:
+def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) -> Where:
     """Take the gap on the fit records apart.
 
     Args:

@@ -43,7 +43,7 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
     """Mean square (n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors' noise.
 
     For white noise of each input, as strong as the input itself; inputs at rest have none. The structure smooths it,
-    so one draw of a record's length tells its power to a few per cent.
+    so one draw of a record's length gives its power to a few per cent.
 
     Args:
         rig: nominal.
@@ -71,7 +71,7 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     """
     rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
     beyond, per = by_channel - sensor_noise, per_unit
-    if rows.any():  # the record with the weakest inputs tells the noise of the sensors itself
+    if rows.any():  # the record with the weakest inputs shows the noise of the sensors itself
         beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
     share = np.median(np.maximum(beyond, 0.0) / np.maximum(per, 1e-300))
     return float(min(np.sqrt(share), MOST_LOGGED))

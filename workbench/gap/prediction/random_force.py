@@ -38,7 +38,7 @@ class RandomForceFit:
         memory, stages: colour of the force; see `force_filter`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
         chi2_by_record: (n_records,) mean squares of the whitened residual.
-        rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records tell.
+        rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records show.
         follows: largest share of the force that the inputs and the motion of its record account for.
         tonal: least share of the force of a record that one sinusoid accounts for.
     """

@@ -31,7 +31,7 @@ class FitData:
         whitener: filter of a random force on the structure, through which every residual is seen; None where there is
             none. With a follower, laws then act on the motion that was measured: that of the rig has no such force.
         given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
-            believed figures that are fitted along with every candidate to first order; None where none are.
+            uncertain parameters that are re-estimated with every candidate to first order; None where none are.
         follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
             they are of the whole record.
     """
@@ -75,12 +75,12 @@ class FitData:
         return replace(self, whitener=whitener, follower=follower)
 
     def giving_way(self, sensitivity: np.ndarray) -> "FitData":
-        """The same yardstick with residuals as small as believed figures make them, to first order.
+        """The same measure with residuals as small as uncertain parameters make them, to first order.
 
         Their squares sum to min over δ of |r + S δ|² + |δ|²: that of r times the root of I - S (Sᵀ S + I)⁻¹ Sᵀ.
 
         Args:
-            sensitivity: (n_values, n_figures) S, in units of the belief in each figure.
+            sensitivity: (n_values, n_parameters) S, in prior standard deviations of each.
         """
         directions, sizes, _ = np.linalg.svd(sensitivity, full_matrices=False)
         return replace(self, given_way=(directions, 1.0 - 1.0 / np.sqrt(1.0 + sizes**2)))

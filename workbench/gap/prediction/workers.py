@@ -24,7 +24,7 @@ from workbench.gap.effects.effect import Kind
 MOST = 8  # processes: to fork one takes a hundredth of a second, every time
 FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not survive one, or there is none
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
-LEFT_OVER = 19  # niceness of what is worked out in the time that others leave
+LEFT_OVER = 19  # niceness of what is computed in the time that others leave
 TURN = 4  # bytes of a number in the pipe that turns are taken from
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
 
@@ -81,16 +81,16 @@ class Workers:
         return [found[i] for i in range(len(items))]
 
     @contextmanager
-    def aside(self, function: Callable[[], Found]) -> Iterator[Callable[[], Found]]:
-        """Have `function()` worked out in the time that the others leave; what is given to the block, called, has it.
+    def in_background(self, function: Callable[[], Found]) -> Iterator[Callable[[], Found]]:
+        """Have `function()` computed in the time that the others leave; what is given to the block, called, has it.
 
-        Its work may be shared further. Where no process is forked it is worked out when it is asked for. What
+        Its work may be shared further. Where no process is forked it is computed when it is asked for. What
         nobody has asked for by the end of the block is given up.
         """
         if _Helper.is_this_process or self.number < 2 or not FORKS:
             yield cache(function)
             return
-        helper = _Helper(function, aside=True)
+        helper = _Helper(function, background=True)
         try:
             yield cache(helper.found)
         finally:
@@ -130,18 +130,18 @@ def _taken(function: Callable[[Any], Any], items: list[Any], turns: int) -> dict
 
 
 class _Helper:
-    """A forked process that sends back what it found; it has no helpers of its own, unless it works aside."""
+    """A forked process that sends back what it found; without helpers of its own, unless in the background."""
 
     is_this_process = False
 
-    def __init__(self, work: Callable[[], Any], aside: bool = False) -> None:
+    def __init__(self, work: Callable[[], Any], background: bool = False) -> None:
         self._source, sink = os.pipe()
         with warnings.catch_warnings():
             # no lock of another thread is ever asked for by a helper: it computes, writes to its pipe and ends
             warnings.filterwarnings("ignore", message=".*multi-threaded.*", category=DeprecationWarning)
             self._pid = os.fork()
         if self._pid == 0:
-            _help(work, sink, aside)
+            _help(work, sink, background)
         os.close(sink)
 
     def found(self) -> Any:
@@ -165,11 +165,11 @@ class _Helper:
             os.waitpid(self._pid, 0)
 
 
-def _help(work: Callable[[], Any], sink: int, aside: bool) -> NoReturn:
+def _help(work: Callable[[], Any], sink: int, background: bool) -> NoReturn:
     """The life of a helper; it ends here, without what a process does at its end for those that it was forked from."""
     try:
-        _Helper.is_this_process = not aside
-        os.nice(LEFT_OVER if aside else 0)
+        _Helper.is_this_process = not background
+        os.nice(LEFT_OVER if background else 0)
         CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # it outlives nobody whom it works for
         try:
             answer = _sent(work())

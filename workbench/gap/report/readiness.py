@@ -1,4 +1,4 @@
-"""Before a fit: do the records fit the model, which effects could they show, and which could they not tell apart?"""
+"""Before a fit: do the records fit the model, which effects could they show, and which could they not distinguish?"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from workbench.structure.domain import Between, Where, same_place
 ALIKE = 0.995
 SEEN = 25.0  # of chi-squared: five standard deviations
 TURNED = -0.95
-FAR_OFF, HEARD = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
+FAR_OFF, ABOVE_NOISE = 50.0, 5.0  # times the model: in other units; times the noise: worth comparing
 ALIKE_IN_SHAPE = 0.5  # correlation of a reading with the model's, whatever its unit
 STUCK = 0.5
 THINNING = 3
@@ -101,8 +101,8 @@ def _sizes(rig: Rig, measured: np.ndarray, predicted: np.ndarray, alike: np.ndar
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     expected = predicted.std(axis=1)
-    told = (expected > HEARD * noise) & (np.abs(alike) > ALIKE_IN_SHAPE)
-    return np.where(told, measured.std(axis=1) / np.where(told, expected, 1.0), np.nan)
+    comparable = (expected > ABOVE_NOISE * noise) & (np.abs(alike) > ALIKE_IN_SHAPE)
+    return np.where(comparable, measured.std(axis=1) / np.where(comparable, expected, 1.0), np.nan)
 
 
 def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
@@ -112,19 +112,19 @@ def _check_units(rig: Rig, record: Record, sizes: np.ndarray) -> None:
         record: any, for its units.
         sizes: (n_records, n_sensors) readings over the model's.
     """
-    heard = [column[np.isfinite(column)] for column in sizes.T]
-    off = [j for j, ratios in enumerate(heard) if ratios.size and _always_far_off(ratios)]
+    ratios_of = [column[np.isfinite(column)] for column in sizes.T]
+    off = [j for j, ratios in enumerate(ratios_of) if ratios.size and _always_far_off(ratios)]
     if not off:
         return
-    if len(off) == sum(ratios.size > 0 for ratios in heard) > 1:
+    if len(off) == sum(ratios.size > 0 for ratios in ratios_of) > 1:
         raise RecordsError(
-            f"the outputs read about {_about(np.concatenate(heard))} times what the model makes of the inputs: are"
+            f"the outputs read about {_about(np.concatenate(ratios_of))} times what the model makes of the inputs: are"
             f" outputs, inputs and model in units that fit, {_units(record)}?"
         )
     name, unit = rig.sensors[off[0]].name, record.output_channels[off[0]].unit or "its unit"
     raise RecordsError(
-        f"output {name!r} reads about {_about(heard[off[0]])} times what the model predicts in every record: is it in"
-        f" {unit}?"
+        f"output {name!r} reads about {_about(ratios_of[off[0]])} times what the model predicts in every record: is it"
+        f" in {unit}?"
     )
 
 

@@ -38,7 +38,7 @@ class Verdict:
         corrected: the rig with the effects in it.
         nominal: the rig as it was handed in.
         attribution: the whole search.
-        readiness: what the records could tell before anything was fitted.
+        readiness: what the records could show before anything was fitted.
         experiment: what to measure next, where rivals remain.
         notes: what else a reader should know.
     """
@@ -59,15 +59,15 @@ class Verdict:
 
     @property
     def _told(self) -> tuple[Effect, ...]:
-        """The effects, rounding or clipping of every sensor told once."""
-        told = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
-        for kind in dict.fromkeys(e.kind for e in told if e.kind.found_in == "readings"):
-            same = [e for e in told if e.kind is kind]
+        """The effects, rounding or clipping of every sensor stated once."""
+        shown = [e for e in self.effects if e.kind is not NOMINAL_ERRORS]
+        for kind in dict.fromkeys(e.kind for e in shown if e.kind.found_in == "readings"):
+            same = [e for e in shown if e.kind is kind]
             if len(same) == len(self.nominal.sensors) > 1:
-                told = [e for e in told if e.kind is not kind]
+                shown = [e for e in shown if e.kind is not kind]
                 median = {name: float(np.median([e.values[name] for e in same])) for name in same[0].values}
-                told.insert(0, Effect(kind, ALL, median))
-        return tuple(told)
+                shown.insert(0, Effect(kind, ALL, median))
+        return tuple(shown)
 
     @property
     def place_stands(self) -> bool:

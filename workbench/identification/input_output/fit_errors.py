@@ -22,11 +22,11 @@ def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
     bound = np.linalg.pinv(h * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
     if np.all(noise_ratio == 1.0):
         return bound
-    loud = tuple(
+    rescaled = tuple(
         replace(part, coefficients=part.coefficients * _by_column(part, rows))
         for part, rows in _by_part(fit, noise_ratio)
     )
-    return np.asarray(bound @ normal(replace(fit, parts=loud), fit.noise)[0] @ bound)
+    return np.asarray(bound @ normal(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
 
 
 def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
@@ -61,8 +61,8 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
         changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
     for part, rows in _by_part(fit, noise_ratio):
         spread = _root(part.spread[: 2 * n, : 2 * n])
-        for loud in np.sqrt(rows):
-            for column in (np.tile(loud, 2)[:, None] * spread).T:
+        for level in np.sqrt(rows):
+            for column in (np.tile(level, 2)[:, None] * spread).T:
                 a = np.zeros_like(fit.amplitudes)
                 a[output] = fit.noise[output] * (column[:n] - 1j * column[n:])
                 changes.append((np.zeros_like(fit.poles), np.zeros_like(fit.participation), a))

@@ -84,10 +84,10 @@ class KnownInputs:
 
     def noise(self, fit: Fit) -> np.ndarray:
         """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
-        loud = (
+        level = (
             np.array([np.sqrt((size**2).mean(axis=0)) for size in self.line_std]) if self.line_std is not None else 1.0
         )
-        return np.asarray(np.sqrt(variances(*self._squares(fit))) * loud)
+        return np.asarray(np.sqrt(variances(*self._squares(fit))) * level)
 
     def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
         """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""

@@ -47,13 +47,13 @@ def noise_spectrum(
         free: (n_records,) degrees of freedom of the residual.
 
     Returns:
-        None where the noise may be white, and as loud in all records, or is round-off.
+        None where the noise may be white, and of equal level in all records, or is round-off.
     """
     squares = np.array([(each**2).sum(axis=0) for each in left])
     measured = np.array([(each**2).sum(axis=0) for each in whole])
     if (squares.sum(axis=0) <= ROUNDING**2 * measured.sum(axis=0)).any():
         return None
-    loud = np.sqrt(variances(squares, free))
+    levels = np.sqrt(variances(squares, free))
     power = [np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in left]
     flat = np.all([white(each, n_modes) for each in power], axis=0)
     if flat.all() and not differ(squares, free).any():
@@ -62,9 +62,9 @@ def noise_spectrum(
         samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, MOST_TAKEN)))
         for each, share in zip(left, taken, strict=True)
     ]
-    found = [np.tile(row, (len(each), 1)) for row, each in zip(loud, left, strict=True)]
+    found = [np.tile(row, (len(each), 1)) for row, each in zip(levels, left, strict=True)]
     for j in np.flatnonzero(~flat):
-        filtered = _burg([each[:, j] / row[j] for each, row in zip(good, loud, strict=True)])
+        filtered = _burg([each[:, j] / row[j] for each, row in zip(good, levels, strict=True)])
         for each in found:
             turns = np.exp(-1j * np.pi / len(each) * np.arange(len(each)))
             each[:, j] /= np.abs(np.polyval(filtered[::-1], turns))

@@ -9,7 +9,7 @@ from workbench.identification.input_output.model_order import bases_of, weights_
 from workbench.identification.signal.order_selection import MOST_DAMPED
 
 MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
-# Half-power bandwidths beside a mode, and the chance that even noise is taken for louder.
+# Half-power bandwidths beside a mode, and the chance that noise of one level is taken for louder.
 DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
 # Chance that even noise is taken for uneven; and b |H| / a at the median line, from nothing to all.
 UNEVEN, SHARES = 1e-4, np.geomspace(1e-3, 1e3, 61)

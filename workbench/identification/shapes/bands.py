@@ -132,7 +132,7 @@ def eigenfunction_bands(
             roughness = leave_one_out.roughness(v, refined.shape_covariance[r])
             if roughness > 0.0:
                 error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)
-                for y, weights, derivative in inertia.weighed(spline, length):
+                for y, weights, derivative in inertia.weighted(spline, length):
                     there = peano_kernel(spline, y, modes.positions, length, derivative)
                     error -= np.outer(phi[:, r], (weights * (spline.matrix(y, derivative) @ v)) @ there / q)
                 error *= np.sqrt(roughness)

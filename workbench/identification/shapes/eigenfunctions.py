@@ -252,7 +252,7 @@ class Inertia:
     density: Profile
     point_masses: tuple[PointMass, ...] = ()
 
-    def weighed(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
+    def weighted(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
         """Places, their weights, and whether it is the value or the slope whose square they weigh."""
         breaks = [b for b in self.density.breaks if 0 < b < length]
         x, weights = quadrature(np.concatenate([spline.knots, breaks]), spline.degree)
@@ -277,7 +277,7 @@ def inertia_of(mass_per_length: ProfileLike | None, point_masses: Sequence[Point
 def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
     """M of v^T M v = ∫ m φ² dx + Σ M_k φ(x_k)² for φ through values v at the sensors, (n_sensors, n_sensors)."""
     found = np.zeros((spline.weights.shape[1],) * 2)
-    for x, weights, derivative in inertia.weighed(spline, length):
+    for x, weights, derivative in inertia.weighted(spline, length):
         along = spline.matrix(x, derivative)
         found += along.T @ (weights[:, None] * along)
     return found

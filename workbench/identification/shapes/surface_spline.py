@@ -249,7 +249,7 @@ def surface_bands(
         raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
     spline, scaled = _scaled(sampled, places, length, mass_per_area, edges)
     at, rng = spline.domain.locate(at), np.random.default_rng(seed)
-    x, weights = _weighed(spline.domain, mass_per_area)
+    x, weights = _weighted(spline.domain, mass_per_area)
     along, inside = spline.matrix(at), spline.matrix(x)
     root = _root(spline.error(np.vstack([at, x])))
     phi, std, interpolation = (np.zeros((len(at), sampled.n_modes)) for _ in range(3))
@@ -288,11 +288,11 @@ def _scaled(
         )
     spline = SurfaceSpline(Rectangle(length), np.asarray(places, float), edges or {})
     values = normalised_shapes(sampled.shapes).real
-    x, weights = _weighed(spline.domain, mass_per_area)
+    x, weights = _weighted(spline.domain, mass_per_area)
     return spline, frozen(values / np.sqrt(weights @ (spline.matrix(x) @ values) ** 2))
 
 
-def _weighed(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.ndarray, np.ndarray]:
+def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.ndarray, np.ndarray]:
     """Points of integration (n, 2), m, and the mass that each stands for."""
     x, weights = domain.quadrature(QUADRATURE)
     density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)

@@ -37,7 +37,7 @@ def decay_start(record: Record) -> float:
     hundred samples, begins with its first sample.
 
     Args:
-        record: outputs that quieten down at the end; what came before may be anything.
+        record: outputs that decay to rest at the end; what came before may be anything.
     """
     signals, rounding = _scaled(record)
     n = record.n_samples

@@ -1,6 +1,6 @@
 """Nonlinear distortion and noise seen in periodic excitation, before any model.
 
-What a linear structure answers stands on the lines that are excited. The mean over periods on the other lines is
+The response of a linear structure stands on the lines that are excited. The mean over periods on the other lines is
 distortion: of an even law on even multiples of 1/T, where only odd ones are excited, and of an odd law on odd ones.
 What differs from period to period is noise. Pintelon & Schoukens, System Identification: A Frequency Domain Approach,
 2nd ed., Wiley 2012, section 4.3.
@@ -54,7 +54,7 @@ class Distortion:
         return np.asarray(~self.excited & (np.arange(self.excited.size) % 2 == 0))
 
     @property
-    def tells_parity(self) -> bool:
+    def parity_resolved(self) -> bool:
         """Whether only odd lines are excited: even ones then tell an even law."""
         return not self.excited[1::2].any()
 

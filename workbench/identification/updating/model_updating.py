@@ -78,7 +78,7 @@ def update_model(
 
     Raises:
         ValueError: more parameters than frequencies, a measured mode that no mode of the model resembles, parameters
-            that cannot be told apart.
+            that the measurements cannot distinguish.
     """
     first, target = np.asarray(start, float), np.asarray(omega, float)
     deviation, measured = np.broadcast_to(np.asarray(omega_std, float), target.shape), np.asarray(shapes)

@@ -108,7 +108,7 @@ def choose_terms(
         priors: `prior_mass`, `prior_stiffness` of `mass_and_stiffness`.
 
     Raises:
-        ValueError: no pair of numbers gives a structure; the last reason is told.
+        ValueError: no pair of numbers gives a structure; the last reason is given.
     """
     ends: dict[str, Any] = {"kind": kind, "left": left, "right": right, "first_mode": first_mode}
     best, tried, reason = None, [], "no number of terms was given"

@@ -1,5 +1,5 @@
-"""How many terms of mass and stiffness the modes of a structure call for: the fewest whose modes cannot be told from
-the measured.
+"""How many terms of mass and stiffness the modes of a structure call for: the fewest whose modes cannot be
+distinguished from the measured.
 
 Schwarz's criterion χ² + n_terms ln n_data (Ann. Statist. 6, 1978) is not lowered by a term that is not needed.
 """
@@ -45,7 +45,7 @@ def fit_structure(
         mass, stiffness: functions of the relative changes; `Basis.polynomial(0)` keeps the nominal ones.
         known_mass, known_stiffness: ((x, value), ...), held exactly.
         mass_prior, stiffness_prior: how far the nominal ones are to be trusted; not at all without.
-        numbers: of the structure's elastic modes, from 1, that the measured are; told by their shapes unless given.
+        numbers: of the structure's elastic modes, from 1, that the measured are; paired by their shapes unless given.
 
     Raises:
         ValueError: overall size unknown, more terms than data, known values the series cannot take, unplaced sensors,
@@ -123,7 +123,7 @@ def choose(
 def with_spare_terms(chosen: FittedStructure, task: Task, basis: Callable[[int], Basis]) -> FittedStructure:
     """The same structure, the terms next in line left free as well in what is said of its errors.
 
-    They are too small to be told from the noise, not zero: left out, they would be missed by the bands (undersmoothing,
+    They are too small to stand out of the noise, not zero: left out, they would be missed by the bands (undersmoothing,
     Hall, Ann. Statist. 20, 1992).
     """
     try:

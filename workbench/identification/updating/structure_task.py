@@ -20,11 +20,11 @@ SAME_MODE = 0.6  # least MAC with the mode of the nominal structure that a measu
 
 @dataclass(frozen=True)
 class GaussianPrior:
-    """How far a distribution is believed to stray from its nominal one: relative, and over what length it varies.
+    """How far a distribution is believed to deviate from its nominal one: relative, and over what length it varies.
 
     Attributes:
         std: standard deviation of k / k_0 - 1 (or m / m_0 - 1) at any place.
-        correlation: length over which two places stray alike, m: exp(-Δx² / (2 correlation²)).
+        correlation: length over which two places deviate alike, m: exp(-Δx² / (2 correlation²)).
     """
 
     std: float
