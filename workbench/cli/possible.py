@@ -33,10 +33,10 @@ def possible_rig(
 
     if verdict is not None:
         return read_verdict(verdict, case.rig)
-    verdict = diagnose(
+    found = diagnose(
         case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report
     )  # fmt: skip
-    return UncertainRig.of(verdict), verdict.budget.noise_found or None
+    return UncertainRig.of(found), found.budget.noise_found or None
 
 
 def predicted(

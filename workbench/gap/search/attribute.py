@@ -122,7 +122,7 @@ def opened(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers:
     _ = evidence.at_peaks  # found once, before the work parts
     if not seen:
         return Opened(seen, evidence, evidence)
-    nominal = replace(Evidence.of(rig, data, workers=workers), sized=evidence.size)
+    nominal = replace(Evidence.of(rig, data, workers=workers), given_size=evidence.size)
     _ = nominal.at_peaks
     return Opened(seen, nominal, evidence)
 
