@@ -82,7 +82,7 @@ def test_what_was_written_comes_back_whole_or_not_at_all(tmp_path, ending, count
     data = write_record(whole, tmp_path / f"whole{ending}").read_bytes()
     rng = np.random.default_rng([7, ENDINGS.index(ending)])
     path = tmp_path / f"x{ending}"
-    for i in range(count or (8 if ending in FORMATS_OF_OTHERS else 40)):
+    for i in range(count or (5 if ending in FORMATS_OF_OTHERS else 40)):
         path.write_bytes(damaged(data, rng))
         start = spent()
         try:

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from workbench.records.checksum import KEY, checksum
 from workbench.records.file_error import RecordFileError
@@ -205,6 +204,9 @@ def _rows(signals: Sequence[np.ndarray], units: Sequence[Unit | None], sampling:
         if unit is not None and unit.factor != 1.0:
             row *= unit.factor
         if sampling.times is not None:
+            # imported here: it is most of what a process that reads one file would wait for
+            from scipy.interpolate import CubicSpline
+
             row[:] = CubicSpline(sampling.times, row)(sampling.start + sampling.step * np.arange(row.size))
     rows.flags.writeable = False
     return rows

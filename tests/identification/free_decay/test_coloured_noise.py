@@ -79,7 +79,7 @@ def test_the_spectrum_near_a_mode():
 
 def test_noise_that_is_not_white_is_no_mode():
     """Noise that falls by 32 dB along its spectrum."""
-    for seed in range(4):
+    for seed in range(2):
         noise = lfilter([1.0], [1.0, -0.95], np.random.default_rng(seed).standard_normal((2, 1400)), axis=1)[:, 200:]
         found = identify(replace(CLEAN, outputs=CLEAN.outputs + 0.02 * noise / noise.std()))
         assert found.modes.n_modes == 3 and np.abs(found.modes.omega / MODES.omega - 1.0).max() < 0.002
@@ -112,7 +112,7 @@ def test_driven_records_say_their_errors_in_coloured_noise():
     poles, seen = np.array([-0.15 + 10.0j, -0.5 + 60.0j]), np.array([[1.0, 0.8 + 0.1j], [0.5, -1.0]])
     direct = np.array([0.02, -0.03])
     own, feedthrough = [], []
-    for seed in range(12):
+    for seed in range(8):
         rng = np.random.default_rng(seed)
         u = rng.standard_normal(600)
         z = [lfilter([0.0, (m - 1.0) / p], [1.0, -m], u + 0j) for p, m in zip(poles, np.exp(0.02 * poles), strict=True)]
