@@ -23,10 +23,11 @@ from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.one_law import one_law, unless_another, weighed_against
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pairs import Pairs
+from workbench.gap.search.plain import are_common, common_as_errors
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
-from workbench.gap.search.stepwise import Stepwise, are_common
+from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.threads import one_blas_thread
@@ -193,6 +194,7 @@ def attribute(
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
     outcome, best, random, rivals, noise = decision
+    best = common_as_errors(search, best)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
@@ -286,6 +288,7 @@ def _with_a_second(
     if alone is not None:
         return alone
     if beside.is_enough:
+        beside.run()
         return beside.decision()
     if beside.last.fit.cost < min(f.cost for f in (start, *singles)):
         beside.run()
@@ -296,7 +299,7 @@ def _with_a_second(
             return decision
     law = one_law(search, evidence)
     pairs = Pairs(search)
-    explained = pairs.at_once(weighed)
+    explained = pairs.at_once(weighed) or (law is None and pairs.with_a_third())
     decision = pairs.decision(start)
     if law is not None:
         return weighed_against(law, search, decision)

@@ -7,6 +7,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.nominal import nominal_errors
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
@@ -23,6 +24,7 @@ NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wro
 RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
 STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
 FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
+TOGETHER = 6  # iterations of errors of the nominal model beside it
 SPREAD = 0.5  # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
@@ -60,7 +62,11 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]
-    return _likeliest(search, tried), [found[0] for found in tried]
+    found = _likeliest(search, tried)
+    if found is None:
+        errors = nominal_errors(search.rig, search.prior)
+        found = _likeliest(search, [with_random(search, fit(search.rig, (errors,), beside.data, iterations=TOGETHER))])
+    return found, [each[0] for each in tried]
 
 
 def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:

@@ -22,6 +22,7 @@ MOVED = 0.1  # of a number: what makes the half of a pair another one than it wa
 NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
 SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
 VERY_NEAR = 0.2 * NEAR  # what is tried in simpler forms, and from other places before beside other single effects
+MOST = 0.3  # of the gap's power left: a pair that leaves less may be two of three
 EXCHANGES = 2  # rounds of keeping either half of the best pair ahead
 TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
 TOLD = 4  # sets, best first, that may be named or be rivals
@@ -59,6 +60,25 @@ class Pairs:
         """
         self.search.report("all pairs at once", 0.4)
         return self._explained_by(pairs_at_once(self.search, weighed))
+
+    def with_a_third(self) -> bool:
+        """Whether the best pair and one more effect explain the records, where the pair takes most of the gap away."""
+        if not (self.found and self.search.near(self.found[0], MOST)):
+            return False
+        self.search.report("the best pair and another", 0.45)
+        pair = self.found[0].effects
+        if self._and_another(pair):
+            return True
+        best = self.found[0]
+        if len(best.effects) <= len(pair) or not self.search.near(best, VERY_NEAR):
+            return False
+        # with a third beside them, one of the two may have stood in for another
+        return self._and_another(tuple(_weightiest_first(self.search, best)[:-1]))
+
+    def _and_another(self, given: tuple[Effect, ...]) -> bool:
+        """Whether these effects with one more explain the records."""
+        evidence = self.search.evidence_of(apply_all(self.search.rig, given))
+        return self._explained_by(one_more(self.search, given, evidence))
 
     def by_exchange(self) -> bool:
         """Whether a pair with either half of the best one sample ahead explains the records.
@@ -146,13 +166,13 @@ def _evidence(search: Search, effect: Effect) -> Evidence:
     return search.evidence_of(rig)
 
 
-def _weightiest_first(search: Search, pair: Fit) -> list[Effect]:
-    """The effects of a pair, first the one that most is left without."""
+def _weightiest_first(search: Search, found: Fit) -> list[Effect]:
+    """The effects of a set, first the one that most is left without."""
 
     def left_without(effect: Effect) -> float:
-        return cost_of(search.rig, (*(e for e in pair.effects if e is not effect), *search.held), search.ahead)
+        return cost_of(search.rig, (*(e for e in found.effects if e is not effect), *search.held), search.ahead)
 
-    return sorted(pair.effects, key=left_without, reverse=True)
+    return sorted(found.effects, key=left_without, reverse=True)
 
 
 def _unmoved(one: Effect, other: Effect) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind
+from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.noise import logging_noise_power
@@ -18,6 +19,7 @@ from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import HOPELESS, Fit, cost_of, sensitivity
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain
+from workbench.structure.member import Structure
 
 SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
 INTEGRATION_SHARE = 2e-6  # of the gap's power: errors of stepping
@@ -126,6 +128,19 @@ class Search:
         """The same search beside believed figures, which give way to every candidate to first order."""
         data = self.data.giving_way(sensitivity(self.rig, (figures,), self.data, self.workers))
         return replace(self, data=data, held=(figures,))
+
+    @property
+    def prior(self) -> NominalPrior:
+        """What the nominal model may be off by before any record is seen."""
+        structured = isinstance(self.rig.structure, Structure)
+        return NominalPrior(
+            stiffness=0.02 if structured else 0.0,
+            mass=0.02,
+            frequency=0.0 if structured else 0.005,
+            damping=0.2,
+            delay=0.1,
+            sample_time=self.data.records[0].sample_time,
+        )
 
     @cached_property
     def logging_noise(self) -> np.ndarray:

@@ -14,12 +14,11 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.noise import logging_noise, noise_found
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.outcome import Decision
+from workbench.gap.search.plain import COMMON, MOST_COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import FINE, one_more
-from workbench.gap.search.search import Search, most_telling, spread_over_kinds
-from workbench.structure.member import Structure
+from workbench.gap.search.search import SURE, Search, most_telling, spread_over_kinds
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
-COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,6 @@ class StepwiseSettings:
         rounds: of learning the sizes, at most.
         settled, last_settled: share of what is left that a round must have taken away for another; in the last fit.
         iterations, tolerance: of the fit in each round.
-        plainly: iterations of a fit without errors.
-        hopeful: times the noise power that such a fit may leave of the quick records, to be fitted to all.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
         singles: effects alone, as they were found without errors, that are tried as the first.
         candidates: sets fitted on whole records at each step.
@@ -54,15 +51,15 @@ class StepwiseSettings:
         promising: share of what the best candidate takes away one sample ahead that another must take away to be tried.
         ahead: share of the cost one sample ahead that the best candidate must take away to be tried at all.
         simpler: share by which a set may leave more above the noise and still be taken for being simpler.
-        needless: likewise, for a set with one effect less.
+        trifle: share of the noise power by which a simpler set may fall behind whatever the likelihood says.
+        needless: as `simpler`, for a set with one effect less.
         explained: share of the nominal gap's power above the noise that an explanation may leave.
-        further: likewise, that a further effect is looked for to explain.
+        further: likewise, from which on a further effect is named though it leaves more than noise.
         in_part: likewise, for effects that are named although something else is there.
         credible: times the stated noise that noise found may be; more is a gap.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         jump: times the power of the change over the span before a sample that the change after it has at a jump.
         astray: share of the nominal gap's power from which on errors may be fitted out of step.
-        damping, stiffness: common to all modes or all along, logarithm, from which on it is an effect of its own.
     """
 
     widest: tuple[tuple[str, float], ...] = (
@@ -89,8 +86,6 @@ class StepwiseSettings:
     last_settled: float = 1e-3
     iterations: int = 4
     tolerance: float = 1e-4
-    plainly: int = 8
-    hopeful: float = 2.0
     last_iterations: int = 6
     last_tolerance: float = 1e-7
     singles: int = 2
@@ -104,6 +99,7 @@ class StepwiseSettings:
     promising: float = 0.2
     ahead: float = 0.005
     simpler: float = 0.05
+    trifle: float = 0.005
     needless: float = 0.3
     explained: float = 0.01
     further: float = 1e-3
@@ -112,8 +108,6 @@ class StepwiseSettings:
     no_gap: float = 0.15
     jump: float = 10.0
     astray: float = 0.02
-    damping: float = 0.5
-    stiffness: float = 0.05
 
 
 SETTINGS = StepwiseSettings()
@@ -258,22 +252,9 @@ def _closed(errors: Effect) -> Effect:
 
 def _opened(search: Search, errors: Effect) -> Effect:
     """The errors with all groups, those that were closed at none and with the sizes they had before any record."""
-    before = prior_of(search)
+    before = search.prior
     closed = {g: getattr(before, g) for g, _ in SETTINGS.widest if not getattr(errors.target, g)}
     return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
-
-
-def prior_of(search: Search) -> NominalPrior:
-    """What a nominal model may be off by before any record is seen."""
-    structured = isinstance(search.rig.structure, Structure)
-    return NominalPrior(
-        stiffness=0.02 if structured else 0.0,
-        mass=0.02,
-        frequency=0.0 if structured else 0.005,
-        damping=0.2,
-        delay=0.1,
-        sample_time=search.data.records[0].sample_time,
-    )
 
 
 def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
@@ -297,14 +278,6 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), errors.values)
 
 
-def are_common(effects: Sequence[Effect]) -> bool:
-    """Whether effects are the errors common to all modes and all along, each no larger than errors may be."""
-    most = {MODULUS_ERROR: SETTINGS.stiffness, MODAL_DAMPING: SETTINGS.damping}
-    return {effect.kind for effect in effects} == set(most) and all(
-        abs(np.log(effect.values["factor"])) < most[effect.kind] for effect in effects
-    )
-
-
 class Stepwise:
     """Stepwise selection of effects beside nominal errors, with going back.
 
@@ -325,9 +298,9 @@ class Stepwise:
         search.report("small errors of the nominal model", 0.4)
         self.steps = [self._afresh(())]
         common = next((f.effects[0] for f in likeliest[:1] if f.effects[0].kind is MODULUS_ERROR), None)
-        if common is not None and "stiffness" in prior_of(search).groups and not self.is_enough:
+        if common is not None and "stiffness" in search.prior.groups and not self.is_enough:
             start = {"stiffness_0": float(np.log(common.values["factor"]))}
-            stiffer = fit_jointly(search, (), nominal_errors(search.rig, prior_of(search), start))
+            stiffer = fit_jointly(search, (), nominal_errors(search.rig, search.prior, start))
             self.steps = [min(self.last, stiffer, key=lambda s: s.fit.cost)]
         again = on_their_sides(search, _opened(search, self.last.errors))
         if again.target.late != self.last.errors.target.late:  # what errors had hidden at first
@@ -341,8 +314,9 @@ class Stepwise:
         """Add effects as long as each takes most of what is left above the noise."""
         while len(self.last.effects) < SETTINGS.most and not self.is_enough:
             before = self.last
+            trifle = before.effects and before.is_plausible and self.unexplained < SETTINGS.further
             step = self._with_one_more(before)
-            if step is None:
+            if step is None or (trifle and not self.explains(step)):
                 break
             self.steps += [step, self._without_needless(step)]
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
@@ -357,8 +331,8 @@ class Stepwise:
     @property
     def is_enough(self) -> bool:
         """Whether the last set leaves nothing that is worth another effect."""
-        left = self.explains(self.last) or (self.last.effects and self.unexplained < SETTINGS.further)
-        return bool(left and self.last.is_plausible)
+        quiet = self.explains(self.last) or (self.last.effects and self.is_quiet)
+        return bool(quiet and self.last.is_plausible)
 
     def explains(self, step: Step) -> bool:
         """Whether next to nothing is left but noise of the sensors."""
@@ -479,7 +453,7 @@ class Stepwise:
         Where frequencies are far off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        none = on_their_sides(search, nominal_errors(search.rig, prior_of(search)), effects)
+        none = on_their_sides(search, nominal_errors(search.rig, search.prior), effects)
         found = fit_jointly(search, effects, none)
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
             return found
@@ -504,9 +478,19 @@ class Stepwise:
         fewer = [
             step
             for step in (*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0))))
-            if step.fit.n_parameters < best.fit.n_parameters and step.excess(best.sensor_noise) < enough
+            if step.fit.n_parameters < best.fit.n_parameters
+            and step.excess(best.sensor_noise) < enough
+            and not self._tells_apart(best, step)
         ]
         return min(fewer, key=lambda s: (s.fit.n_parameters, s.fit.cost)) if fewer else best
+
+    def _tells_apart(self, best: Step, simpler: Step) -> bool:
+        """Whether, where only noise is left, records surely prefer a set to a simpler one, by more than a trifle."""
+        if not self.explains(best):
+            return False
+        n, more = self.search.data.n_values, best.fit.n_parameters - simpler.fit.n_parameters
+        gain = float(np.log(simpler.fit.cost / best.fit.cost))
+        return gain > SETTINGS.trifle and n * gain > SURE + more * np.log(n)
 
     def _without_needless(self, step: Step) -> Step:
         """The set without effects that a later one has made needless."""
@@ -518,27 +502,11 @@ class Stepwise:
         return self._without_needless(best) if best.excess(step.sensor_noise) < enough else step
 
     def _without_errors(self, step: Step) -> Fit | None:
-        """The effects, or these and one error common to all modes or all along, where only noise is left beside them.
-
-        They say the same with fewer numbers than errors of their own for every mode and wave.
-        """
-        if not step.effects or self.unexplained > SETTINGS.explained:
+        """Few effects that explain the records without errors of the nominal model as well as a step beside them."""
+        if self.unexplained > SETTINGS.explained:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
-        common = [Effect(kind, None, {"factor": 1.0}) for kind in COMMON]
-        named = {effect.kind for effect in step.effects}
-        sets = [step.effects, *((*step.effects, effect) for effect in common if effect.kind not in named)]
-        if len(step.effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
-            fewer = list(_each_left_out(step.effects))
-            sets += [*fewer, *(s for given in (step.effects, *fewer) for s in simpler_sets(given, search.rig))]
-        quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=SETTINGS.plainly), sets)
-        hopeful = [f for f in quickly if f.cost < SETTINGS.hopeful]
-        for candidate in sorted(hopeful, key=lambda f: f.n_parameters):
-            data = search.data.stepped(FINE)
-            found = fit(search.rig, candidate.effects, data, iterations=SETTINGS.plainly)
-            if search.explains(found):
-                return found
-        return None
+        return in_place_of_errors(search, step.effects)
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small, and common to all, as effects of their own."""
@@ -547,10 +515,10 @@ class Stepwise:
         stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
         named = {effect.kind for effect in step.effects}
         added, reset = [], dict(values)
-        if abs(damping) > SETTINGS.damping and MODAL_DAMPING not in named:
+        if abs(damping) > MOST_COMMON["modal_damping"] and MODAL_DAMPING not in named:
             added.append(Effect(MODAL_DAMPING, None, {"factor": float(np.exp(damping))}))
             reset.update({n: v - damping for n, v in values.items() if group_of(n) == "damping"})
-        if abs(stiffness) > SETTINGS.stiffness and MODULUS_ERROR not in named:
+        if abs(stiffness) > MOST_COMMON["modulus_error"] and MODULUS_ERROR not in named:
             added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
             reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
         if not added:
