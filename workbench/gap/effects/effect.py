@@ -99,6 +99,7 @@ class Kind:
         nonlinear: whether it makes the response depend on level.
         phrase: how the sentence of the verdict calls it.
         simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
+        wider: effect -> what it is a limiting case of and records can mistake for it, with values to start a fit from.
         signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
         found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",
             where only its statistics can be found.
@@ -123,6 +124,7 @@ class Kind:
     nonlinear: bool = False
     phrase: str = ""
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
+    wider: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
     signed: bool = False
     found_in: Literal["search", "readings", "residual"] = "search"
     alone: bool = False

@@ -33,6 +33,13 @@ def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effe
             yield (*effects[:i], simpler, *effects[i + 1 :])
 
 
+def wider_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    """The sets with one effect as what it is a limiting case of."""
+    for i, effect in enumerate(effects):
+        for wider in effect.kind.wider(effect):
+            yield (*effects[:i], wider, *effects[i + 1 :])
+
+
 def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:
     """The sets that this one comes to at a bound of one effect, or with two as one."""
     yield from fewer(effects)

@@ -233,6 +233,12 @@ def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
     return {name: v for name, v in friction.numbers.items() if name != "smoothing_speed" or not sudden}
 
 
+def _either_way(friction: Effect) -> tuple[Effect, ...]:
+    force = friction.values["force"]
+    numbers = {**friction.values, "force_forward": force, "force_backward": force}
+    return (Effect(TWO_WAY_FRICTION, None, {n: v for n, v in numbers.items() if n != "force"}),)
+
+
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
@@ -244,6 +250,7 @@ COULOMB_FRICTION = Kind(
     apply=lambda rig, _, v: with_element(rig, CoulombFriction(place_of(v), v["force"], v["smoothing_speed"])),
     starts=_friction_starts,
     nonlinear=True,
+    wider=_either_way,
     simpler=_viscous,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
     numbers=_without_sudden,

@@ -67,9 +67,13 @@ class RandomForceFit:
         """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
         no single tone, which could be predicted.
         """
+        return self.holds_within(WHITENED)
+
+    def holds_within(self, whitened: float) -> bool:
+        """The same, where the whitened residual of each record may be so far from unit power."""
         spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
-        whitened = np.abs(self.chi2_by_record - 1.0).max()
-        return bool(spread < LEVEL_SPREAD and whitened < WHITENED and self.follows < FOLLOWS and self.tonal < TONAL)
+        white = np.abs(self.chi2_by_record - 1.0).max() < whitened
+        return bool(spread < LEVEL_SPREAD and white and self.follows < FOLLOWS and self.tonal < TONAL)
 
 
 def fit_random_force(

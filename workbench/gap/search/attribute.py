@@ -18,6 +18,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.beside_random import decide_on_random
 from workbench.gap.search.decide import decide
+from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.one_law import one_law, unless_another, weighed_against
@@ -195,6 +196,8 @@ def attribute(
         decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
     outcome, best, random, rivals, noise = decision
     best = common_as_errors(search, best)
+    if outcome == "explained" and random is None:
+        best = widened(search, best)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
@@ -287,7 +290,7 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
-    if beside.is_enough:
+    if beside.is_enough or beside.by_singles():
         beside.run()
         return beside.decision()
     if beside.last.fit.cost < min(f.cost for f in (start, *singles)):

@@ -24,6 +24,7 @@ NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wro
 RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
 STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
 FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
+WHITENED_BESIDE = 0.2  # of unit power: what small errors of the model leave after a fit of them
 TOGETHER = 6  # iterations of errors of the nominal model beside it
 SPREAD = 0.5  # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
@@ -65,7 +66,8 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     found = _likeliest(search, tried)
     if found is None:
         errors = nominal_errors(search.rig, search.prior)
-        found = _likeliest(search, [with_random(search, fit(search.rig, (errors,), beside.data, iterations=TOGETHER))])
+        off = with_random(search, fit(search.rig, (errors,), beside.data, iterations=TOGETHER))
+        found = Decision("explained", *off) if off[1].holds_within(WHITENED_BESIDE) else None
     return found, [each[0] for each in tried]
 
 

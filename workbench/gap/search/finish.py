@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of, place_values
-from workbench.gap.effects.limiting_cases import simpler_sets, with_one_simpler
+from workbench.gap.effects.limiting_cases import simpler_sets, wider_sets, with_one_simpler
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
 from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.search import Search, promise
@@ -22,6 +22,7 @@ AT_FIRST, TOO_FAR = 4, 30.0  # iterations of a simpler form on the quick records
 TRIED = 2  # iterations at each other place, before the likeliest are chosen
 LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
 APART = 0.02  # of the extent: nearer, a place is the same valley
+WIDENING = 8  # iterations
 FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
@@ -56,6 +57,17 @@ def _with_stepping(search: Search, finely: Fit) -> Fit:
     if fine is None or half is None:
         return finely
     return replace(finely, stepping=search.data.by_channel(fine - half).mean(axis=1))
+
+
+def widened(search: Search, found: Fit) -> Fit:
+    """The fit, or one with an effect as what it is a limiting case of, where the records surely prefer that."""
+    data = search.data.stepped(FINE)
+    cost = cost_of(search.rig, found.effects, data)
+    for effects in wider_sets(found.effects):
+        trial = fit(search.rig, effects, data, iterations=WIDENING, workers=search.workers, chord=True)
+        if search.tells_apart(trial.cost, cost, trial.n_parameters - found.n_parameters):
+            return trial
+    return found
 
 
 def simplified(search: Search, candidate: Fit) -> Fit:

@@ -18,6 +18,7 @@ COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes:
 MOST_COMMON = {"modulus_error": 0.05, "modal_damping": 0.5}  # logarithms: more is an effect of its own
 MOST_ALONE = {"modulus_error": 0.015, "modal_damping": 0.25}  # likewise, where only one of them is there
 PLAINLY = 8  # iterations without errors
+PUNCTUAL = 0.01  # of a sample: sensors that are late by less are not
 NEAR = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
 LIKELIEST = 4  # kinds of the one more that are tried
 
@@ -32,42 +33,55 @@ def are_common(effects: Sequence[Effect]) -> bool:
 
 def common_as_errors(search: Search, found: Fit) -> Fit:
     """The fit with common errors, small and beside an effect, as errors of the nominal model."""
-    common = [e for e in found.effects if e.kind in COMMON]
-    most = MOST_ALONE if len(common) == 1 else MOST_COMMON
+    common = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in COMMON}
     others = [e for e in found.effects if e.kind not in COMMON]
-    large = any(abs(np.log(e.values["factor"])) >= most[e.kind.name] for e in common)
-    if not common or not others or large or any(e.kind is NOMINAL_ERRORS for e in others):
+    late = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
+    named = [e for e in others if e is not late]
+    most = MOST_ALONE if len(common) == 1 else MOST_COMMON
+    if not common or not named or any(abs(size) >= most[name] for name, size in common.items()):
         return found
-    if not isinstance(search.rig.structure, Structure):
+    if not isinstance(search.rig.structure, Structure) or (late is not None and set(late.target.groups) != {"delay"}):
         return found
-    logarithm = {e.kind.name: float(np.log(e.values["factor"])) for e in common}
-    stiffness, damping = (logarithm.get(kind.name, 0.0) for kind in COMMON)
-    prior = NominalPrior(
-        stiffness=abs(stiffness), damping=abs(damping), sample_time=search.data.records[0].sample_time, waves=1
-    )
-    errors = nominal_errors(search.rig, prior)
-    values = {name: stiffness if group_of(name) == "stiffness" else damping for name in errors.values}
-    return replace(found, effects=(*others, replace(errors, values=values)), covariance=None)
+    stiffness, damping = (common.get(kind.name, 0.0) for kind in COMMON)
+    prior = NominalPrior(sample_time=search.data.records[0].sample_time) if late is None else late.target
+    errors = nominal_errors(search.rig, replace(prior, stiffness=abs(stiffness), damping=abs(damping), waves=1))
+    sizes = {"stiffness": stiffness, "damping": damping}
+    values = {name: sizes.get(group_of(name), 0.0) for name in errors.values}
+    values.update({} if late is None else late.values)
+    return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
 
 
-def in_place_of_errors(search: Search, effects: tuple[Effect, ...]) -> Fit | None:
-    """The effects, or one more, that leave only noise without errors of the nominal model, or with common ones alone.
+def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effect) -> Fit | None:
+    """The effects, or one more, that leave only noise with no errors of the nominal model but common and late ones.
 
     They say the same with fewer numbers than errors of their own for every mode and wave.
 
     Args:
         search: with the noise found beside the errors.
         effects: that were found beside the errors.
+        errors: of the nominal model; sensors stay as late as they make them.
     """
     named = {effect.kind for effect in effects}
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
+    late = _late(search, errors)
     if not effects:
-        return None if _explaining(search, [common]) else _one_more(search, common, ())  # None: errors they are
+        if _explaining(search, [(*common, *late)]):
+            return None  # errors they are
+        return _one_more(search, (*common, *late), ())
     sets = [effects, *((*effects, effect) for effect in common), (*effects, *common)]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = [tuple(other for other in effects if other is not effect) for effect in effects]
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
-    return _explaining(search, sets) or _one_more(search, effects, common)
+    return _explaining(search, [(*s, *late) for s in sets]) or _one_more(search, (*effects, *late), common)
+
+
+def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:
+    """What the errors say of the timing of the sensors, where they say anything of it."""
+    prior = errors.target
+    if prior.delay <= PUNCTUAL:
+        return ()
+    timing = NominalPrior(delay=prior.delay, sample_time=prior.sample_time, late=prior.late, early=prior.early)
+    return (nominal_errors(search.rig, timing, errors.values),)
 
 
 def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | None:
@@ -82,8 +96,7 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | Non
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...]) -> Fit | None:
     """The effects and another, linear as errors are, that stands for those of every mode and wave."""
-    linear = tuple(kind for kind in search.catalogue if not kind.nonlinear)
-    search = replace(search, catalogue=linear)
+    search = replace(search, catalogue=tuple(kind for kind in search.catalogue if not kind.nonlinear))
     given = fit(search.rig, effects, search.quick, iterations=PLAINLY).effects
     evidence = search.evidence_of(apply_all(search.rig, given))
     ahead = [f.effects for f in spread_over_kinds(one_more(search, given, evidence), 1)][:LIKELIEST]

@@ -24,6 +24,7 @@ from workbench.structure.member import Structure
 SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
 INTEGRATION_SHARE = 2e-6  # of the gap's power: errors of stepping
 SURE = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
+TRIFLE = 0.005  # of the noise power: no set is preferred to a simpler one for less, whatever the likelihood says
 WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect model
 ELSEWHERE = 0.1  # of the extent: nearer, two places are in one valley of the cost at first
 SAME_PLACE = 0.02  # of the extent: nearer, fits go on to the same end
@@ -93,6 +94,11 @@ class Search:
     def worthwhile(self, candidate: Fit, than: float) -> bool:
         """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
         return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > WORTHWHILE
+
+    def tells_apart(self, better: float, cost: float, extra: int) -> bool:
+        """Whether records surely prefer the lower of two costs, for `extra` more numbers, and by more than a trifle."""
+        n, gain = self.data.n_values, float(np.log(cost / better))
+        return gain > TRIFLE and n * gain > SURE + extra * np.log(n)
 
     def near(self, candidate: Fit, share: float) -> bool:
         """Whether at most this share of the gap's power is left."""

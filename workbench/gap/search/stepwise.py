@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.plain import COMMON, MOST_COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import FINE, one_more
-from workbench.gap.search.search import SURE, Search, most_telling, spread_over_kinds
+from workbench.gap.search.search import Search, most_telling, spread_over_kinds
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
 
@@ -51,8 +52,7 @@ class StepwiseSettings:
         promising: share of what the best candidate takes away one sample ahead that another must take away to be tried.
         ahead: share of the cost one sample ahead that the best candidate must take away to be tried at all.
         simpler: share by which a set may leave more above the noise and still be taken for being simpler.
-        trifle: share of the noise power by which a simpler set may fall behind whatever the likelihood says.
-        needless: as `simpler`, for a set with one effect less.
+        needless: likewise, for a set with one effect less.
         explained: share of the nominal gap's power above the noise that an explanation may leave.
         further: likewise, from which on a further effect is named though it leaves more than noise.
         in_part: likewise, for effects that are named although something else is there.
@@ -88,7 +88,7 @@ class StepwiseSettings:
     tolerance: float = 1e-4
     last_iterations: int = 6
     last_tolerance: float = 1e-7
-    singles: int = 2
+    singles: int = 3
     candidates: int = 4
     finalists: int = 2
     near: float = 2.0
@@ -99,7 +99,6 @@ class StepwiseSettings:
     promising: float = 0.2
     ahead: float = 0.005
     simpler: float = 0.05
-    trifle: float = 0.005
     needless: float = 0.3
     explained: float = 0.01
     further: float = 1e-3
@@ -258,14 +257,18 @@ def _opened(search: Search, errors: Effect) -> Effect:
 
 
 def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
-    """The errors with each accelerometer on that side of the jumps at the samples which the records show it to read."""
-    jumping = tuple(sensor.name for sensor in search.rig.sensors if sensor.quantity == "acceleration")
+    """The errors with each accelerometer on that side of the jumps at the samples which the records show it to read.
+
+    Those that are known to be late stay so.
+    """
+    known = errors.target.late
+    jumping = tuple(s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known)
     if not jumping or not errors.target.delay:
         return errors
     none = {**errors.values, **{f"delay_{name}": 0.0 for name in jumping}}
 
     def left(delay: float) -> np.ndarray:
-        tried = nominal_errors(search.rig, replace(errors.target, late=(), early=()), none)
+        tried = nominal_errors(search.rig, replace(errors.target, late=known, early=()), none)
         tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in jumping}})
         return search.data.residual(apply_all(search.rig, (*effects, tried)))
 
@@ -273,7 +276,7 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     step, smooth = (search.data.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
     gain = (search.data.by_channel(at) - search.data.by_channel(after)).sum(axis=0)
     rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > SETTINGS.jump * smooth[j]]
-    late = tuple(search.rig.sensors[j].name for j in rows if gain[j] > 0)
+    late = (*known, *(search.rig.sensors[j].name for j in rows if gain[j] > 0))
     early = tuple(search.rig.sensors[j].name for j in rows if gain[j] <= 0)
     return nominal_errors(search.rig, replace(errors.target, late=late, early=early), errors.values)
 
@@ -296,7 +299,8 @@ class Stepwise:
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.plain: Fit | None = None
         search.report("small errors of the nominal model", 0.4)
-        self.steps = [self._afresh(())]
+        self.steps: list[Step] = []
+        self.steps.append(self._afresh(()))
         common = next((f.effects[0] for f in likeliest[:1] if f.effects[0].kind is MODULUS_ERROR), None)
         if common is not None and "stiffness" in search.prior.groups and not self.is_enough:
             start = {"stiffness_0": float(np.log(common.values["factor"]))}
@@ -309,6 +313,22 @@ class Stepwise:
     @property
     def last(self) -> Step:
         return self.steps[-1]
+
+    @cached_property
+    def _alone(self) -> list[Step]:
+        """The likeliest single effects beside errors that start from none, best first."""
+        found = self.search.workers.map(self._afresh, [f.effects for f in self.singles])
+        return sorted((s for s in found if not self._is_timing(s)), key=lambda s: s.fit.cost)
+
+    def by_singles(self) -> bool:
+        """Whether one of the likeliest single effects explains the records beside errors: then it is the first step."""
+        if not self._alone or not self.explains(self._alone[0]):
+            return False
+        best = self._simplest(self._alone[0], self._alone[1:])
+        if not (best.is_plausible and self._is_worth(best, self.last)):
+            return False
+        self.steps.append(best)
+        return True
 
     def run(self) -> None:
         """Add effects as long as each takes most of what is left above the noise."""
@@ -388,18 +408,39 @@ class Stepwise:
         ahead = one_more(beside, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - SETTINGS.ahead) * left:
             return None
-        best = self._best_of(spread_over_kinds(ahead, 1), step, left)
+        ahead = spread_over_kinds(ahead, 1)
+        enough = left - SETTINGS.promising * (left - ahead[0].cost)
+        chosen = [f.effects for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
+        tried = self._fitted(chosen, step, self._slopes(step))
+        sided = self._on_the_other_side(step, tried)
+        if sided is not None:
+            self.steps[-1] = sided
+            return self._with_one_more(sided)
+        best = self._best_of(tried, step)
         return best if self._is_worth(best, step) else None
 
-    def _best_of(self, ahead: Sequence[Fit], step: Step, left: float) -> Step:
-        """The best on whole records of sets that are the likeliest one sample ahead, best first."""
-        enough = left - SETTINGS.promising * (left - ahead[0].cost)
-        chosen = [f for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
-        tried = self._fitted([candidate.effects for candidate in chosen], step, self._slopes(step))
-        # what was found before errors could bend to it
-        alone = [] if step.effects else self.search.workers.map(self._afresh, [f.effects for f in self.singles])
-        tried += alone
-        tried = sorted((s for s in tried if not self._is_timing(s)), key=lambda s: s.fit.cost)
+    def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
+        """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
+        best = min(tried, key=lambda s: s.fit.cost)
+        if not self._is_timing(best):
+            return None
+        prior, late = step.errors.target, best.effects[-1]
+        jumping = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
+        if late.target not in jumping.difference(prior.late):
+            return None
+        errors = _opened(self.search, step.errors)
+        early = tuple(name for name in prior.early if name != late.target)
+        target = replace(errors.target, late=(*prior.late, late.target), early=early)
+        delay = late.values[TIMING[late.kind.name]] / prior.sample_time
+        values = {**errors.values, f"delay_{late.target}": delay}
+        sided = fit_jointly(self.search, step.effects, nominal_errors(self.search.rig, target, values))
+        return sided if sided.fit.cost < step.fit.cost else None
+
+    def _best_of(self, tried: Sequence[Step], step: Step) -> Step:
+        """The best on whole records of sets fitted to the most telling ones."""
+        # and of what was found before errors could bend to it
+        alone = [] if step.effects else self._alone
+        tried = sorted((s for s in (*tried, *alone) if not self._is_timing(s)), key=lambda s: s.fit.cost)
         if not tried:
             return step
         near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
@@ -453,7 +494,9 @@ class Stepwise:
         Where frequencies are far off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        none = on_their_sides(search, nominal_errors(search.rig, search.prior), effects)
+        late = self.last.errors.target.late if self.steps else ()
+        known = {name: self.last.errors.values[name] for name in (f"delay_{sensor}" for sensor in late)}
+        none = on_their_sides(search, nominal_errors(search.rig, replace(search.prior, late=late), known), effects)
         found = fit_jointly(search, effects, none)
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
             return found
@@ -486,11 +529,8 @@ class Stepwise:
 
     def _tells_apart(self, best: Step, simpler: Step) -> bool:
         """Whether, where only noise is left, records surely prefer a set to a simpler one, by more than a trifle."""
-        if not self.explains(best):
-            return False
-        n, more = self.search.data.n_values, best.fit.n_parameters - simpler.fit.n_parameters
-        gain = float(np.log(simpler.fit.cost / best.fit.cost))
-        return gain > SETTINGS.trifle and n * gain > SURE + more * np.log(n)
+        more = best.fit.n_parameters - simpler.fit.n_parameters
+        return self.explains(best) and self.search.tells_apart(best.fit.cost, simpler.fit.cost, more)
 
     def _without_needless(self, step: Step) -> Step:
         """The set without effects that a later one has made needless."""
@@ -506,7 +546,7 @@ class Stepwise:
         if self.unexplained > SETTINGS.explained:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
-        return in_place_of_errors(search, step.effects)
+        return in_place_of_errors(search, step.effects, step.errors)
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small, and common to all, as effects of their own."""
