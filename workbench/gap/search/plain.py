@@ -9,6 +9,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
+from workbench.gap.search.finish import finished
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.pursuit import FINE, one_more
 from workbench.gap.search.search import Search, spread_over_kinds
@@ -90,7 +91,7 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | Non
     for candidate in sorted((f for f in quickly if f.cost < NEAR), key=lambda f: f.n_parameters):
         found = fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=PLAINLY)
         if search.explains(found):
-            return found
+            return finished(search, found)
     return None
 
 

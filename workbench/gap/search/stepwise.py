@@ -47,14 +47,15 @@ class StepwiseSettings:
         excess: share of what errors of the nominal model leave above the noise that the first effect must take away. On
             practice cases the right one takes over 0.9, the best wrong one under 0.1.
         further_excess: likewise of what other effects leave, for one more beside them: of three, two leave much.
-        least: share of the nominal gap's power above the noise that one more beside others must take away. What is
-            left of a measured gap bends to any law; a servo drive's friction varies by a tenth along its rail.
+        least: share of the nominal gap's power above the noise: one more that takes away less must take away as much of
+            what others leave as the first does. What is left of a measured gap bends to any law; a servo drive's
+            friction varies by a tenth along its rail.
         promising: share of what the best candidate takes away one sample ahead that another must take away to be tried.
         ahead: share of the cost one sample ahead that the best candidate must take away to be tried at all.
         simpler: share by which a set may leave more above the noise and still be taken for being simpler.
         needless: likewise, for a set with one effect less.
         explained: share of the nominal gap's power above the noise that an explanation may leave.
-        further: likewise, from which on a further effect is named though it leaves more than noise.
+        further: likewise, that a further effect is looked for to explain.
         in_part: likewise, for effects that are named although something else is there.
         credible: times the stated noise that noise found may be; more is a gap.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
@@ -145,9 +146,11 @@ class Step:
             getattr(self.errors.target, group) < SETTINGS.plausible * widest for group, widest in SETTINGS.widest
         )
 
-    def description(self, noise_power: np.ndarray) -> float:
+    def description(self, noise_power: np.ndarray, *, of_errors_alone: bool = False) -> float:
         """Description length, nats, of what is left above that noise and of the errors."""
-        left = SETTINGS.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
+        left = 0.0
+        if not of_errors_alone:
+            left = SETTINGS.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
         for group, small in SETTINGS.small:
             size = getattr(self.errors.target, group)
             count = sum(group_of(name) == group for name in self.errors.values)
@@ -321,10 +324,14 @@ class Stepwise:
         return sorted((s for s in found if not self._is_timing(s)), key=lambda s: s.fit.cost)
 
     def by_singles(self) -> bool:
-        """Whether one of the likeliest single effects explains the records beside errors: then it is the first step."""
-        if not self._alone or not self.explains(self._alone[0]):
+        """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
+        if not self._alone:
             return False
-        best = self._simplest(self._alone[0], self._alone[1:])
+        best = self._alone[0]
+        left = best.excess(best.noise_power)
+        if not self.explains(best) and left > SETTINGS.further * float(self.search.nominal.mean()):
+            return False
+        best = self._simplest(best, self._alone[1:])
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
         self.steps.append(best)
@@ -334,9 +341,8 @@ class Stepwise:
         """Add effects as long as each takes most of what is left above the noise."""
         while len(self.last.effects) < SETTINGS.most and not self.is_enough:
             before = self.last
-            trifle = before.effects and before.is_plausible and self.unexplained < SETTINGS.further
             step = self._with_one_more(before)
-            if step is None or (trifle and not self.explains(step)):
+            if step is None:
                 break
             self.steps += [step, self._without_needless(step)]
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
@@ -351,8 +357,8 @@ class Stepwise:
     @property
     def is_enough(self) -> bool:
         """Whether the last set leaves nothing that is worth another effect."""
-        quiet = self.explains(self.last) or (self.last.effects and self.is_quiet)
-        return bool(quiet and self.last.is_plausible)
+        left = self.explains(self.last) or (self.last.effects and self.unexplained < SETTINGS.further)
+        return bool(left and self.last.is_plausible)
 
     def explains(self, step: Step) -> bool:
         """Whether next to nothing is left but noise of the sensors."""
@@ -453,10 +459,11 @@ class Stepwise:
             return False
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
-        worth, least = (SETTINGS.further_excess, SETTINGS.least) if step.effects else (SETTINGS.excess, 0.0)
-        if not self.explains(step) and before - after > max(worth * before, least * self._gap):
+        trifle = bool(step.effects) and before - after < SETTINGS.least * self._gap
+        worth = SETTINGS.further_excess if step.effects and not trifle else SETTINGS.excess
+        if not self.explains(step) and before - after > worth * before:
             return True
-        saved = step.description(noise) - best.description(noise)
+        saved = step.description(noise, of_errors_alone=trifle) - best.description(noise, of_errors_alone=trifle)
         return not step.is_plausible and saved > SETTINGS.shorter
 
     def _matters(self, step: Step) -> bool:

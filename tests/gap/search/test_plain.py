@@ -1,0 +1,72 @@
+"""One effect, where small errors of every mode could say the same with many numbers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, nominal_errors
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE
+from workbench.gap.search.plain import common_as_errors, in_place_of_errors
+from workbench.gap.search.search import Search
+from workbench.trials.make import make_trial
+from workbench.trials.scoring import score_dirty
+
+DAMPER = Effect(kind_named("point_damper"), None, {"at": 1.2, "coefficient": 0.06})
+MODULUS = Effect(kind_named("modulus_error"), None, {"factor": 1.008})
+DAMPING = Effect(kind_named("modal_damping"), None, {"factor": 1.12})
+TRIED = ("point_damper", "point_mass", "modulus_error", "modal_damping", "sensor_gain")
+
+
+@pytest.fixture(scope="module")
+def search(hinged_rig, record_of):
+    rig = hinged_rig(n_modes=4)
+
+    def make(effects):
+        rng = np.random.default_rng(0)
+        inputs = np.repeat(rng.normal(size=100), 5)[None]
+        data = FitData((record_of(apply_all(rig, effects), inputs, rng),), np.full(4, 1e-5))
+        quick, nominal = data.stepped(2), data.by_channel(data.residual(rig))
+        catalogue = tuple(kind for kind in CATALOGUE if kind.name in TRIED)
+        return Search(rig, data, quick, quick, catalogue, lambda text, share: None, ALONE, nominal)
+
+    return make
+
+
+def test_a_damper_stands_in_place_of_the_damping_of_every_mode(search):
+    """Beside stiffness and damping that are a little off, which are told as errors of the model."""
+    one = search((DAMPER, MODULUS, DAMPING))
+    found = in_place_of_errors(one, (), nominal_errors(one.rig, replace(one.prior, delay=0.0)))
+    damper, errors = common_as_errors(one, found).effects
+    assert damper.kind is DAMPER.kind and errors.kind is NOMINAL_ERRORS
+    assert damper.values["at"] == pytest.approx(1.2, abs=0.02)
+    assert damper.values["coefficient"] == pytest.approx(0.06, rel=0.05)
+    assert errors.values["stiffness_0"] == pytest.approx(np.log(1.008), rel=0.02)
+    assert errors.values["damping_1"] == pytest.approx(np.log(1.12), rel=0.1)
+
+
+def test_stiffness_and_damping_that_are_a_little_off_are_no_effect(search):
+    one = search((MODULUS, DAMPING))
+    assert in_place_of_errors(one, (), nominal_errors(one.rig, replace(one.prior, delay=0.0))) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "kinds", "dirt", "size"),
+    [
+        (34017, ("sensor_bias", "sensor_drift", "support_rotation"), "triple", 1.0),
+        (35026, ("one_sided_stop", "point_damper", "sensor_drift"), "triple", 2.0),
+        (34029, ("point_damper",), "offset", 0.5),
+        (37006, ("axial_load",), "late", 0.5),
+        (35006, ("random_disturbance",), "late", 0.5),
+    ],
+)
+def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, dirt, size):
+    """Plants by another numerical route: an effect that a support, a damper or a load hides among errors of modes."""
+    case, label = make_trial(seed, kinds=kinds, dirt=dirt, size=size)
+    verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1)
+    assert score_dirty(verdict.to_json(), label, length=case.rig.modes.length)["named"]
