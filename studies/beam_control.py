@@ -104,9 +104,7 @@ def study(outcome, data=None):
     outcome.check("energy balance: work in against energy gained, relative", balance, 1e-9)
     outcome.check("nine sensors: filtered against exact feedback, share of the largest displacement", difference, 0.005)
     ratio = works["c"].residual_total / works["a"].residual_total
-    outcome.say(
-        f"crowding the actuators on the left half (c) spills {ratio:.0f} times the work of the nodes of mode 5 (a)"
-    )
+    outcome.say(f"actuators all on the left half (c) spill {ratio:.0f} times the work of the nodes of mode 5 (a)")
     outcome.say(f"the controlled modes give up {-works['a'].controlled_total:.7f} whatever the places")
     labels = {name: ", ".join(f"{x:g}" for x in places) for name, places in PLACES.items()}
     outcome.figure(

@@ -14,13 +14,13 @@ from workbench.structure.member import Beam
 WEIGHT, SHARE, PUSH = 20.0, 0.05, 1.0
 
 
-def pushed(modes, at, seconds):
-    """State after a half-sine push (N) of some seconds at a place, undamped modes from rest, from its end on."""
+def after_half_sine(modes, at, seconds):
+    """State after a half-sine force (N) of some seconds at a place, undamped modes from rest, from its end on."""
     w, turn = modes.omega, np.pi / seconds
     strength = PUSH * modes.phi(at)[0]
     s = 1j * w
     transform = turn * (1 + np.exp(-s * seconds)) / (turn**2 - w**2) * strength
-    # q' + iω q at the end of the push is the push's transform turned on by e^{iωt}
+    # q' + iω q at the end of the force is the force's transform turned on by e^{iωt}
     moving = transform * np.exp(s * seconds)
     return np.r_[moving.imag / w, moving.real]
 
@@ -28,11 +28,11 @@ def pushed(modes, at, seconds):
 def study(outcome, data=None):
     beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
     modes = beam.modes(24)
-    blow = impulse_state(modes, 6.3)
-    push = pushed(modes, 6.3, 4.0)
+    impulse = impulse_state(modes, 6.3)
+    force = after_half_sine(modes, 6.3, 4.0)
     found = {
-        "a blow, the same momentum for every mode": how_many_modes(modes, blow, weight=WEIGHT, share=SHARE),
-        "a push of 4 s": how_many_modes(modes, push, weight=WEIGHT, share=SHARE),
+        "an impulse, the same momentum for every mode": how_many_modes(modes, impulse, weight=WEIGHT, share=SHARE),
+        "a half-sine force of 4 s": how_many_modes(modes, force, weight=WEIGHT, share=SHARE),
     }
     for name, result in found.items():
         n = result.recommended
@@ -53,25 +53,25 @@ def study(outcome, data=None):
                 "least": result.least,
             },
         )
-    gentle = found["a push of 4 s"]
+    gentle = found["a half-sine force of 4 s"]
     n = gentle.recommended
     law = imsc(modes, n, [Actuator(f"F{i}", x) for i, x in enumerate(nodes_of_mode(modes, n))], weight=WEIGHT)
-    rest = push.copy()
+    rest = force.copy()
     rest[n:24] = rest[24 + n :] = 0.0
     late = finite_spillover(close_loop(modes, law), rest, 2000.0)
     outcome.check(
-        "what the recommended number spills, against the work up to 2000 s, relative",
+        "spillover work of the recommended number, against the work up to 2000 s, relative",
         abs(late.residual_total / gentle.spilled[n - 1] - 1.0),
         1e-6,
     )
     outcome.check(
-        "what control takes from its modes (5.27) against what the push gave them, relative",
+        "work of control on its modes (5.27) against the energy that the force gave them, relative",
         abs(-late.controlled_total / gentle.energy[:n].sum() - 1.0),
         1e-9,
     )
-    outcome.check("modes recommended for the push of 4 s", n, 6)
+    outcome.check("modes recommended for a force of 4 s", n, 6)
     outcome.check(
-        "left by one mode fewer, over what may be left",
+        "energy left with one mode fewer, over the limit",
         gentle.left[n - 2] / (SHARE * gentle.energy.sum()),
         1.0,
         at_least=True,

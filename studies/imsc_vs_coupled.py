@@ -44,8 +44,8 @@ FIGURES = {
     "cost": "cost",
     "effort": "effort",
     "spilled": "spillover W_R",
-    "survived_share": f"stable on, of models\n{ERRORS:.0%} wrong",
-    "design_time": "time to design,\nin the first's",
+    "stable_share": f"stable on, of models\n{ERRORS:.0%} wrong",
+    "design_time": "time to design,\nrelative to the first",
 }
 
 
@@ -140,22 +140,22 @@ def every_design(places):
         law, law_seconds = designed(make)
         for way_name, way in ways.items():
             design, seconds = designed(lambda way=way, law=law: way(law))
-            told = performance(close_with(modes, design), state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
+            measures = performance(close_with(modes, design), state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
             rows.append(
                 {
                     "law": law_name,
                     "state": way_name,
-                    **asdict(told),
-                    "survived_share": stable_share(possible, design),
+                    **asdict(measures),
+                    "stable_share": stable_share(possible, design),
                     "seconds": law_seconds + (0.0 if design is law else seconds),
                 }
             )
     relay, seconds = designed(lambda: on_off(modes, 4, actuators, **RELAY))
-    told = on_off_performance(modes, relay, state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
+    measures = on_off_performance(modes, relay, state, weight=FORCE_WEIGHT, final_time=FINAL_TIME)
     rows.append(
         {
-            "law": "IMSC, on-off", "state": "exact coordinates", **asdict(told), "margin": None,
-            "survived_share": None, "seconds": seconds,
+            "law": "IMSC, on-off", "state": "exact coordinates", **asdict(measures), "margin": None,
+            "stable_share": None, "seconds": seconds,
         }
     )  # fmt: skip
     first = rows[0]["seconds"]
@@ -205,17 +205,17 @@ def study(outcome, data=None):
         start = np.r_[state[:4], state[9:13]]
         return rows, float(start @ p @ start)
 
-    (rows, least), (crowded, crowded_least) = compared((2.0, 4.0, 6.0, 8.0)), compared((1.3, 2.6, 3.9, 5.2))
+    (rows, least), (close, close_least) = compared((2.0, 4.0, 6.0, 8.0)), compared((1.3, 2.6, 3.9, 5.2))
     gains_by_poles = pole_gains(beam, outcome)
     outcome.table("nodes_of_mode_5", rows)
-    outcome.table("crowded", crowded)
+    outcome.table("close", close)
     outcome.table("distributed", {"modal_cost": unattainable, "W_R": 0.0})
     outcome.table("poles", gains_by_poles)
 
     spread, near = every_design((1.5, 3.5, 6.5, 8.5)), every_design((1.3, 2.6, 3.9, 5.2))
-    for name, found, where in (("designs", near, "crowded on one side"), ("designs_spread", spread, "spread")):
+    for name, found, where in (("designs", near, "close together"), ("designs_spread", spread, "spread")):
         outcome.table(name, found)
-        title = f"four modes of a beam after the same blow, actuators {where}; less is better, but for the fourth panel"
+        title = f"four modes of a beam after the same impulse, actuators {where}; less is better but in the fourth"
         caption = f"Every law on every way to know the state, actuators {where}, nine sensors."
         outcome.figure(name, plot_designs(found, FIGURES, title), caption)
 
@@ -224,7 +224,7 @@ def study(outcome, data=None):
         return row
 
     outcome.check(
-        "crowded: margin of IMSC through the modal filter, that spread ones have",
+        "close together: margin of IMSC through the modal filter, that spread ones have",
         of(near, "IMSC, Riccati", "modal filter")["margin"],
         0.0,
     )
@@ -239,11 +239,12 @@ def study(outcome, data=None):
         ),
         1.0,
     )
-    least_sure = min(near[:-1], key=lambda row: row["survived_share"] if row["margin"] > 0 else 1.0)
+    least_sure = min(near[:-1], key=lambda row: row["stable_share"] if row["margin"] > 0 else 1.0)
     outcome.say(
-        f"crowded: through nine sensors' modal filter IMSC is unstable; {least_sure['law']} on {least_sure['state']} is"
-        f" stable on the model and on {least_sure['survived_share']:.0%} of those {ERRORS:.0%} wrong, coupled LQR on"
-        f" {min(r['survived_share'] for r in near if r['law'] == 'coupled LQR'):.0%} at the least"
+        f"close together: through nine sensors' modal filter IMSC is unstable; {least_sure['law']} on"
+        f" {least_sure['state']} is stable on the model and on {least_sure['stable_share']:.0%} of those"
+        f" {ERRORS:.0%} wrong, coupled LQR on"
+        f" {min(r['stable_share'] for r in near if r['law'] == 'coupled LQR'):.0%} at the least"
     )
     residual, gains = riccati_errors()
     outcome.check("Riccati residual of the closed form over five decades, relative", residual, 1e-12)
@@ -255,27 +256,27 @@ def study(outcome, data=None):
     )
     outcome.check(
         "cost of coupled LQR against x0ᵀ P x0 of control.care, relative, both places",
-        max(abs(rows[1]["cost"] / least - 1.0), abs(crowded[1]["cost"] / crowded_least - 1.0)),
+        max(abs(rows[1]["cost"] / least - 1.0), abs(close[1]["cost"] / close_least - 1.0)),
         1e-9,
     )
     outcome.check(
-        "IMSC, modal forces weighed, against distributed control wherever the actuators stand, relative",
-        max(abs(r[0]["modal_cost"] / unattainable - 1.0) for r in (rows, crowded)),
+        "IMSC, modal forces weighted, against distributed control wherever the actuators stand, relative",
+        max(abs(r[0]["modal_cost"] / unattainable - 1.0) for r in (rows, close)),
         1e-9,
     )
     outcome.check(
-        "coupled LQR, modal forces weighed, over distributed control, actuators crowded",
-        crowded[1]["modal_cost"] / unattainable,
+        "coupled LQR, modal forces weighted, over distributed control, actuators close together",
+        close[1]["modal_cost"] / unattainable,
         1.0,
         at_least=True,
     )
     outcome.check(
-        "actuators crowded: cost of IMSC over coupled LQR",
-        crowded[0]["cost"] / crowded[1]["cost"],
+        "actuators close together: cost of IMSC over coupled LQR",
+        close[0]["cost"] / close[1]["cost"],
         90.0,
         at_least=True,
     )
-    outcome.check("poles of the Sylvester way, relative", max(r["poles_missed"] for r in gains_by_poles), 1e-9)
+    outcome.check("poles by Sylvester's equation, relative", max(r["poles_missed"] for r in gains_by_poles), 1e-9)
     outcome.check(
         "its gain norm over that of control.place",
         max(r["gain_norm"] / r["place_gain_norm"] for r in gains_by_poles),
@@ -283,16 +284,16 @@ def study(outcome, data=None):
     )
     outcome.say("actuators at the nodes of mode 5: IMSC and coupled LQR are the same law")
     outcome.say(
-        f"actuators crowded: coupled LQR costs {crowded[1]['cost'] / crowded[0]['cost']:.3f} of IMSC, with"
-        f" {crowded[1]['effort'] / crowded[0]['effort']:.3f} of its effort and"
-        f" {crowded[1]['W_R'] / crowded[0]['W_R']:.3f} of its spillover"
+        f"actuators close together: coupled LQR costs {close[1]['cost'] / close[0]['cost']:.3f} of IMSC, with"
+        f" {close[1]['effort'] / close[0]['effort']:.3f} of its effort and"
+        f" {close[1]['W_R'] / close[0]['W_R']:.3f} of its spillover"
     )
     outcome.say(
-        "weighed on modal forces IMSC costs what distributed control does, wherever its actuators stand; what the"
+        "with modal forces weighted IMSC costs what distributed control does, wherever its actuators stand; what the"
         " places decide is the effort and the spillover"
     )
     outcome.figure(
-        "comparison", plot_comparison(crowded[:2]), "Actuators at 1.3, 2.6, 3.9, 5.2: coupled LQR beside IMSC."
+        "comparison", plot_comparison(close[:2]), "Actuators at 1.3, 2.6, 3.9, 5.2: coupled LQR beside IMSC."
     )
     relay = on_off(modes, 4, [Actuator(f"F{i + 1}", x) for i, x in enumerate((2.0, 4.0, 6.0, 8.0))], **RELAY)
     coarse, fine = (respond_on_off(modes, relay, state, np.linspace(0.0, 120.0, n)) for n in (481, 15361))

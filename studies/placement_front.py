@@ -27,8 +27,8 @@ GRIDS = {2: 200, 3: 60, 4: 24}
 def study(outcome, data=None):
     beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
     modes = beam.modes(9)
-    blows = np.linspace(0.5, 9.5, 19)
-    disturbances = {"a blow at 6.3": 6.3, "a blow anywhere": blows}
+    places = np.linspace(0.5, 9.5, 19)
+    disturbances = {"an impulse at 6.3": 6.3, "an impulse anywhere": places}
 
     fronts, nodes = {}, {}
     for name, at in disturbances.items():
@@ -57,7 +57,7 @@ def study(outcome, data=None):
             f" {fronts[name][4].residual_work / nodes[name].residual_work:.0%}"
         )
         work = np.array([p.residual_work for p in fronts[name]])
-        outcome.check(f"{name}: W_R nowhere rises along the front, largest step", float(np.diff(work).max()), 1e-12)
+        outcome.check(f"{name}: W_R does not rise along the front, largest step", float(np.diff(work).max()), 1e-12)
         outcome.check(
             f"{name}: W_R of the optimum over the nodes' at their effort",
             fronts[name][0].residual_work / nodes[name].residual_work,
@@ -86,7 +86,7 @@ def study(outcome, data=None):
             }
         )
         under = ", under every limit" if more else ""
-        outcome.check(f"{n} actuators{under}: share by which W_R could yet be lower", proof.gap, gap * (1 + 1e-9))
+        outcome.check(f"{n} actuators{under}: gap of the certificate", proof.gap, gap * (1 + 1e-9))
         outcome.say(
             f"{n} actuator(s){under}: no placement spills less than {1 - proof.gap:.0%} of the optimum, proven on"
             f" {proof.cells} cells; the nodes of mode {n + 1} spill"
@@ -94,7 +94,7 @@ def study(outcome, data=None):
         )
     outcome.table("certificates", proofs)
 
-    rule, best = nodes["a blow at 6.3"], fronts["a blow at 6.3"][4]
+    rule, best = nodes["an impulse at 6.3"], fronts["an impulse at 6.3"][4]
     limits = Limits(effort=1.5 * rule.effort, spacing=SPACING)
     together = place_coupled(modes, 4, 4, impulse_at=6.3, weight=10.0, limits=limits)
     scans = []
@@ -142,14 +142,14 @@ def study(outcome, data=None):
         },
     )
     outcome.check(
-        "coupled LQR, placed for itself: W_R over that of IMSC's optimum",
+        "coupled LQR, placed for its own W_R: W_R over that of IMSC's optimum",
         together.residual_work / best.residual_work,
         1.0,
     )
     outcome.say(
         f"coupled LQR placed for itself spills {together.residual_work / best.residual_work:.2g} of what IMSC at its"
         f" optimum does, for {together.effort / best.effort:.2f} of the effort and"
-        f" {cost['coupled LQR'] / cost['IMSC']:.2f} of the cost: it need not push every mode, nor use every actuator"
+        f" {cost['coupled LQR'] / cost['IMSC']:.2f} of the cost: it need not act on every mode, nor use every actuator"
         f" (they stand at {', '.join(f'{x:.2f}' for x in together.positions)})"
     )
     outcome.figure(

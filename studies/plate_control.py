@@ -165,7 +165,7 @@ def study(outcome, data=None):
             actuators=SHAKERS,
             struck=STRUCK_AT,
         ),
-        "The panel after a blow at the star, left alone and controlled from the four crosses.",
+        "The panel after an impulse at the star, left alone and controlled from the four crosses.",
     )
     works = {
         "design on identified modes": spillover(undamped, law, at_rest).residual_work,

@@ -108,7 +108,7 @@ def robust(outcome):
 
 
 def closed_loop_record(truth, law, through, seed):
-    """Modal coordinates that the sensors' filter reads in the running loop of all modes, after a blow, noise 1 %."""
+    """Modal coordinates that the sensors' filter reads in the loop of all modes, after an impulse, noise 1 %."""
     time = 0.1 * np.arange(400)
     motion = respond(close_loop(truth, law, through), impulse_state(truth, 6.3), time).displacement(SENSORS)
     noise = 0.01 * motion.std(axis=1, keepdims=True)

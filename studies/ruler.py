@@ -46,10 +46,10 @@ def study(outcome, data: Path | None = None) -> None:
     stayed = stayed.select(np.flatnonzero(stayed.frequencies_hz < BAND_HZ))
 
     beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(8)
-    told = pair_modes(stayed, beam.select(range(2, 8)))
-    bending = stayed.select(told.matched)
-    others = stayed.select(told.others)
-    report_modes(outcome, bending, others, told)
+    paired = pair_modes(stayed, beam.select(range(2, 8)))
+    bending = stayed.select(paired.matched)
+    others = stayed.select(paired.others)
+    report_modes(outcome, bending, others, paired)
     outcome.figure(
         "stabilisation",
         stabilisation_diagram(diagram, stayed, BAND_HZ),
@@ -57,30 +57,30 @@ def study(outcome, data: Path | None = None) -> None:
     )
     outcome.figure(
         "modes",
-        measured_modes(bending, others, told, beam.select(range(2, 8))),
+        measured_modes(bending, others, paired, beam.select(range(2, 8))),
         "The ruler's shapes at its ten points, over those of a uniform free-free beam.",
     )
     diagnose_frequencies(outcome, bending, others, beam)
     place_actuators(outcome, bending)
 
 
-def report_modes(outcome, bending, others, told) -> None:
+def report_modes(outcome, bending, others, paired) -> None:
     outcome.table("bending_hz", bending.frequencies_hz)
     outcome.table("bending_zeta", bending.zeta)
-    outcome.table("mac", told.mac)
-    outcome.table("beam_hz", told.scaled_hz)
+    outcome.table("mac", paired.mac)
+    outcome.table("beam_hz", paired.scaled_hz)
     outcome.table("other_hz", others.frequencies_hz)
     outcome.say(
         f"bending at {', '.join(f'{f:.1f}' for f in bending.frequencies_hz)} Hz; a uniform beam scaled to the"
-        f" first has {', '.join(f'{f:.1f}' for f in told.scaled_hz)} Hz"
+        f" first has {', '.join(f'{f:.1f}' for f in paired.scaled_hz)} Hz"
     )
     outcome.say(f"not bending: {', '.join(f'{f:.1f}' for f in others.frequencies_hz)} Hz")
     outcome.check("number of bending modes", abs(bending.n_modes - len(SEEN_HZ)), 0)
     outcome.check("number of other modes", abs(others.n_modes - len(OTHERS_HZ)), 0)
     found, seen = bending.frequencies_hz, SEEN_HZ
     if bending.n_modes == len(seen):
-        outcome.check("bending frequencies against those seen by eye, relative", np.abs(found / seen - 1).max(), 0.01)
-    outcome.check("MAC with the free-free beam, first five", told.mac[:5].min(), 0.95, at_least=True)
+        outcome.check("bending frequencies against those picked by eye, relative", np.abs(found / seen - 1).max(), 0.01)
+    outcome.check("MAC with the free-free beam, first five", paired.mac[:5].min(), 0.95, at_least=True)
 
 
 def diagnose_frequencies(outcome, bending, others, beam) -> None:

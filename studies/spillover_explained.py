@@ -73,7 +73,7 @@ def study(outcome, data=None):
     worst = crossed.shifts[0]
     path = worst.paths[0]
     outcome.check(
-        "paths add up to the exact movement of every residual pole, relative to its frequency",
+        "paths add up to the exact shift of every residual pole, relative to its frequency",
         max(abs(sum(p.shift for p in m.paths) - m.shift) / abs(m.pole) for m in crossed.shifts),
         1e-9,
     )
@@ -100,7 +100,7 @@ def study(outcome, data=None):
         " once the alias of its highest mode lies beyond the plant's"
     )
     perfect = close_loop(modes, law(one)).margin
-    outcome.check("a number of sensors suffices for the modal filter, up to", counts["modal filter"] or np.inf, 24)
+    outcome.check("number of sensors that suffices for the modal filter", counts["modal filter"] or np.inf, 24)
     outcome.check(
         "its margin with 24 sensors over that with exact modal coordinates",
         margins_of_filter(modes, through_filter, one) / perfect,

@@ -65,7 +65,7 @@ ROWS = {
     "eight kinds of record": lambda r: max(
         row["over_bound"] for row in r["records"].values() if row["bound"] == "Cramér-Rao"
     ),
-    "every law with every way": lambda r: _largest(r, "crowded: cost of IMSC"),
+    "every law with every way": lambda r: _largest(r, "close together: cost of IMSC"),
     "a fifth of the stiffness": lambda r: min(c["value"] for c in r["checks"] if "found and placed" in c["name"]),
     "worst mode of fifty": lambda r: _largest(r, "median worst mode over the best peer's"),
     "the same, time": lambda r: _largest(r, "time over SSI-cov's"),
@@ -75,7 +75,7 @@ ROWS = {
     "W_R of the optimum over the best of a full grid": lambda r: _largest(r, "W_R of the optimum over the best"),
     "a hundred thousand modes": lambda r: r["speeds"]["imsc_100000_modes_s"],
     "spillover explained": lambda r: _largest(r, "paths add up"),
-    "placement of 4 actuators": lambda r: _largest(r, "4 actuators", "share"),
+    "placement of 4 actuators": lambda r: _largest(r, "4 actuators", "certificate"),
     "frequencies re-identified": lambda r: _largest(r, "re-identified in the loop"),
     "ruler": lambda r: _largest(r, "MAC with the free-free beam"),
     "Silverbox": lambda r: 1e3 * r["rmse"]["multisines"]["after"],

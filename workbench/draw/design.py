@@ -172,7 +172,7 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     axes[1].barh(rows, shifts, color=[COLOURS[1] if s > 0 else COLOURS[0] for s in shifts])
     axes[1].axvline(0.0, color=GREY, linewidth=0.8)
     axes[1].set_yticks(rows, labels)
-    axes[1].set(xlabel="share of the path in Re λ [1/s]", title=f"which path shifts mode {worst.mode + 1}")
+    axes[1].set(xlabel="contribution to Re λ [1/s]", title=f"which path shifts mode {worst.mode + 1}")
     return figure
 
 
