@@ -75,6 +75,8 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     if distortions:
         seen = (
             "What the records show before any model: lines that are excited, odd and even ones that are not, and noise."
+            + " Only odd lines are excited, so even ones reveal an even law."
+            * all(d.parity_resolved for d in distortions)
         )
         figures.append((plot_distortion(distortions), seen))
     gaps = [
@@ -123,7 +125,7 @@ def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
     """Distortion of the records of least and of largest excitation, where it repeats."""
     found = []
     for record in records:
-        with suppress(ValueError):  # excitation that does not repeat tells none
+        with suppress(ValueError):  # excitation that does not repeat shows none
             found.append(distortion_of(record))
     found.sort(key=lambda each: each.input_rms)
     return found if len(found) < 2 else [found[0], found[-1]]

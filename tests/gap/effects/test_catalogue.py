@@ -161,12 +161,12 @@ def test_cross_talk_adds_a_share_of_another_reading():
     assert _described(effect, nominal) == "cross-talk between sensors (share 0.2), d from v"
 
 
-def test_a_number_whose_deviation_exceeds_it_is_not_significant():
+def test_a_number_whose_deviation_exceeds_it_does_not_stand_out():
     damper, nominal = kind_named("point_damper"), rig()
     sure = Effect(damper, None, {"at": 0.8, "coefficient": 1.0}, {"at": 0.01, "coefficient": 0.1})
     unsure = Effect(damper, None, {"at": 0.8, "coefficient": 1.1e6}, {"at": 0.01, "coefficient": 7e7})
     gain = Effect(kind_named("sensor_gain"), "d", {"gain": 1.0}, {"gain": 0.01})
-    assert sure.significant(nominal) and not unsure.significant(nominal) and not gain.significant(nominal)
+    assert sure.stands_out(nominal) and not unsure.stands_out(nominal) and not gain.stands_out(nominal)
 
 
 def test_a_harmonic_of_excitation_at_one_level_is_no_disturbance():

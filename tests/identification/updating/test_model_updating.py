@@ -44,9 +44,9 @@ def test_standard_errors_are_those_of_repeated_measurements():
 
 
 def test_what_cannot_be_told_is_refused():
-    with pytest.raises(ValueError, match="cannot tell 5 parameters"):
+    with pytest.raises(ValueError, match="cannot determine 5 parameters"):
         update_model(row_of_masses, np.ones(5), **measured(0, 1e-3))
-    with pytest.raises(ValueError, match="cannot tell the parameters apart"):
+    with pytest.raises(ValueError, match="cannot distinguish the parameters"):
         update_model(lambda p: row_of_masses([p[0] * p[1], 25.0]), [9.0, 10.0], **measured(0, 1e-3))
     strange = measured(0, 1e-3)
     strange["shapes"][:, 3] = np.linalg.svd(row_of_masses(TRUTH).phi(NAMES))[0][:, 5]  # unlike any of five modes

@@ -174,16 +174,11 @@ class Effect:
         """Its values, the place left out."""
         return {name: value for name, value in self.values.items() if name not in COORDINATES}
 
-    def significant(self, rig: Rig) -> bool:
-        """Whether every number is farther from where it changes nothing than its standard deviation."""
-        return all(
-            abs(self.values[p.name] - p.neutral) > self.deviations.get(p.name, 0.0)
-            for p in self.parameters(rig)
-            if p.neutral is not None
-        )
-
     def stands_out(self, rig: Rig) -> bool:
-        """Whether any number is; true of an effect without such numbers, and of errors of the nominal model."""
+        """Whether any number is farther from where it changes nothing than its standard deviation.
+
+        True of an effect without such numbers, and of errors of the nominal model.
+        """
         tested = [p for p in self.parameters(rig) if p.neutral is not None and self.deviations.get(p.name, 0.0) > 0]
         off = any(abs(self.values[p.name] - p.neutral) > self.deviations[p.name] for p in tested)
         return off or not tested or self.kind.first

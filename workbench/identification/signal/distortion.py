@@ -55,7 +55,7 @@ class Distortion:
 
     @property
     def parity_resolved(self) -> bool:
-        """Whether only odd lines are excited: even ones then tell an even law."""
+        """Whether only odd lines are excited: even ones then reveal an even law."""
         return not self.excited[1::2].any()
 
     @property

@@ -83,7 +83,7 @@ def update_model(
     first, target = np.asarray(start, float), np.asarray(omega, float)
     deviation, measured = np.broadcast_to(np.asarray(omega_std, float), target.shape), np.asarray(shapes)
     if first.size > target.size:
-        raise ValueError(f"{target.size} measured frequencies cannot tell {first.size} parameters; choose fewer")
+        raise ValueError(f"{target.size} measured frequencies cannot determine {first.size} parameters; choose fewer")
     if not (first > 0).all() or not (deviation > 0).all():
         raise ValueError("parameters to start from and standard errors must be positive")
     if measured.shape[1] != target.size:
@@ -115,7 +115,7 @@ def update_model(
     singular = np.linalg.svd(found.jac, compute_uv=False)
     if singular[-1] <= INDISTINCT * singular[0]:
         raise ValueError(
-            "the measured frequencies cannot tell the parameters apart: some change them alike; choose fewer"
+            "the measured frequencies cannot distinguish the parameters: some change them alike; choose fewer"
         )
     modes = build(parameters)
     columns, agreement = paired(modes)
