@@ -40,14 +40,20 @@ def function(x, power=2):
 """
 
 
-def loaded(tmp_path, source, name="mine"):
+def loaded(tmp_path, source, name="mine", registered=True):
     path = tmp_path / f"{name}.py"
     path.write_text(source)
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    if registered:
+        sys.modules[name] = module
     spec.loader.exec_module(module)
     return module.function
+
+
+def test_a_dataclass_of_a_module_that_is_not_registered_is_read(tmp_path):
+    """As the modules of studies are; what `dataclass` writes for it belongs to no module."""
+    assert fingerprint(loaded(tmp_path, SOURCE, name="study", registered=False))
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,8 @@ def library_of(file: str | None, module: str | None) -> str | None:
 def _version(top: str) -> str:
     try:
         return metadata.version(top)
-    except metadata.PackageNotFoundError:  # of a distribution with another name than its module
+    # a distribution with another name than its module; or a method that `dataclass` wrote for a class of no module
+    except (metadata.PackageNotFoundError, ValueError):
         return str(getattr(sys.modules.get(top), "__version__", ""))
 
 

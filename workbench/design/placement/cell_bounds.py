@@ -10,7 +10,7 @@ where d_rj is zero at c_j: an error of the forces F costs only to second order. 
 ½ ‖Y‖² and ‖Y‖ >= vᵀ Y for any unit vector v, here that of the least ‖Y‖ to first order in the cell; the linear part is
 minimised over the cell under each limit linearised alike (a linear programme of one constraint, solved by its dual).
 
-Near a singular B the limits decide alone: with tr(B⁻¹ S B⁻ᵀ) <= L², no unit vector u has ‖S^-½ B u‖ < 1/L.
+Where B may be singular, or nearly so, duality bounds ‖Y‖ under each limit (`dual_bound.py`); the larger bound counts.
 """
 
 from dataclasses import dataclass
@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit
 
 from workbench.arrays import Flags, Floats, Integers
+from workbench.design.placement.dual_bound import dual_bound, inverse_of
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
@@ -109,9 +110,9 @@ class CellBounds:
             table.most_rate,
             np.ascontiguousarray(task.roots),
             roots,
+            np.array([matrix for matrix, _ in squares]).reshape(-1, n, n),
+            inverses,
             np.asarray(inverses.any(axis=(1, 2))),
-            np.einsum("skl,il->isk", inverses, table.slope[:, :n]),
-            np.linalg.norm(np.einsum("skl,il->isk", np.abs(inverses), table.most_bend[:, :n]), axis=2),
             np.array([limit for _, limit in squares]),
             float(limits.condition),
             np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
@@ -124,37 +125,6 @@ class CellBounds:
         axis = np.empty(len(cells), np.int64)
         _bounds(cells, *self._arguments, lower, work, axis)
         return lower, work, axis
-
-
-@njit(cache=True, nogil=True)
-def _inverse(matrix: Floats, inverse: Floats, least: float) -> bool:
-    """Gauss-Jordan with pivots; whether every pivot is above the least. The matrix is destroyed."""
-    n = matrix.shape[0]
-    for i in range(n):
-        for j in range(n):
-            inverse[i, j] = 1.0 if i == j else 0.0
-    for k in range(n):
-        best = k
-        for i in range(k + 1, n):
-            if abs(matrix[i, k]) > abs(matrix[best, k]):
-                best = i
-        pivot = matrix[best, k]
-        if not abs(pivot) > least:
-            return False
-        if best != k:
-            for j in range(n):
-                matrix[k, j], matrix[best, j] = matrix[best, j], matrix[k, j]
-                inverse[k, j], inverse[best, j] = inverse[best, j], inverse[k, j]
-        for j in range(n):
-            matrix[k, j] /= pivot
-            inverse[k, j] /= pivot
-        for i in range(n):
-            factor = matrix[i, k]
-            if i != k and factor != 0.0:
-                for j in range(n):
-                    matrix[i, j] -= factor * matrix[k, j]
-                    inverse[i, j] -= factor * inverse[k, j]
-    return True
 
 
 @njit(cache=True, nogil=True)
@@ -193,9 +163,9 @@ def _bounds(
     most_rate: Floats,
     transforms: Floats,
     roots: Floats,
+    squares: Floats,
+    inverses: Floats,
     regular: Flags,
-    root_slope: Floats,
-    root_bend: Floats,
     square_limits: Floats,
     condition: float,
     forces: Floats,
@@ -218,8 +188,8 @@ def _bounds(
     rest_by = np.empty((n_residual, n_columns, n))
     least_y, shift, cost, score = np.empty((n_residual, n_columns)), np.empty(n), np.empty(n), np.empty(n)
     directions, slacks = np.empty((n_squares + 1, n)), np.empty(n_squares + 1)
-    corner = np.empty((n, n))
     weighted, u, v, carried = np.empty((n, n)), np.empty(n), np.empty(n), np.empty(n)
+    limits = np.empty(n_squares)
     for cell in range(n_cells):
         node = cells[cell]
         lower[cell], work[cell] = 0.0, np.inf
@@ -234,9 +204,31 @@ def _bounds(
                 largest = max(largest, abs(b[k, j]))
                 frame += b[k, j] ** 2
         axis[cell] = widest
-        if not _inverse(matrix, m, SINGULAR * largest):
-            continue
         frame = np.sqrt(frame)
+
+        # no place in the cell has a ‖B‖ below this
+        least_frame = frame
+        for j in range(n):
+            a = 0.0
+            for k in range(n):
+                a += (abs(slope[node[j], k]) + h[j] * most_bend[node[j], k]) ** 2
+            least_frame -= h[j] * np.sqrt(a)
+        for s in range(n_squares):
+            limits[s] = square_limits[s]
+            if np.isinf(limits[s]) and least_frame > 0:
+                limits[s] = condition / least_frame
+
+        # by duality, under each limit
+        shapes = (value[node], slope[node], bend[node], most_bend[node], most_rate[node])
+        nearest = -np.inf
+        for s in range(n_squares):
+            if regular[s] and np.isfinite(limits[s]):
+                bound = dual_bound(h, shapes, transforms, squares[s], inverses[s], limits[s], SINGULAR, score)
+                if bound > nearest:
+                    nearest, axis[cell] = bound, np.argmax(score)
+        lower[cell] = max(nearest, 0.0)
+        if np.isinf(lower[cell]) or not inverse_of(matrix, m, SINGULAR * largest):
+            continue
 
         # how the forces change over the cell: E = M ΔB
         for i in range(n):
@@ -250,88 +242,18 @@ def _bounds(
                 rate[i, j] = a
                 curved[i, j] = 0.5 * h[j] ** 2 * min(abs(c) + h[j] * d, e)
                 change[i, j] = abs(a) * h[j] + curved[i, j]
-        for j in range(n):
-            score[j] = 0.0
-            for i in range(n):
-                score[j] += change[i, j]
-            if score[j] > score[axis[cell]]:
-                axis[cell] = j
-
-        # no place in the cell has a ‖B‖ below this
-        least_frame = frame
-        for j in range(n):
-            a = 0.0
-            for k in range(n):
-                a += (abs(slope[node[j], k]) + h[j] * most_bend[node[j], k]) ** 2
-            least_frame -= h[j] * np.sqrt(a)
-        least_frame = max(least_frame, 0.0)
-
-        # limits that a nearly singular B breaks
-        open_ = True
-        for s in range(n_squares):
-            limit = square_limits[s]
-            if np.isinf(limit):
-                limit = condition / least_frame if least_frame > 0 else np.inf
-            slacks[s] = limit
-            column, size = 0, -1.0
-            for c in range(n):
-                a = 0.0
+        if nearest == -np.inf:
+            for j in range(n):
+                score[j] = 0.0
                 for i in range(n):
-                    d = 0.0
-                    for k in range(n):
-                        d += m[i, k] * roots[s, k, c]
-                    weighted[i, c] = d
-                    a += d * d
-                if a > size:
-                    column, size = c, a
-            for i in range(n):
-                v[i] = weighted[i, column]
-            a = 0.0
-            for c in range(n):
-                u[c] = 0.0
-                for i in range(n):
-                    u[c] += weighted[i, c] * v[i]
-                a += u[c] ** 2
-            if not regular[s]:
-                continue
-            # S^-½ B v = u at the centre; a norm is convex, so its linear part is largest at a corner of the cell
-            a = np.sqrt(a)
-            d, e = 0.0, 0.0
-            for c in range(n):
-                u[c] /= a
-            for i in range(n):
-                v[i] = 0.0
-                for c in range(n):
-                    v[i] += weighted[i, c] * u[c]
-                d += v[i] ** 2
-                e += abs(v[i]) * 0.5 * h[i] ** 2 * root_bend[node[i], s]
-                for c in range(n):
-                    corner[i, c] = v[i] * h[i] * root_slope[node[i], s, c]
-                    u[c] += corner[i, c]
-            largest_square = 0.0
-            for step in range(1, 2**n + 1):
-                a = 0.0
-                for c in range(n):
-                    a += u[c] ** 2
-                largest_square = max(largest_square, a)
-                # Gray's code: one sign turns at a time
-                i = 0
-                while i < n - 1 and not (step >> i) & 1:
-                    i += 1
-                for c in range(n):
-                    corner[i, c] = -corner[i, c]
-                    u[c] += 2.0 * corner[i, c]
-            if np.sqrt(d) > limit * (np.sqrt(largest_square) + e):
-                open_ = False
-        if not open_:
-            lower[cell] = np.inf
-            continue
+                    score[j] += change[i, j]
+            axis[cell] = np.argmax(score)
 
         # Neumann's series, where it converges: (I - Ē) w = 1 with w > 0 makes I - Ē an M-matrix
         for i in range(n):
             for j in range(n):
                 matrix[i, j] = (1.0 if i == j else 0.0) - change[i, j]
-        if not _inverse(matrix, neumann, 1e-12):
+        if not inverse_of(matrix, neumann, 1e-12):
             continue
         converges = True
         for i in range(n):
@@ -349,6 +271,7 @@ def _bounds(
                     error[i, j] += neumann[i, k] * change[k, j]
 
         # the limits to first order: aᵀδ <= slack
+        open_ = True
         for s in range(n_squares):
             energy = 0.0
             for i in range(n):
@@ -372,7 +295,7 @@ def _bounds(
                     for j in range(n):
                         directions[s, j] -= share * rate[i, j] * weighted[j, c]
                         remainder += abs(share) * (curved[i, j] * abs(weighted[j, c]) + change[i, j] * carried[j])
-            slacks[s] = slacks[s] - energy + remainder
+            slacks[s] = limits[s] - energy + remainder
             reach = 0.0
             for j in range(n):
                 reach += abs(directions[s, j]) * h[j]
@@ -495,6 +418,8 @@ def _bounds(
                     for r in range(n_residual):
                         for q in range(n_columns):
                             score[j] += 2.0 * abs(least_y[r, q]) / size * rest_by[r, q, j]
+        if found <= lower[cell]:
+            continue
         lower[cell] = found
         for j in range(n):
             a = 0.0

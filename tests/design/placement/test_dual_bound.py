@@ -1,0 +1,77 @@
+"""Bounds of cells by duality: exact at a place, below every placement in a cell that keeps the limit."""
+
+import numpy as np
+import pytest
+
+from workbench.design.placement.cell_bounds import SINGULAR, Intervals
+from workbench.design.placement.certificate import certify
+from workbench.design.placement.dual_bound import dual_bound
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.placement import place, placement_task
+from workbench.design.placement.task import batch_costs
+from workbench.structure.member import Beam
+
+
+@pytest.fixture(scope="module")
+def task():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+    return placement_task(modes, 4, impulse_at=6.3, weight=20.0)
+
+
+def bound_of(task, table, cell, half, effort):
+    values, vectors = np.linalg.eigh(task.force_gramian)
+    shapes = tuple(
+        np.ascontiguousarray(part[cell])
+        for part in (table.value, table.slope, table.bend, table.most_bend, table.most_rate)
+    )
+    root = np.ascontiguousarray((vectors / np.sqrt(values)).T)
+    transforms = np.ascontiguousarray(task.roots)
+    square = np.ascontiguousarray(task.force_gramian)
+    return dual_bound(half, shapes, transforms, square, root, np.sqrt(effort), SINGULAR, np.empty(cell.size))
+
+
+def drawn(rng, level):
+    centres = np.sort(rng.uniform(0.3, 9.7, 4))
+    return (centres / 10.0 * 2**level).astype(int) + 2**level - 1
+
+
+def test_a_cell_of_no_width_is_bounded_by_its_own_work(task):
+    table, rng = Intervals.of(task), np.random.default_rng(0)
+    for _ in range(50):
+        cell = drawn(rng, 8)
+        at = batch_costs(task, task.shapes(table.centre[cell][None]))
+        if np.isfinite(at.work[0]) and at.condition[0] < 1e4:
+            found = bound_of(task, table, cell, np.zeros(4), 1.5 * at.effort[0])
+            assert found == pytest.approx(np.sqrt(at.work[0]), rel=1e-6)
+            assert np.isinf(bound_of(task, table, cell, np.zeros(4), 0.9 * at.effort[0]))
+
+
+def test_no_placement_that_keeps_the_limit_is_below_the_bound(task):
+    table, rng = Intervals.of(task), np.random.default_rng(1)
+    counts = {"informative": 0, "refused": 0, "kept": 0}
+    for level in (4, 6, 7, 8):
+        for _ in range(80):
+            cell = drawn(rng, level)
+            centre, half = table.centre[cell], table.half[cell]
+            ends = np.array(np.meshgrid(*[(-1, 1)] * 4)).reshape(4, 16).T
+            places = centre + half * np.vstack([ends, rng.uniform(-1.0, 1.0, (300, 4))])
+            costs = batch_costs(task, task.shapes(places))
+            # limits that some placements in the cell just keep, and some that none keeps
+            effort = np.quantile(costs.effort, 0.05) if rng.random() < 0.7 else 0.3 * costs.effort.min()
+            found = bound_of(task, table, cell, half, effort)
+            kept = costs.effort <= effort
+            assert (np.sqrt(costs.work[kept]) >= found * (1 - 1e-9)).all()
+            counts["informative"] += 0 < found < np.inf
+            counts["refused"] += np.isinf(found)
+            counts["kept"] += kept.any()
+    assert counts["informative"] > 20 and counts["refused"] > 20 and counts["kept"] > 100
+
+
+@pytest.mark.slow
+def test_six_actuators_are_proven_within_ten_per_cent():
+    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(10)
+    six = placement_task(modes, 6, impulse_at=6.3, weight=20.0)
+    even = six.placed(10.0 * np.arange(1, 7) / 7, "")
+    limits = Limits(effort=1.5 * even.effort, spacing=0.5)
+    proven = certify(six, limits, placement=place(six, limits), gap=0.10)
+    assert proven.complete and proven.better is None
