@@ -31,12 +31,19 @@ SPLINE_DEGREE = 7
 PEAK_ROUNDS = 4
 DRAWN = 4000  # random placements on a surface, of which the best are starts
 MOVES = 4  # of actuators from box to box around forbidden zones
+SAME = 1e-4  # of the size: optima that are one
+INSIDE = 0.02  # of the length: random starts keep so far from the ends of their reach
+POINTS = 40  # a half wave, where nodes are bracketed
+SPLINE_POINTS = {"interval": (15, 120), "side": (10, 30)}  # a mode or half wave, and besides: of the shapes' splines
+DIRECTIONS = 400  # a force, by which the instants of its peaks are chosen
+IPOPT = {"ipopt.max_iter": 200, "ipopt.tol": 1e-9}
+OFF_ENDS = 1e-3  # of a side: IPOPT's places keep so far inside
 ON_EDGE = 1e-6  # of a side: so near, an actuator stands on the edge of its box
 
 
 def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
     """Interior nodes (n_nodes,) of a mode (zero-based), m: zeros of its shape away from the held ends (5.6)."""
-    x = np.linspace(0.0, modes.length, 40 * (mode + 2) + 1)[1:-1]
+    x = np.linspace(0.0, modes.length, POINTS * (mode + 2) + 1)[1:-1]
     values = modes.phi(x)[:, mode]
     crossings = np.flatnonzero(np.sign(values[:-1]) * np.sign(values[1:]) < 0)
     roots = [brentq(lambda at: modes.phi(at)[0, mode], x[i], x[i + 1], xtol=1e-14 * modes.length) for i in crossings]
@@ -87,7 +94,7 @@ def place(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 
         if not np.isfinite(found.residual_work) or not limits.satisfied_by(found):
             continue
         positions = found.positions
-        if not any(np.abs(positions - p).max() < 1e-4 * size for p, _ in optima):
+        if not any(np.abs(positions - p).max() < SAME * size for p, _ in optima):
             optima.append((positions, found.residual_work))
             status = message
     if not optima:
@@ -118,7 +125,9 @@ def _guesses(
     nodes = nodes_of_mode(task.modes, n)
     if nodes.size == n:
         guesses.append(np.sort(nodes))
-    guesses += [np.sort(rng.uniform(margin + 0.02 * length, length - margin - 0.02 * length, n)) for _ in range(starts)]
+    guesses += [
+        np.sort(rng.uniform(margin + INSIDE * length, length - margin - INSIDE * length, n)) for _ in range(starts)
+    ]
     return [guess[:, None] for guess in guesses]
 
 
@@ -191,14 +200,18 @@ def _spline(task: PlacementTask) -> tuple[list[list[float]], ca.DM]:
     modes, domain = task.modes, task.modes.domain
     if isinstance(domain, Rectangle):
         waves = np.sqrt(modes.n_modes) * np.array(domain.length) / np.sqrt(np.prod(domain.length))
-        grids = [np.linspace(0.0, side, round(10 * n) + 30) for side, n in zip(domain.length, waves, strict=True)]
+        each, besides = SPLINE_POINTS["side"]
+        grids = [
+            np.linspace(0.0, side, round(each * n) + besides) for side, n in zip(domain.length, waves, strict=True)
+        ]
         values = task.shapes(np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1))
         along_x = make_interp_spline(grids[0], values, k=SPLINE_DEGREE, axis=0)
         along_y = make_interp_spline(grids[1], along_x.c, k=SPLINE_DEGREE, axis=1)
         knots = [list(along_x.t), list(along_y.t)]
         # SciPy puts the axis of the last interpolation first: y, then x, then the modes
         return knots, ca.DM(along_y.c.ravel())
-    grid = np.linspace(*task.reach, 60 * modes.n_modes // 4 + 120)
+    each, besides = SPLINE_POINTS["interval"]
+    grid = np.linspace(*task.reach, each * modes.n_modes + besides)
     spline = make_interp_spline(grid, task.shapes(grid), k=SPLINE_DEGREE)
     return [list(spline.t)], ca.DM(spline.c.ravel())
 
@@ -229,8 +242,7 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
         "ipopt.print_level": 0,
         "print_time": 0,
         "ipopt.sb": "yes",
-        "ipopt.max_iter": 200,
-        "ipopt.tol": 1e-9,
+        **IPOPT,
     }
     solver = ca.nlpsol("placement", "ipopt", problem, options)
     count, n_gaps = limited.shape[0], gaps.shape[0]
@@ -238,7 +250,9 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
     is_force = (np.arange(count) >= first_force) & (np.arange(count) < first_force + n_forces)
 
     def solve(guess: np.ndarray, homes: Sequence[Box], share: float) -> tuple[np.ndarray, str]:
-        low, high = (np.clip(np.concatenate([home[i] for home in homes]) / units, 1e-3, 1.0 - 1e-3) for i in (0, 1))
+        low, high = (
+            np.clip(np.concatenate([home[i] for home in homes]) / units, OFF_ENDS, 1.0 - OFF_ENDS) for i in (0, 1)
+        )
         result = solver(
             x0=np.clip(np.ravel(guess) / units, low, high),
             lbx=low,
@@ -283,5 +297,5 @@ def _usual_work(task: PlacementTask) -> float:
 
 def _extreme_instants(forces: np.ndarray) -> np.ndarray:
     """The instants that can decide the peak of any combination B⁻¹f: those on the hull of ±f, as directions see it."""
-    directions = np.random.default_rng(0).standard_normal((400 * forces.shape[0], forces.shape[0]))
+    directions = np.random.default_rng(0).standard_normal((DIRECTIONS * forces.shape[0], forces.shape[0]))
     return forces[:, np.unique(np.abs(directions @ forces).argmax(axis=1))]

@@ -20,6 +20,11 @@ PAIRS_SHOWN = 12  # of named points
 TWO_SIGMA = 4.0  # rise of the misfit
 NOISE, ALL_BUT = 0.1, 1e-5  # left by what may be one force: of the noise, and of the gap
 CHANCE = 3.0  # deviations of a sum of squares
+EDGE = 1e-4  # of the length: a place stays so far inside
+NEAR = 0.02  # of a rectangle's size: the first simplex about a peak
+SIMPLEX = {"fatol": 1e-2, "maxfev": 60}  # of the misfit, in squared deviations; evaluations
+CURVED_OVER = 0.1  # of that simplex: half of the stretch over which the misfit's curvature is taken
+BISECTIONS = 6  # of the distance at which the misfit has risen
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +151,18 @@ class _Search:
         extent = np.array(rectangle.length)
 
         def misfit(xy: np.ndarray) -> float:
-            inside = np.clip(xy, 1e-4 * extent, (1.0 - 1e-4) * extent)
+            inside = np.clip(xy, EDGE * extent, (1.0 - EDGE) * extent)
             return self.misfit(informative, (float(inside[0]), float(inside[1])))
 
-        reach = 0.02 * rectangle.size
+        reach = NEAR * rectangle.size
         simplex = np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-        options = {"initial_simplex": simplex, "xatol": 1e-3 * reach, "fatol": 1e-2, "maxfev": 60}
+        options = {"initial_simplex": simplex, "xatol": RESOLVED * reach, **SIMPLEX}
         found = minimize(misfit, top, method="Nelder-Mead", options=options)
-        at = np.clip(found.x, 1e-4 * extent, (1.0 - 1e-4) * extent)
-        rises = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in 0.1 * reach * np.array([(1, 0), (0, 1)])]
+        at = np.clip(found.x, EDGE * extent, (1.0 - EDGE) * extent)
+        step = CURVED_OVER * reach
+        rises = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
         flattest = max(min(rises), 1e-12)  # of |r|², twice the logarithm of a likelihood ratio
-        return (float(at[0]), float(at[1])), float(min(0.1 * reach * np.sqrt(2.0 / flattest), rectangle.size))
+        return (float(at[0]), float(at[1])), float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
 
     def refined(self, top: float) -> float:
         """The bottom of a valley."""
@@ -193,7 +199,7 @@ class _Search:
             if self.misfit(lines, at + side * outside) > level:
                 break
             inside, outside = outside, 2.0 * outside
-        for _ in range(6):
+        for _ in range(BISECTIONS):
             middle = 0.5 * (inside + outside)
             beyond = not 0 < at + side * middle < length or self.misfit(lines, at + side * middle) > level
             inside, outside = (inside, middle) if beyond else (middle, outside)
@@ -201,5 +207,5 @@ class _Search:
 
     def _inside(self, low: float, high: float) -> tuple[float, float]:
         length = self.evidence.domain.size
-        edge = 1e-4 * length
+        edge = EDGE * length
         return max(low, edge), min(high, length - edge)

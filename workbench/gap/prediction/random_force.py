@@ -20,11 +20,17 @@ from workbench.gap.prediction.unmodelled_force import (
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints, Where, same_place
 
-COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))
-LEVEL_SPREAD = 0.15
-WHITENED = 0.08
-FOLLOWS = 0.1
-TONAL = 0.7
+COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))  # memory, stages
+SIZES = (3e-3, 3e-2, 3e-1)  # of a typical force
+LONGEST_MEMORY = 0.9995  # a sample: beyond, the force is a drift
+FIRST_STEPS = {"place": 0.03, "log rms": 0.5, "logit of memory": 0.7}  # of the simplex; a place in shares of the extent
+SIMPLEX = {"xatol": 1e-4, "fatol": 0.1, "maxfev": 160}  # shares and logarithms; twice a log-likelihood; evaluations
+CURVED_OVER = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
+# What one force of the same strength in every record shows:
+LEVEL_SPREAD = 0.15  # of its rms between records, relative, at most
+WHITENED = 0.08  # mean square of each whitened residual, off one by at most
+FOLLOWS = 0.1  # share of it that inputs and motion account for, at most
+TONAL = 0.7  # share of it that one sinusoid accounts for, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +107,7 @@ def fit_random_force(
 
     def loss(point: np.ndarray, start: Where, stages: int, records: list[np.ndarray]) -> float:
         memory = 1.0 / (1.0 + np.exp(-point[d + 1]))
-        if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > 0.9995:
+        if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > LONGEST_MEMORY:
             return 1e300
         value = -2.0 * log_likelihood(filter_at(placed_at(point, start), point[d], memory, stages), records)
         return value if np.isfinite(value) else 1e300
@@ -110,12 +116,13 @@ def fit_random_force(
         (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], where, stages)
         for where in places
         for within in [_fractions(where, extent)]
-        for share in (3e-3, 3e-2, 3e-1)
+        for share in SIZES
         for memory, stages in COLOURS
     ]
     start, beside, stages = min(grid, key=lambda each: loss(each[0], each[1], each[2], quick))
-    simplex = start + np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, 0.03), 0.5, 0.7])])
-    options = {"initial_simplex": simplex, "xatol": 1e-4, "fatol": 0.1, "maxfev": 160}
+    place, log_size, logit_of_memory = FIRST_STEPS.values()
+    simplex = start + np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
+    options = {"initial_simplex": simplex, **SIMPLEX}
     found = minimize(loss, start, args=(beside, stages, residuals), method="Nelder-Mead", options=options)
     at, log_rms, logit = placed_at(found.x, beside), found.x[d], found.x[d + 1]
     memory = float(1.0 / (1.0 + np.exp(-logit)))
@@ -127,7 +134,7 @@ def fit_random_force(
         at=at,
         rms=float(np.exp(log_rms)),
         at_std=tuple(
-            _deviation(lambda p: loss(p, beside, stages, residuals), found.x, i, 2e-3) * float(extent[i])
+            _deviation(lambda p: loss(p, beside, stages, residuals), found.x, i, CURVED_OVER) * float(extent[i])
             for i in range(d)
         ),
         memory=memory,
