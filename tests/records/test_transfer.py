@@ -104,7 +104,7 @@ def test_lines_up_to_half_the_sample_rate(tmp_path):
     ("arrays", "match"),
     [
         ({"f": LINES[:-1], "H": SPECTRA}, "no axis is as long"),
-        ({"f": LINES[:2], "H": SPECTRA[:2, :, :2]}, "which axis they run along cannot be told"),
+        ({"f": LINES[:2], "H": SPECTRA[:2, :, :2]}, "which axis they run along is not clear"),
         ({"f": LINES, "w": LINES, "H": SPECTRA}, "two arrays of frequencies"),
         ({"f": LINES, "H": SPECTRA, "G": SPECTRA}, "several complex arrays"),
         ({"f": LINES[::-1], "H": SPECTRA}, "increase from line to line"),

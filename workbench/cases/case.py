@@ -287,7 +287,7 @@ def _sensor(entry: dict[str, Any], at: Place) -> Sensor:
         raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {shown(quantity)}")
     noise = number(entry, "noise_std", where, low=0.0)
     if noise == 0:
-        raise CaseError(f"{where}: noise_std must be positive; the diagnosis weighs every residual by it")
+        raise CaseError(f"{where}: noise_std must be positive; the diagnosis weights every residual by it")
     return Sensor(entry["name"], at, quantity, noise_std=noise)
 
 

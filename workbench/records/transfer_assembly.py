@@ -111,7 +111,7 @@ def _lines(path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], samp
 def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> np.ndarray:
     along = [axis for axis, size in enumerate(values.shape) if size == n_lines]
     if len(along) != 1 or values.ndim > 3:
-        which = "which axis they run along cannot be told" if along else "no axis is as long"
+        which = "which axis they run along is not clear" if along else "no axis is as long"
         raise RecordFileError(
             f"{path}, {name!r} has shape {values.shape} for {n_lines} lines: {which}; give (n_outputs, n_frequencies)"
             " or (n_outputs, n_references, n_frequencies)"

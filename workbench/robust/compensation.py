@@ -177,7 +177,7 @@ def _matrices(
     size = n_x + int(late.sum())
     estimator = loop.controller.estimator
     if estimator is None:
-        raise DesignError("the controller does not tell its estimator; make it by luenberger, kalman or filtered")
+        raise DesignError("the controller does not name its estimator; make it by luenberger, kalman or filtered")
     filters = loop.controller.state.size == 0
     turned = _as_read(loop, sensors, 0.5 * model.sample_time if aware and not filters else 0.0, aware, recalibrated)
     a, b, e = np.zeros((size, size)), np.zeros((size, n_y)), np.zeros((size, n_u))

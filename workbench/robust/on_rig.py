@@ -110,7 +110,7 @@ def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
     if isinstance(design, Controller):
         if design.designed_by is None:
             raise DesignError(
-                f"{design.name} does not tell how its estimator was designed: make it by luenberger, kalman or"
+                f"{design.name} does not say how its estimator was designed: make it by luenberger, kalman or"
                 " filtered(law, hermite_filter(...))"
             )
         return Loop(rig.modes, law, replace(design, law=linear, sensors=_same_sensors(rig, design.sensors)))

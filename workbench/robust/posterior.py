@@ -119,7 +119,7 @@ class UncertainRig:
                 continue
         raise ValueError(
             f"of {MOST_TRIES} draws of {' and '.join(e.label for e in self.effects)} none is a rig that can be: the"
-            " records hardly tell their sizes; measure more of them before a redesign"
+            " records hardly determine their sizes; measure more of them before a redesign"
         )
 
     @cached_property

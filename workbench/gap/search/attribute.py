@@ -118,7 +118,7 @@ def opened(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers:
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
-        raise ValueError(f"sensor {name} has no noise_std; the diagnosis weighs every residual by it")
+        raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
     seen, data = _plain_to_see(rig, FitData(tuple(records), noise, lead=round(settle / records[0].sample_time)))
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
     _ = evidence.at_peaks  # found once, before the work parts

@@ -79,7 +79,7 @@ class Task:
             raise ValueError(f"sensor {lost} has no place; give its channel `at`")
         n, m = modes.n_modes, modes.positions.size
         if m < 2:
-            raise ValueError("one sensor tells no shape; use two or more")
+            raise ValueError("one sensor shows no shape; use two or more")
         # The entry that a shape is measured by has no error of its own.
         reference = np.argmin(measured.shape_std, axis=0)
         shapes = (modes.shapes / modes.shapes[reference, np.arange(n)]).real

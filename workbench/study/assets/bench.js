@@ -49,14 +49,14 @@
     setting.laws.forEach(function (name) { html("option", {}, law, name); });
     law.value = design.law;
     law.addEventListener("change", function () { design.law = law.value; build(); ask(); });
-    var c = row("modes controlled"), told;
+    var c = row("modes controlled"), reading;
     count = html("input", { id: "controlled", type: "range", min: 1, max: setting.omega.length, value: design.controlled }, c);
-    told = html("output", {}, c, design.controlled);
+    reading = html("output", {}, c, design.controlled);
     count.addEventListener("input", function () {
       design.controlled = +count.value;
       while (design.weight.length < design.controlled) design.weight.push(design.weight[design.weight.length - 1]);
       design.weight.length = design.controlled;
-      told.textContent = count.value;
+      reading.textContent = count.value;
       weights();
       ask();
     });
@@ -67,12 +67,12 @@
     weights();
   }
   function ports(kind, text) {
-    var label = row(text), told = html("output", {}, label, design[kind].length);
+    var label = row(text), reading = html("output", {}, label, design[kind].length);
     [["−", -1], ["+", 1]].forEach(function (way) {
       html("button", { type: "button", "aria-label": (way[1] > 0 ? "add to " : "take from ") + kind }, label, way[0]).addEventListener("click", function () {
         if (way[1] < 0 && design[kind].length > (kind === "actuators" ? 1 : 0)) design[kind].pop();
         if (way[1] > 0 && design[kind].length < setting.most) design[kind].push(gap(design[kind]));
-        told.textContent = design[kind].length;
+        reading.textContent = design[kind].length;
         handles();
         ask();
       });
@@ -89,12 +89,12 @@
     sliders = [];
     var imsc = design.law === "IMSC", n = imsc ? design.controlled : 1;
     for (var r = 0; r < n; r++) (function (r) {
-      var label = row(imsc ? "R of mode " + (r + 1) : "R"), told;
+      var label = row(imsc ? "R of mode " + (r + 1) : "R"), reading;
       var slider = html("input", { type: "range", min: -2, max: 4, step: 0.02, value: Math.log10(design.weight[r]), "aria-label": "weight " + (r + 1) }, label);
-      told = html("output", {}, label, shown(design.weight[r]));
+      reading = html("output", {}, label, shown(design.weight[r]));
       slider.addEventListener("input", function () {
         design.weight[r] = +Math.pow(10, +slider.value).toPrecision(4);
-        told.textContent = shown(design.weight[r]);
+        reading.textContent = shown(design.weight[r]);
         ask();
       });
       sliders.push(label);
@@ -120,7 +120,7 @@
     line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
     free = svg("g", {}, stand);
     handles();
-    swing();
+    animate();
   }
   function handles() {
     if (!free) return;
@@ -163,7 +163,7 @@
     cards.stable.className = undamped ? "" : answer.stable ? "good" : "bad";
     reach = 1e-12;
     for (var k = 0; k < answer.time.length; k += 5) displaced(k).concat(idle(k)).forEach(function (w) { reach = Math.max(reach, Math.abs(w)); });
-    swing();
+    animate();
     var n = answer.by_mode.length, numbers = answer.by_mode.map(function (_, i) { return i + 1; }).slice(design.controlled);
     var work = answer.by_mode.slice(design.controlled).map(function (w) { return w || 0; }), top = Math.max.apply(null, work.concat([1e-300]));
     figure("work", { x: axis("residual mode", [design.controlled + 0.4, Math.max(n, design.controlled + 1) + 0.6], false, numbers.map(function (v) { return [v, String(v)]; })),
@@ -204,7 +204,7 @@
     });
     return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * q[r]; return w; });
   }
-  function swing() {
+  function animate() {
     if (!answer || !X) return;
     var k = Math.round(clock % 1 * (answer.time.length - 1)), size = (beamY - 40) / reach;
     [[line, displaced(k)], [still, idle(k)]].forEach(function (shape) {
@@ -213,7 +213,7 @@
     by("clock").textContent = "t = " + shown(answer.time[k]) + " s";
   }
   function step(now) {
-    if (playing && last !== null) { clock += (now - last) / 10000; swing(); }
+    if (playing && last !== null) { clock += (now - last) / 10000; animate(); }
     last = now;
     requestAnimationFrame(step);
   }
