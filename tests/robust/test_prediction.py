@@ -6,6 +6,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from workbench.design.estimation.digital import sampled
+from workbench.design.estimation.observers import kalman
+from workbench.design.laws.imsc import imsc
+from workbench.design.loop.rig_loop import LoopTest
 from workbench.draw.plot import plot
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
@@ -13,7 +17,9 @@ from workbench.rig.elements import RandomForce
 from workbench.rig.simulate import simulate
 from workbench.robust.check import check_prediction, log_test, read_log
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.prediction import predict
+from workbench.robust.prediction import predict, predict_loop
+from workbench.trials.controlled import control_plant
+from workbench.trials.plant import Plant
 
 NOISE, SPREAD = 2e-4, 0.1  # of the sensors, m; of ln gain
 
@@ -61,6 +67,26 @@ def test_bands_hold_what_they_say_on_plants_drawn_from_what_is_possible(plain, s
         told = predict(uncertain(plain, unexplained=share), new, draws=60, seed=k)
         shares.append(check_prediction(told, new).overall)
     assert 0.90 < np.mean(shares) < 0.99
+
+
+def test_bands_of_a_controlled_test_hold_plants_of_another_numerical_route(plain):
+    """The gain of the actuator is in the loop: the feedback itself is uncertain."""
+    rng = np.random.default_rng(7)
+    law = imsc(plain.modes, 1, plain.actuators, weight=0.05)
+    controller = sampled(kalman(plain.modes, law, plain.sensors, disturbance=1.0, noise=1e-4), 0.01)
+    test = LoopTest(250, 0.01, impulse_at=plain.actuators[0].at, impulse=0.05)
+    told = predict_loop(uncertain(plain), controller, test, draws=100, seed=2)
+    shares = []
+    for _ in range(6):
+        real = gain_of(float(np.exp(SPREAD * rng.normal()))).apply(plain)
+        plant = Plant(plain, real.actuators, real.sensors, plain.modes.n_modes).solved()
+        run = control_plant(plant, controller, n_samples=250, struck="F1", impulse=0.05, rng=rng)
+        shares.append(told.coverage(run.outputs)[:, 0].mean())
+    assert 0.90 < np.mean(shares) < 0.99
+    certain = predict_loop(uncertain(plain, spread=0.0), controller, test, draws=60)
+    assert certain.relative_width.mean() < 0.8 * told.relative_width.mean()
+    quiet = predict_loop(uncertain(plain), controller, test, draws=60, noise_std=[0.0, 0.0])
+    assert np.median(quiet.upper - quiet.lower) < np.median(told.upper - told.lower)
 
 
 def test_a_model_holds_on_its_own_tests_and_not_on_others(plain):

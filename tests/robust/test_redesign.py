@@ -127,3 +127,13 @@ def test_a_sensor_that_drifts_is_left_out(rig, controller):
     assert found.steps[-1].name == "without d2" and found.steps[-1].kept
     assert "d2" not in found.redesigned.sensors
     assert found.steps[-1].loss < 0.01 * found.steps[0].loss
+
+
+def test_an_estimator_that_is_too_slow_for_a_late_loop_is_made_faster(rig, controller):
+    late = possible(rig, effect("actuator_delay", "all", delay=2.0 * DT))
+    found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False)
+    compensated = next(step for step in found.steps if step.name == "delay")
+    faster = next(step for step in found.steps if step.name == "estimator")
+    assert faster.kept and faster.loss < 0.2 * compensated.loss
+    assert found.proof.stable.all()
+    assert found.after.effort == faster.effort

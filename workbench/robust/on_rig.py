@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -221,6 +222,16 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
     sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
     controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
     return Loop(modes, law, controller)
+
+
+def with_noise(loop: Loop, rig: Rig, factor: float) -> Loop | None:
+    """The loop with its Kalman filter designed for a multiple of the readings' noise; None where there is none."""
+    design: Any = loop.controller.designed_by
+    keywords = getattr(design, "keywords", {})
+    if "noise" not in keywords:
+        return None
+    other = partial(design.func, **{**keywords, "noise": factor * np.asarray(keywords["noise"])})
+    return designed_anew(loop._replace(controller=replace(loop.controller, designed_by=other)), rig, loop.modes)
 
 
 def _estimated(

@@ -6,13 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.design.estimation.digital import DigitalController
+from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loops
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import Motion, read, simulate
 from workbench.robust.posterior import UncertainRig
+from workbench.robust.proof import drawn_with_errors
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, counted
 from workbench.threads import one_blas_thread
@@ -123,25 +126,12 @@ def predict(
     Raises:
         ValueError: inputs that do not fit the rig, too few draws, or hardly any draw with a bounded motion.
     """
-    found = rig if isinstance(rig, UncertainRig) else UncertainRig.of(rig)
-    if noise_std is None and isinstance(rig, Verdict) and rig.budget.noise_found:
-        noise_std = rig.budget.noise_found
+    found, spread = _found(rig, noise_std)
     sent, period, hold, start = _inputs(found.nominal, inputs, sample_time)
-    spread = _noise(found.nominal, noise_std)
     n_outputs, n_samples = spread.size, sent.shape[1]
-    if draws < LEAST_DRAWS:
-        raise ValueError(f"bands of {100 * LEVEL:g} % need {LEAST_DRAWS} draws or more; got {draws}")
-    most = MOST_NUMBERS // (n_outputs * n_samples)
-    if most < LEAST_DRAWS:
-        raise ValueError(
-            f"{n_samples} samples of {n_outputs} sensors are too many for {LEAST_DRAWS} draws; predict at most"
-            f" {MOST_NUMBERS // (n_outputs * LEAST_DRAWS)} samples at a time"
-        )
     rng = np.random.default_rng(seed)
-    frequencies = np.asarray(np.fft.rfftfreq(n_samples, period), float)
-    bands = _bands(found.rig.modes, frequencies)
-    truths, notes, away = [], [], 0
-    rigs = found.draws(min(draws, most), rng)
+    truths = []
+    rigs = found.draws(_draws(draws, n_outputs, n_samples), rng)
     for i, drawn in enumerate(rigs):
         if report is not None:
             report("predicting", i / len(rigs))
@@ -151,31 +141,140 @@ def predict(
                 truth = simulate(quiet, forces, sample_time=period, input_hold=hold).outputs
             except ValueError:  # a record holds no infinite readings
                 truth = np.full((n_outputs, n_samples), np.inf)
-        if not np.abs(truth).max() < RUN_AWAY:
-            away += 1
-            continue
-        truths.append(truth + _unexplained(truth, found.unexplained, frequencies, bands, rng))
-    if away > len(rigs) // 10:
+        truths.append(truth)
+    time = np.asarray(start + period * np.arange(n_samples), float)
+    name = inputs.name if isinstance(inputs, Record) else "prediction"
+    return _banded(found, found.rig, truths, time, spread, rng, name)
+
+
+@one_blas_thread
+def predict_loop(
+    rig: Verdict | UncertainRig,
+    controller: DigitalController,
+    test: LoopTest,
+    *,
+    noise_std: Sequence[float] | Floats | None = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+) -> Prediction:
+    """What the sensors of a controller will read in a controlled test to come, with 95 % bands over time and frequency.
+
+    Each draw of the rig is simulated in the loop, its sensors' noise fed back; what is left unexplained is an error of
+    the gains that the loop feels, and one of the readings as in `predict`.
+
+    Args:
+        rig: a verdict, or the uncertain rig that it leaves.
+        controller: of the test's sample time.
+        test: what the loop is put through.
+        noise_std: (n_outputs,) of all the rig's sensors; as the verdict found it, or as they state it.
+        draws: of the rig.
+        seed: of the draws and of the noise.
+
+    Raises:
+        ValueError: a controller or a test that does not fit the rig, too few draws, or hardly any with a bounded
+            motion.
+    """
+    found, noise = _found(rig, noise_std)
+    n_outputs, n_samples = len(controller.sensors), test.n_samples
+    rigs = [_with_noise(drawn, noise) for drawn in drawn_with_errors(found, _draws(draws, n_outputs, n_samples), seed)]
+    runs = run_loops(rigs, controller, replace(test, seed=seed))
+    truths = [_loop_truth(drawn, run, controller, test.sample_time) for drawn, run in zip(rigs, runs, strict=True)]
+    sensors = _with_noise(found.rig, noise).sensors
+    read_by = replace(found.rig, sensors=tuple(named(sensors, name) for name in controller.sensors))
+    spread = np.array([s.noise_std for s in read_by.sensors])
+    rng = np.random.default_rng([seed, 1])
+    return _banded(found, read_by, truths, test.time, spread, rng, controller.name)
+
+
+def _found(rig: Verdict | UncertainRig, noise_std: Sequence[float] | Floats | None) -> tuple[UncertainRig, Floats]:
+    """The uncertain rig, and the noise of its sensors: as given, as the verdict found it, or as they state it."""
+    found = rig if isinstance(rig, UncertainRig) else UncertainRig.of(rig)
+    if noise_std is None and isinstance(rig, Verdict) and rig.budget.noise_found:
+        noise_std = rig.budget.noise_found
+    return found, _noise(found.nominal, noise_std)
+
+
+def _with_noise(rig: Rig, noise: Floats) -> Rig:
+    sensors = tuple(replace(s, noise_std=float(n)) for s, n in zip(rig.sensors, noise, strict=True))
+    return replace(rig, sensors=sensors)
+
+
+def _draws(wanted: int, n_outputs: int, n_samples: int) -> int:
+    """How many draws: as wanted, or as many as can be held at a time."""
+    if wanted < LEAST_DRAWS:
+        raise ValueError(f"bands of {100 * LEVEL:g} % need {LEAST_DRAWS} draws or more; got {wanted}")
+    most = MOST_NUMBERS // (n_outputs * n_samples)
+    if most < LEAST_DRAWS:
         raise ValueError(
-            f"{away} of {len(rigs)} rigs that the diagnosis leaves possible run away under these inputs; predict a"
-            " weaker test, or measure more first"
+            f"{n_samples} samples of {n_outputs} sensors are too many for {LEAST_DRAWS} draws; predict at most"
+            f" {MOST_NUMBERS // (n_outputs * LEAST_DRAWS)} samples at a time"
+        )
+    return min(wanted, most)
+
+
+def _loop_truth(rig: Rig, run: LoopRun, controller: DigitalController, sample_time: float) -> Floats:
+    """What the controller's sensors (n_outputs, n_samples) read of a run, noise, clipping and rounding apart."""
+    rows = [[s.name for s in rig.sensors].index(name) for name in controller.sensors]
+    if not run.bounded:
+        return np.full((len(rows), run.commands.shape[1]), np.inf)
+    n = rig.modes.n_modes
+    forces = run.into @ run.response.forces
+    stiffness = np.asarray(rig.modes.omega[:, None] ** 2, float)
+    motion = Motion(run.response.modal[:n], run.response.modal[n:], forces, stiffness, rig.modes.damping, held=True)
+    plain = replace(rig, sensors=tuple(replace(s, limit=np.inf, step=0.0) for s in rig.sensors))
+    return np.asarray(read(plain, motion, sample_time=sample_time)[rows], float)
+
+
+def _banded(
+    found: UncertainRig,
+    rig: Rig,
+    possible: Sequence[Floats],
+    time: Floats,
+    spread: Floats,
+    rng: np.random.Generator,
+    name: str,
+) -> Prediction:
+    """The bands of what the sensors of a rig read in each draw, (n_outputs, n_samples); draws that run away left out.
+
+    Args:
+        found: whose unexplained share is allowed for.
+        rig: whose sensors read.
+        possible: noise apart, a draw each.
+        time: (n_samples,) s.
+        spread: (n_outputs,) of the noise.
+        rng: of the noise.
+        name: of what is predicted.
+    """
+    period = float(time[1] - time[0])
+    frequencies = np.asarray(np.fft.rfftfreq(time.size, period), float)
+    bands = _bands(rig.modes, frequencies)
+    truths = [
+        truth + _unexplained(truth, found.unexplained, frequencies, bands, rng)
+        for truth in possible
+        if np.abs(truth).max() < RUN_AWAY
+    ]
+    notes, away = [], len(possible) - len(truths)
+    if away > len(possible) // 10:
+        raise ValueError(
+            f"{away} of {len(possible)} rigs that the diagnosis leaves possible run away in this test; predict a weaker"
+            " one, or measure more first"
         )
     if away:
-        notes.append(f"{away} of {len(rigs)} draws run away and are left out.")
+        notes.append(f"{away} of {len(possible)} draws run away and are left out.")
     if not found.explained:
         notes.append(
             "The diagnosis leaves the gap unexplained:"
             f" {100 * found.unexplained:.3g} % of the readings are allowed for, of any phase and in any band."
         )
     readings = np.array(truths)
-    low, middle, high = _over_time(readings, found.rig, spread, rng)
+    low, middle, high = _over_time(readings, rig, spread, rng)
     for i, truth in enumerate(readings):
-        readings[i] = _read(truth, found.rig, spread, rng)
+        readings[i] = _read(truth, rig, spread, rng)
     sizes = np.array([amplitudes(reading) for reading in readings])
     spectrum = np.quantile(sizes, QUANTILES, axis=0, method="weibull")
     prediction = Prediction(
-        np.asarray(start + period * np.arange(n_samples), float),
-        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(found.nominal.sensors, spread)),
+        time,
+        tuple(Channel(s.name, s.quantity, at=s.at, noise_std=n) for s, n in zip(rig.sensors, spread)),
         middle,
         low,
         high,
@@ -184,8 +283,8 @@ def predict(
         spectrum[0],
         spectrum[2],
         bands,
-        np.zeros((0, n_outputs, 1 + len(bands))),
-        inputs.name if isinstance(inputs, Record) else "prediction",
+        np.zeros((0, len(rig.sensors), 1 + len(bands))),
+        name,
         tuple(notes),
     )
     return replace(prediction, expected=np.array([prediction.coverage(reading) for reading in readings]))

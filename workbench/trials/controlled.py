@@ -23,6 +23,7 @@ class Controlled:
         peak_force: of any actuator, N.
         bounded: whether the energy stayed within a million times that of the impulse.
         sample_time: s.
+        outputs: (n_outputs, n_samples) what the controller's sensors read.
     """
 
     energy: np.ndarray
@@ -31,6 +32,7 @@ class Controlled:
     peak_force: float
     bounded: bool
     sample_time: float
+    outputs: np.ndarray
 
     @property
     def vibration(self) -> float:
@@ -83,12 +85,14 @@ def control_plant(
     headed_for = (np.zeros(m), np.zeros(m), np.zeros(1))
     sums = (np.zeros(m), np.zeros(m), np.zeros(n), np.zeros(m))
     z, followed = np.zeros(controller.a.shape[0]), np.zeros(len(commanded))
-    energy = np.zeros(n_samples)
+    energy, outputs = np.zeros(n_samples), np.zeros((len(controller.sensors), n_samples))
     for k in range(n_samples):
         energy[k] = 0.5 * float(y[n : 2 * n] @ y[n : 2 * n] + omega2 @ y[:n] ** 2)
         if not energy[k] < RUN_AWAY * given:
-            return Controlled(energy[: k + 1], sums[2], float(sums[1].sum()), float(sums[3].max()), False, dt)
-        command, followed, z = controller.step(z, followed, reading.at(k, y, pieces))
+            given_up = energy[: k + 1], sums[2], float(sums[1].sum()), float(sums[3].max()), False, dt, outputs[:, :k]
+            return Controlled(*given_up)
+        outputs[:, k] = reading.at(k, y, pieces)
+        command, followed, z = controller.step(z, followed, outputs[:, k])
         commands = np.zeros(m)
         commands[commanded] = command
         motion.aim(commands, drive, earlier, hysteresis, now)
@@ -96,7 +100,7 @@ def control_plant(
         motion.interval(
             k, y, system, drive[1][:, 3], aims, headed_for, held[k], dt, edges, steps, work, pieces[k], sums
         )
-    return Controlled(energy, sums[2], float(sums[1].sum()), float(sums[3].max()), True, dt)
+    return Controlled(energy, sums[2], float(sums[1].sum()), float(sums[3].max()), True, dt, outputs)
 
 
 class _Reading:
