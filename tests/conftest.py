@@ -1,9 +1,14 @@
-"""The beam that most rigs of the tests are built on."""
+"""The order of the tests, and the beam that most of their rigs are built on."""
 
 import pytest
 
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Whole studies first: they are the longest, and two workers then end together."""
+    items.sort(key=lambda item: item.path.name != "test_studies.py")
 
 
 @pytest.fixture(scope="session")
