@@ -40,6 +40,21 @@ def test_time_that_suffices_changes_nothing():
     assert np.array_equal(limited.modes.omega, unlimited.modes.omega) and not limited.remarks
 
 
+@pytest.mark.parametrize("seconds", [None, 5.0])
+def test_progress_is_a_share_that_grows(seconds):
+    """Without a limit there is no share: what is being searched is said all the same."""
+    met = []
+    wb.ring_down(
+        free_decay(MODES, sample_time=0.01, n_samples=600, noise_std=0.01),
+        seconds=seconds,
+        progress=lambda what, share: met.append((what, share)),
+    )
+    shares = [share for _, share in met]
+    assert shares == sorted(shares) and 0.0 <= shares[0] and shares[-1] <= 1.0
+    assert (shares[-1] > 0.0) == (seconds is not None)
+    assert {"search for further modes"} <= {what for what, _ in met}
+
+
 @pytest.mark.parametrize("seconds", [0.0, -1.0])
 def test_no_time_at_all_is_refused(seconds):
     with pytest.raises(ValueError, match="seconds must be positive"):

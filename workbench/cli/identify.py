@@ -6,7 +6,18 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from workbench.cli.terminal import JsonPath, console, guarded, names_in, progress_bar, reporter, say, write_json
+from workbench.cli.terminal import (
+    JsonPath,
+    Memory,
+    console,
+    guarded,
+    names_in,
+    progress_bar,
+    reporter,
+    say,
+    short,
+    write_json,
+)
 
 
 @guarded
@@ -32,6 +43,12 @@ def identify(
         tuple[float, float] | None,
         typer.Option(metavar="LOW HIGH", help="Frequency band of transfer functions to fit."),
     ] = None,
+    seconds: Annotated[float, typer.Option(help="Processor time to search for, s.")] = 30.0,
+    memory: Memory = 1.0,
+    page: Annotated[
+        Path | None,
+        typer.Option("--page", help="HTML file to write: shapes, MAC, stabilisation diagram, frequency response."),
+    ] = None,
     json_path: JsonPath = None,
 ) -> None:
     """Identify modes from free decays, driven or ambient records, or transfer functions, with standard errors.
@@ -40,17 +57,24 @@ def identify(
     """
     from workbench.identification.signal.modal_estimates import HEADINGS
     from workbench.records.files import read_measured
+    from workbench.records.limits import Limits
     from workbench.study.identification_report import identification_report
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
+    check_target(page)
+    limits = Limits.of_gib(memory)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
-        read = [read_measured(path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs)) for path in records]
+        read = [
+            read_measured(path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=limits)
+            for path in records
+        ]
         if outputs:
             read = [measured.only(names_in(outputs)) for measured in read]
-        report("identifying modes", 0.1)
-        found = identification_report(read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz)
+        found = identification_report(
+            read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
+        )
     table = Table(box=None, pad_edge=False)
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
@@ -59,7 +83,13 @@ def identify(
     say(found.heading, bold=True)
     console.print(table)
     for line in found.lines:
-        say(f"  {line}")
+        say(f"  {line.replace('`seconds`', '--seconds')}")
     for remark in dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ())):
         say(f"  as read: {remark}")
+    if page is not None:
+        from workbench.study.identification_page import identification_page
+        from workbench.study.page import write_page
+
+        made_by = " ".join(["workbench identify", *map(str, records)])
+        say(f"  page {short(write_page(page, identification_page(found, read, made_by=made_by)))}")
     write_json(json_path, {**found.content, "heading": found.heading, "lines": found.lines})

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from workbench.cli.terminal import PagePath, console, guarded, names_in, say, short
+from workbench.cli.terminal import Memory, PagePath, console, guarded, names_in, say, short
 
 
 @guarded
@@ -16,6 +16,7 @@ def look(
         float | None, typer.Option(help="Sampling rate, where the file has no time axis.")
     ] = None,
     inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Channels that are inputs.")] = "",
+    memory: Memory = 1.0,
     page: PagePath = None,
 ) -> None:
     """Show what a measured file holds: channels, rate, length, levels, spectrum, faults, and the command to go on with.
@@ -23,10 +24,11 @@ def look(
     Example: workbench look ringdown.csv
     """
     from workbench.records.files import read_measured
+    from workbench.records.limits import Limits
     from workbench.study.look import HEADINGS, look_at
     from workbench.study.page import write_page
 
-    measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs))
+    measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=Limits.of_gib(memory))
     seen = look_at(measured, file)
     table = Table(box=None, pad_edge=False)
     for heading in HEADINGS:

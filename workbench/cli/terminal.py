@@ -17,6 +17,7 @@ OPTIONS = {"sample_rate_hz": "--sample-rate-hz", "n_modes": "--modes", "band_hz"
 WIDE = 150  # columns of a table that goes to a file or a pipe
 
 JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
+Memory = Annotated[float, typer.Option(help="Memory that reading a file may take, GiB.")]
 PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
 
 console = Console(soft_wrap=True, highlight=False)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.output_only.subspace import StablePole, Subspace
-from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes
 from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.projection import project
@@ -91,6 +91,7 @@ def identify_ambient(
     references: Sequence[str] | None = None,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
+    progress: Progress | None = None,
 ) -> AmbientModes:
     """The modes of a structure under unknown broadband forces, each with its standard error.
 
@@ -103,11 +104,12 @@ def identify_ambient(
         false_alarm: chance that noise alone is taken for a mode.
         seconds: of processor time, after which standard errors come from fewer parts of the record, with a remark;
             None for no limit.
+        progress: called with the search under way and the share of the time that is spent.
 
     Raises:
         ValueError: as `correlation_functions`; no mode found, or fewer than asked for.
     """
-    budget = Budget(seconds)
+    budget = Budget(seconds, progress)
     lags, rows = _lags(record, longest, references)
     decays = _as_records(record, _correlations(record, lags, rows, 1)[0] / record.n_samples, rows)
     subspace = Subspace(_directions(record), record.sample_time)

@@ -18,7 +18,7 @@ from workbench.identification.input_output.modal_fit import Fit, projected, sett
 from workbench.identification.input_output.mode_clusters import overlap_remarks
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
-from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.modal_estimates import ModalEstimates, credible, normalised_shapes
 from workbench.identification.signal.order_selection import FALSE_ALARM
@@ -140,6 +140,7 @@ def identify_driven(
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
+    progress: Progress | None = None,
 ) -> Driven:
     """The modes between inputs and outputs, as many as there are, with participation factors and standard errors.
 
@@ -156,6 +157,7 @@ def identify_driven(
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
         seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
+        progress: called with the search under way and the share of the time that is spent.
 
     Returns:
         `Driven`. Its standard errors hold in noise of any smooth spectrum.
@@ -163,7 +165,7 @@ def identify_driven(
     Raises:
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
     """
-    budget = Budget(seconds)
+    budget = Budget(seconds, progress)
     records = [records] if isinstance(records, Record) else list(records)
     check_same_sensors(records)
     _check_inputs(records)

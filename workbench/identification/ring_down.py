@@ -15,7 +15,7 @@ from workbench.identification.free_decay.refined import Identified, Refined, in_
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.free_decay.remarks import SURE, remarks
 from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
-from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
 from workbench.identification.signal.decay import decay_start
 from workbench.identification.signal.modal_estimates import ModalEstimates
@@ -86,6 +86,7 @@ def ring_down(
     start: float | None = None,
     n_modes: int | None = None,
     seconds: float | None = SECONDS,
+    progress: Progress | None = None,
 ) -> RingDown:
     """The modes of records that become free decay.
 
@@ -97,12 +98,13 @@ def ring_down(
         start: where the decay is free, s, in every record; found in each unless given.
         n_modes: number of modes; selected unless given.
         seconds: of processor time, after which the best so far is returned, with a note; None for no limit.
+        progress: called with the search under way and the share of the time that is spent.
 
     Raises:
         ValueError: records that differ in sensors or rate; a faulty channel; too few samples; nothing that decays
             freely.
     """
-    budget = Budget(seconds)
+    budget = Budget(seconds, progress)
     records = [records] if isinstance(records, Record) else list(records)
     check_same_sensors(records)
     cut, notes = [], []

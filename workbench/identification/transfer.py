@@ -19,7 +19,7 @@ from workbench.identification.input_output.modal_fit import Fit, projected, sett
 from workbench.identification.input_output.mode_clusters import NARROW, overlap_remarks, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
-from workbench.identification.signal.budget import SECONDS, Budget
+from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes
 from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.synthesis import time_derivatives
@@ -112,6 +112,7 @@ def identify_transfer(
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
+    progress: Progress | None = None,
 ) -> TransferModes:
     """The modes of measured transfer functions, as many as there are, each with its standard error.
 
@@ -130,11 +131,12 @@ def identify_transfer(
         most_modes: of a band, where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
         seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
+        progress: called with the search under way and the share of the time that is spent.
 
     Raises:
         ValueError: shapes that do not fit, values that are not finite, a band with too few lines, no mode.
     """
-    budget = Budget(seconds)
+    budget = Budget(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
     n_bands, each_own = (1, 3) if f.size <= MOST_LINES else (-(-f.size // BAND), LINES_A_MODE)
     found, share = [], f.size / n_bands

@@ -32,6 +32,11 @@ class Limits:
             if not 0 < getattr(self, name) < np.inf:
                 raise ValueError(f"the limit of {name} must be positive; got {getattr(self, name)}")
 
+    @classmethod
+    def of_gib(cls, memory: float) -> "Limits":
+        """Limits of memory in GiB, the time as ever."""
+        return cls(memory=memory * 2.0**30)
+
     @property
     def most_numbers(self) -> int:
         """Numbers that a record may have."""

@@ -10,6 +10,7 @@ from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.free_decay.proportional import ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
+from workbench.identification.signal.budget import SECONDS, Progress
 from workbench.identification.signal.data_quality import check_data_quality
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.transfer import TransferModes, identify_transfer
@@ -32,12 +33,14 @@ class IdentificationReport:
         rows: one a mode, under `HEADINGS`; figures to the second digit of their standard errors.
         lines: remarks.
         content: for JSON.
+        decays: free decays that the modes are of, or correlation functions that decay alike; none of other data.
     """
 
     heading: str
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[str, ...]
     content: dict[str, Any]
+    decays: tuple[Record, ...] = ()
 
 
 def identification_report(
@@ -47,6 +50,8 @@ def identification_report(
     n_modes: int | None = None,
     ambient: bool = False,
     band_hz: tuple[float, float] | None = None,
+    seconds: float = SECONDS,
+    progress: Progress | None = None,
 ) -> IdentificationReport:
     """The modes of transfer functions, or of records: driven where inputs move, by unknown forces with `ambient`, else
     free decays.
@@ -57,11 +62,14 @@ def identification_report(
         n_modes: number of modes; in driven records and transfer functions, at most.
         ambient: whether unknown broadband forces drive the record all along.
         band_hz: lowest and highest line to fit, of transfer functions.
+        seconds: of processor time, after which the best so far is reported.
+        progress: as in `identify_driven`.
 
     Raises:
         ValueError: as `ring_down`, `identify_driven`, `identify_ambient`, `identify_transfer`; ambient records that are
             two or have inputs; options that belong to the other kind.
     """
+    on: dict[str, Any] = {"seconds": seconds, "progress": progress}
     transfer = [one for one in measured if isinstance(one, TransferFunctions)]
     if transfer:
         if len(measured) > 1:
@@ -70,27 +78,27 @@ def identification_report(
             raise ValueError("transfer functions have no time: leave --start and --ambient out; --band-hz sets a band")
         one, most = transfer[0], MOST_MODES if n_modes is None else n_modes
         found = identify_transfer(
-            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, most_modes=most
+            one.values, one.frequencies_hz, channels=one.output_channels, band_hz=band_hz, most_modes=most, **on
         )
         return of_transfer(found, one)
     if band_hz is not None:
         raise ValueError("--band-hz is for transfer functions; a record has none: resample it, or take all its modes")
     records = [one for one in measured if isinstance(one, Record)]
     if not ambient and not any(record.inputs.any() for record in records):
-        return of_ring_down(ring_down(records, start=start, n_modes=n_modes))
+        return of_ring_down(ring_down(records, start=start, n_modes=n_modes, **on))
     if start is not None:
         records = [record.between(start) for record in records]
     for record in records:
         check_data_quality(record)
     if not ambient:
         most = MOST_MODES if n_modes is None else n_modes
-        return of_driven(identify_driven(records, most_modes=most), records)
+        return of_driven(identify_driven(records, most_modes=most, **on), records)
     if len(records) > 1 or records[0].n_inputs:
         raise ValueError(
             f"ambient forces are unknown and act all along one record; got {len(records)} records with"
             f" {records[0].n_inputs} inputs: give one record, no inputs"
         )
-    return of_ambient(identify_ambient(records[0], n_modes=n_modes), records[0])
+    return of_ambient(identify_ambient(records[0], n_modes=n_modes, **on), records[0])
 
 
 def of_ring_down(decay: RingDown) -> IdentificationReport:
@@ -123,7 +131,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
         "notes": decay.notes,
         "converged": found.converged,
     }  # fmt: skip
-    return _report(decay.records, found, lines, content)
+    return _report(decay.records, found, lines, content, decay.records)
 
 
 def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
@@ -142,8 +150,8 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
 
 def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
     """A record under unknown broadband forces."""
-    lines = ["modes and standard errors by the likelihood of the spectrum", *found.remarks]
-    return _report([record], found, lines, _content(record.output_channels, found))
+    lines = ["poles by canonical variate analysis, standard errors by leaving out parts of the record", *found.remarks]
+    return _report([record], found, lines, _content(record.output_channels, found), found.decays)
 
 
 def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
@@ -205,7 +213,11 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
 
 
 def _report(
-    records: Sequence[Record], found: ModalEstimates, lines: Sequence[str], content: dict[str, Any]
+    records: Sequence[Record],
+    found: ModalEstimates,
+    lines: Sequence[str],
+    content: dict[str, Any],
+    decays: tuple[Record, ...] = (),
 ) -> IdentificationReport:
     first = records[0]
     samples = sum(record.n_samples for record in records)
@@ -213,7 +225,7 @@ def _report(
     sensors = _counted(first.n_outputs, "sensor")
     since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
     heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
-    return IdentificationReport(heading, tuple(rows_of(found)), tuple(lines), content)
+    return IdentificationReport(heading, tuple(rows_of(found)), tuple(lines), content, decays)
 
 
 def _counted(number: int, what: str) -> str:

@@ -148,7 +148,7 @@ def _verdict(content: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _identified(content: dict[str, Any]) -> dict[str, Any]:
+def identified(content: dict[str, Any]) -> dict[str, Any]:
     """The modes of a record."""
     shapes = np.array(content["shapes_real"], float) + 1j * np.array(content["shapes_imag"], float)
     hertz = np.array(content["frequencies_hz"], float)
@@ -172,7 +172,16 @@ def _identified(content: dict[str, Any]) -> dict[str, Any]:
         "lead": _words([content.get("heading", "")])[0],
         "lines": _words(content.get("lines", [])),
         "blocks": blocks,
-        "tables": [("Modes", heads, [[r + 1, *row] for r, row in enumerate(zip(*columns, strict=True))])],
+        "tables": [
+            (
+                "Modes",
+                heads,
+                [
+                    [r + 1, *to_its_error(f, f_std), *to_its_error(zeta, zeta_std)]
+                    for r, (f, f_std, zeta, zeta_std) in enumerate(zip(*columns, strict=True))
+                ],
+            )
+        ],
     }
 
 
@@ -288,7 +297,7 @@ def _anything(content: dict[str, Any]) -> dict[str, Any]:
 
 KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "sentence": _verdict,
-    "shapes_real": _identified,
+    "shapes_real": identified,
     "laws": _designed,
     "placements": _placed,
     "checks": _studied,

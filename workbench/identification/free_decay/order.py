@@ -22,7 +22,7 @@ from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refined import Identified, in_coloured_noise, unshaped
 from workbench.identification.free_decay.refinement import MOST_STEPS, refine, search
-from workbench.identification.signal.budget import SEARCH, SECONDS, Budget
+from workbench.identification.signal.budget import SEARCH, SECONDS, Budget, Progress
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
 from workbench.identification.signal.noise import differ, variances, whitened
 from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, Stepwise, spurious_modes
@@ -61,6 +61,7 @@ def identify(
     most_modes: int | None = None,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
+    progress: Progress | None = None,
 ) -> Identified:
     """The modes that a free decay holds, as many as there are, each with its standard error.
 
@@ -71,13 +72,14 @@ def identify(
         most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
         false_alarm: chance that noise alone is taken for a mode.
         seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
+        progress: called with the search under way and the share of the time that is spent.
 
     Raises:
         ValueError: no mode rises above the noise; a faulty channel (`check_data_quality`); records that differ in
             sensors or rate; too few samples.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    found = identify_within(records, Budget(seconds), most_modes=most_modes, false_alarm=false_alarm)
+    found = identify_within(records, Budget(seconds, progress), most_modes=most_modes, false_alarm=false_alarm)
     return found.without_artefacts(np.pi / records[0].sample_time)
 
 

@@ -1,0 +1,43 @@
+"""`workbench identify --page`: what a person looks at before believing modes; and the limits of time and memory."""
+
+import json
+
+import numpy as np
+import pytest
+
+RATE, N = 500.0, 2000
+HERTZ, ZETA = np.array([12.0, 47.0]), 0.01
+
+
+@pytest.fixture(scope="module")
+def decay(tmp_path_factory):
+    time, rng = np.arange(N) / RATE, np.random.default_rng(0)
+    modes = np.exp(-ZETA * 2.0 * np.pi * np.outer(HERTZ, time)) * np.cos(2.0 * np.pi * np.outer(HERTZ, time))
+    outputs = np.array([[1.0, 0.6], [0.5, -0.8]]) @ modes + 1e-3 * rng.standard_normal((2, N))
+    path = tmp_path_factory.mktemp("decay") / "ring.csv"
+    np.savetxt(path, np.column_stack([time, *outputs]), delimiter=",", header="time,a,b", comments="")
+    return path
+
+
+def test_the_page_shows_shapes_mac_stabilisation_and_spectra(run, decay, tmp_path):
+    page = tmp_path / "modes.html"
+    found = run("identify", decay, "--page", page)
+    assert found.exit_code == 0, found.output
+    content = json.loads(page.with_suffix(".page.json").read_text())
+    captions = " ".join(block["caption"] for block in content["blocks"])
+    for what in ("shapes identified", "Modal assurance criterion", "Stabilisation diagram", "spectral density"):
+        assert what in captions
+    [(_, _, rows)] = content["tables"]
+    # rounded to the second digit of the standard error, as the terminal shows it
+    for row, exact in zip(rows, HERTZ / np.sqrt(1.0 - ZETA**2), strict=True):  # HERTZ are damped
+        value, error = float(row[1]), float(row[2])
+        assert abs(value - exact) < 5.0 * error and len(row[2].lstrip("0.")) == 2
+
+
+def test_time_and_memory_are_limited(run, decay):
+    refused = run("identify", decay, "--memory", 1e-5)
+    assert refused.exit_code == 2 and "allow more memory" in " ".join(refused.output.split())
+    assert run("look", decay, "--memory", 1e-5).exit_code == 2
+    assert run("identify", decay, "--seconds", 0).exit_code == 2
+    hurried = run("identify", decay, "--seconds", 1e-3)
+    assert "--seconds" in hurried.output
