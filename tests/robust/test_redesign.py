@@ -137,3 +137,24 @@ def test_an_estimator_that_is_too_slow_for_a_late_loop_is_made_faster(rig, contr
     assert faster.kept and faster.loss < 0.2 * compensated.loss
     assert found.proof.stable.all()
     assert found.after.effort == faster.effort
+
+
+def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
+    """One mode, its force held to half of its peak; what any controller can win back is known, see the theory.
+
+    With F = min(g sin φ, L) and averages over a period, the least ∫ (a² + κ F²) dt has a gain g(a) with
+    κ (g r - m) = a², r = 2 <F sin φ>, m = <F²>; κ is such that the effort is that without the limit.
+    """
+    one = replace(rig, modes=rig.modes.select(slice(1)), actuators=rig.actuators[:1])
+    quick = kalman(one.modes, imsc(one.modes, 1, one.actuators, weight=2.0), one.sensors, disturbance=1.0, noise=1e-9)
+    free = redesign(possible(one), quick, sample_time=DT, impulse_at=0.45, draws=1, placement=False)
+    peak = float(np.abs(free.after.response.forces).max())
+    held = possible(one, effect("actuator_saturation", "all", limit=0.5 * peak))
+    found = redesign(held, quick, sample_time=DT, impulse_at=0.45, draws=4, placement=False)
+    present, last = found.steps[0].vibration, [s for s in found.steps if s.kept][-1]
+    ideal = free.after.response.energy.sum() * DT
+    assert last.name in ("gain", "estimator") and last.effort < 1.03 * free.after.effort
+    assert present / ideal > 1.1
+    won = (present - last.vibration) / (present - ideal)
+    assert 0.40 < won < 0.55
+    assert found.proof.stable.all()

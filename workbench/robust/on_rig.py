@@ -234,6 +234,16 @@ def with_noise(loop: Loop, rig: Rig, factor: float) -> Loop | None:
     return designed_anew(loop._replace(controller=replace(loop.controller, designed_by=other)), rig, loop.modes)
 
 
+def with_weight(loop: Loop, rig: Rig, factor: float) -> Loop | None:
+    """The loop with its law designed for a multiple of the weight of the forces; None where it has none."""
+    design: Any = loop.law.designed_by
+    keywords = getattr(design, "keywords", {})
+    if "weight" not in keywords:
+        return None
+    other = partial(design.func, **{**keywords, "weight": factor * np.asarray(keywords["weight"])})
+    return designed_anew(loop._replace(law=replace(loop.law, designed_by=other)), rig, loop.modes)
+
+
 def _estimated(
     old: Controller, modes: Modes, law: Law, sensors: Sequence[Sensor], removed: Sequence[str]
 ) -> Controller:
