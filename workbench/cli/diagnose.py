@@ -67,8 +67,8 @@ def diagnose(
     check_kept_apart(found.fit, found.validation)
     faults = wiring(found.rig, found.fit)
     for fault in faults:
-        say(f"  {'mended' if mend else 'wiring'}     {fault.sentence}")
-    if faults and not (mend or as_wired):
+        say(f"  {'mended' if mend and fault.certain else 'wiring'}     {fault.sentence}")
+    if any(fault.certain for fault in faults) and not (mend or as_wired):
         raise ValueError("diagnose again with --mend to go on with this mended, or with --as-wired to go on as it is")
     if mend:
         rig, fit = mended(faults, found.rig, found.fit)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
+from scipy.linalg import expm
 
 from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
 from workbench.design.laws.coupled import coupled_lqr
@@ -13,6 +14,9 @@ from workbench.design.spillover.spillover import effort, energy_gained, finite_s
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
+from workbench.structure.plate import Plate
+
+EDGES = {"left": "clamped", "right": "free", "bottom": "simply supported", "top": "free"}
 
 
 def modes(n=9, **options):
@@ -118,3 +122,20 @@ def test_a_loop_through_sensors_that_cannot_see_a_mode_names_it():
     law = imsc(found, 2, [Actuator("a", 2.0), Actuator("b", 3.0)], weight=1.0)
     with pytest.raises(ValueError, match="cannot see mode 2"):
         close_loop(found, law, filter_)
+
+
+def test_work_on_a_plate_against_quadrature_of_the_closed_loop():
+    plate = Plate(length=(1.2, 0.8), mass_per_area=7.8, bending_stiffness=18.3, poisson_ratio=0.3, edges=EDGES)
+    panel, struck = plate.modes(6), (0.83, 0.31)
+    places = np.array([(0.33, 0.22), (0.87, 0.55), (0.58, 0.43)])
+    chosen = imsc(panel, 3, [Actuator(f"F{i}", tuple(at)) for i, at in enumerate(places)], weight=1e-2)
+    loop, state = close_loop(panel, chosen), impulse_state(panel, struck)
+    plant = np.block([[np.zeros((6, 6)), np.eye(6)], [-np.diag(panel.omega**2), np.zeros((6, 6))]])
+    fed = np.vstack([np.zeros((6, 3)), panel.phi(places).T]) @ loop.feedback
+
+    def power(t):  # the motion by scipy's matrix exponential, apart from what computes the work
+        x = expm((plant + fed) * t) @ state
+        return (fed @ x)[9:] * x[9:]
+
+    work = quad_vec(power, 0.0, 3.0, epsabs=0.0, epsrel=1e-11)[0]
+    np.testing.assert_allclose(finite_spillover(loop, state, 3.0).by_mode[3:], work, rtol=1e-8)

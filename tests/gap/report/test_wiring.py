@@ -168,3 +168,28 @@ def test_an_effect_is_not_taken_for_a_fault_of_wiring(kinds):
 def test_a_fault_says_how_much_it_closes(case):
     [fault] = wiring(case.rig, change(case.fit, inputs=exchanged(4, 0, 2)))
     assert isinstance(fault, WiringFault) and 0.99 < fault.closes <= 1.0
+
+
+def test_a_gain_that_is_near_a_unit_and_differs_beyond_its_error_is_said_and_not_mended(case):
+    records = change(case.fit, outputs=diagonal(7, 2, 1.01 / 9.80665))
+    [fault] = wiring(case.rig, records)
+    assert not fault.certain
+    assert fault.sentence == (
+        "The output a3 may look like g where m/s² is meant; but the gain is +1 % from that factor, beyond its error: it"
+        " is taken as an error of gain."
+    )
+    rig, kept = mended([fault], case.rig, records)
+    assert rig is case.rig and all(np.array_equal(a.outputs, b.outputs) for a, b in zip(kept, records, strict=True))
+
+
+def test_an_input_with_a_gain_near_a_unit_is_not_mended_beside_a_turned_sign_that_is(case):
+    matrix = diagonal(4, 3, 9.80665 * 1.02) @ diagonal(4, 1, -1.0)
+    faults = wiring(case.rig, change(case.fit, inputs=np.linalg.inv(matrix)))
+    assert [(fault.kind, fault.certain) for fault in faults] == [("sign", True), ("unit", False)]
+    assert "the gain is +2 % from that factor" in faults[1].sentence
+
+
+@pytest.mark.parametrize("factor", [1 / 9.81, 1.0005 / 9.80665])
+def test_a_factor_rounded_or_within_calibration_is_a_fault_of_units(case, factor):
+    [fault] = wiring(case.rig, change(case.fit, outputs=diagonal(7, 2, factor)))
+    assert fault.certain

@@ -25,8 +25,12 @@ CLOSED = 0.9  # share of the closable power that a mend must take away, on the c
 NEAR = 0.15  # relative error of a gain that still is that factor: the least ratio of two of them is 1.56
 MOST_CHANNELS = 12  # pairs of inputs are simulated one by one: beyond, only neighbours are
 MOST_ROUNDS = 4  # faults that hide one another are found one after the other
+GAIN_TAKES = 0.5  # share of what a factor leaves beyond the noise that a gain near it takes away: it is no unit then
+CALIBRATED = 1e-3  # relative: a gain nearer to a factor is that factor (9.81 for 9.80665 is 3.4e-4)
+GAIN_CHI2 = 25.0  # and five standard deviations of the gain, in noise that is white
 PER_CENT_FROM = 0.05  # damping ratio above which a structure is asked whether per cent was meant
 G, TURN = 9.80665, 2.0 * np.pi
+MAY_BE_GAIN = (G, 1.0 / G, TURN, 1.0 / TURN)  # the other factors are further from one than errors of calibration
 
 # measured / predicted: what an output does that reads so, and what an input does that is logged so as to give it
 FACTORS = {
@@ -57,12 +61,15 @@ class WiringFault:
         closes: share of the closable power of the gap that the mend takes away on the channels that it concerns; nan
             where no prediction was needed to see the fault.
         mend: (rig, records) -> (rig, records) without the fault.
+        certain: False for a factor that may be one of units, where a gain near it explains far more: an error of
+            calibration is likelier. It is said and not mended.
     """
 
     kind: str
     sentence: str
     closes: float
     mend: Mend
+    certain: bool = True
 
 
 def wiring(rig: Rig, records: Sequence[Record]) -> tuple[WiringFault, ...]:
@@ -76,19 +83,19 @@ def wiring(rig: Rig, records: Sequence[Record]) -> tuple[WiringFault, ...]:
     rig, seen = mended(found, rig, records)
     for _ in range(MOST_ROUNDS):
         faults = _best(rig, seen)
-        if not faults:
+        found += faults
+        if not any(fault.certain for fault in faults):
             break
-        for fault in faults:
-            found.append(fault)
-            rig, seen = fault.mend(rig, seen)
+        rig, seen = mended(faults, rig, seen)
     return tuple(found)
 
 
 def mended(faults: Iterable[WiringFault], rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-    """The rig and the records without the faults."""
+    """The rig and the records without the faults that are certain."""
     kept = tuple(records)
     for fault in faults:
-        rig, kept = fault.mend(rig, kept)
+        if fault.certain:
+            rig, kept = fault.mend(rig, kept)
     return rig, kept
 
 
@@ -201,7 +208,7 @@ class _Gap:
 
 
 def _best(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
-    """The faults of the kind that closes most; none where no mend closes nearly all."""
+    """The faults of the kind that closes most, doubtful ones where none is certain; none where no mend closes most."""
     gap = _Gap.of(rig, records)
     predicted = [_predict(rig, record) for record in records]
     before = gap.power(predicted)
@@ -209,7 +216,10 @@ def _best(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
     ways = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_inputs, _quantities, _rates, _structure)
     # a record at a low level may be sampled wrongly and yet leave no wide gap over all records
     found = [way(rig, records, gap, predicted, before, wide) for way in (ways if wide.any() else (_rates,))]
-    found = [faults for faults in found if faults]
+    doubtful = [fault for faults in found for fault in faults if not fault.certain]
+    found = [faults for faults in ([f for f in faults if f.certain] for faults in found) if faults]
+    if not found:
+        return doubtful
     return found[0] if len(found) == 1 else max(found, key=lambda faults: _overall(faults, rig, records), default=[])
 
 
@@ -227,15 +237,25 @@ def _scaled_outputs(
     over = sum((p**2).sum(axis=1) for p in predicted)
     along = sum((y * p).sum(axis=1) for y, p in zip(gap.measured, predicted, strict=True))
     gains = np.divide(along, over, out=np.ones_like(over), where=over > 0)
-    factors: dict[float, list[int]] = {}
+    freely = gap.power([gains[:, None] * p for p in predicted])
+    n_samples = sum(y.shape[1] for y in gap.measured)
+    factors: dict[tuple[float, bool], list[int]] = {}
     for j in np.flatnonzero(wide):
         factor = _factor(float(gains[j]))
         if factor is not None:
-            closed = gap.closed(before, gap.power([factor * p for p in predicted]))[j]
-            if closed >= CLOSED:
-                factors.setdefault(factor, []).append(int(j))
+            left = gap.power([factor * p for p in predicted])
+            if gap.closed(before, left)[j] >= CLOSED:
+                certain = not _is_gain(
+                    float(gains[j]),
+                    factor,
+                    n_samples * left[j],
+                    n_samples * freely[j],
+                    n_samples * gap.noise[j],
+                    n_samples,
+                )
+                factors.setdefault((factor, certain), []).append(int(j))
     faults = []
-    for factor, outputs in factors.items():
+    for (factor, certain), outputs in factors.items():
         names = [rig.sensors[j].name for j in outputs]
         closes = float(gap.closed(before, gap.power([factor * p for p in predicted]))[outputs].min())
         every = len(outputs) == len(rig.sensors)
@@ -247,8 +267,30 @@ def _scaled_outputs(
         cure = "multiply by -1" if factor == -1.0 else f"multiply by {1.0 / factor:.6g}"
         kind = "sign" if factor == -1.0 else "unit"
         sentence = f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
-        faults.append(WiringFault(kind, sentence, closes, _outputs_times(dict.fromkeys(names, 1.0 / factor))))
+        if not certain:
+            sentence = _doubtful(f"{who} {what}{rest}", gains[outputs] / factor - 1.0)
+        mend = _outputs_times(dict.fromkeys(names, 1.0 / factor))
+        faults.append(WiringFault(kind, sentence, closes, mend, certain))
     return faults
+
+
+def _is_gain(gain: float, factor: float, left: float, freely: float, noise: float, n_samples: int) -> bool:
+    """Whether a gain is near a factor of units by chance: it differs beyond its error, and explains far more.
+
+    Args:
+        left, freely, noise: sums of squares that the factor leaves, that the gain leaves, and of the noise.
+    """
+    if factor not in MAY_BE_GAIN or abs(gain / factor - 1.0) < CALIBRATED:
+        return False
+    taken = left - freely
+    return bool(taken > GAIN_TAKES * (left - noise) and taken * n_samples > GAIN_CHI2 * freely)
+
+
+def _doubtful(what: str, off: Floats) -> str:
+    """What may be a fault of units, and by how much it is none; off: relative differences of the gains."""
+    may = what.replace(" look ", " may look ", 1).replace(" are ", " may be ", 1)
+    far = ", ".join(dict.fromkeys(f"{100 * share:+.2g} %" for share in off))
+    return f"{may}; but the gain is {far} from that factor, beyond its error: it is taken as an error of gain."
 
 
 def _factor(gain: float) -> float | None:
@@ -320,13 +362,26 @@ def _scaled_inputs(
     closes = _closes(gap, before, wide, *mend(rig, records))
     if closes < CLOSED:
         return []
+    freely, noise = _squares(target - matrix @ gains), float(gap.noise.sum()) * target.size / gap.noise.size
     faults = []
     for factor in dict.fromkeys(wrong.values()):
-        names = [rig.actuators[p].name for p in wrong if wrong[p] == factor]
-        sentence = _one(f"{_named('input', names)} {FACTORS[factor][1]}", names) + f": multiply by {factor:.6g}."
+        inputs = [p for p in wrong if wrong[p] == factor]
+        names = [rig.actuators[p].name for p in inputs]
+        stiffly = gains.copy()
+        stiffly[inputs] = factor
+        left = _squares(target - matrix @ stiffly)
+        certain = not all(_is_gain(gains[p], factor, left, freely, noise, target.size) for p in inputs)
+        what = f"{_named('input', names)} {FACTORS[factor][1]}"
+        sentence = f"{_one(what, names)}: multiply by {factor:.6g}."
+        if not certain:
+            sentence = _doubtful(what, gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
-        faults.append(WiringFault(kind, sentence, closes, _inputs_times(dict.fromkeys(names, factor))))
+        faults.append(WiringFault(kind, sentence, closes, _inputs_times(dict.fromkeys(names, factor)), certain))
     return faults
+
+
+def _squares(values: Floats) -> float:
+    return float(values @ values)
 
 
 def _quantities(
