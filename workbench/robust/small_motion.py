@@ -3,15 +3,14 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from workbench.design.estimation.digital import DigitalController
+from workbench.design.export.sampled_loop import closed_by, held, linear_plant
 from workbench.design.loop.rig_loop import LoopRun, named
 from workbench.rig.elements import PointElement
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED
-from workbench.rig.simulate import participation_of
 from workbench.rig.statespace import output_matrix
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
@@ -79,61 +78,16 @@ def loop_poles(rig: Rig, controller: DigitalController, modes: Modes | None = No
 
 def _closed(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The loop z ← A z, what errors of the readings add to it, and the readings: A, B, C."""
-    plant_a, plant_b, plant_c = _plant(rig, controller, modes)
-    n_c, n_u = len(controller.a), len(controller.actuators)
-    c, d = controller.c, controller.d * controller.scale
-    if controller.relays is not None:
-        c, d = np.zeros((n_u, n_c)), np.zeros((n_u, len(controller.sensors)))
-    b = controller.b * controller.scale
-    a_c, b_c = controller.a + controller.e @ c, b + controller.e @ d
-    closed = np.block([[plant_a + plant_b @ d @ plant_c, plant_b @ c], [b_c @ plant_c, a_c]])
-    by_error = np.vstack([plant_b @ d, b_c])
-    return closed, by_error, np.hstack([plant_c, np.zeros((plant_c.shape[0], n_c))])
-
-
-def _plant(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B, C from commands to readings over a sample: modes, lags, and commands on their way."""
-    dt = controller.sample_time
     actuators = [named(rig.actuators, name) for name in controller.actuators]
+    a, b, _ = linear_plant(modes, actuators, ())
+    stepped, into = held(a, b, controller.sample_time, np.array([x.delay for x in actuators]))
+    return closed_by(stepped, into, _reads(rig, controller, modes, len(stepped)), controller)
+
+
+def _reads(rig: Rig, controller: DigitalController, modes: Modes, total: int) -> np.ndarray:
+    """C (n_sensors, total) of the readings: modes first, sensors late or slow as they are at each mode's frequency."""
     sensors = [named(rig.sensors, name) for name in controller.sensors]
-    n, n_u = modes.n_modes, len(actuators)
-    into = participation_of(Rig(modes, tuple(actuators), ())) * np.array([a.gain for a in actuators])
-    slow = [j for j, a in enumerate(actuators) if a.time_constant > 0]
-    size = 2 * n + len(slow)
-    a, b = np.zeros((size, size)), np.zeros((size, n_u))
-    a[: 2 * n, : 2 * n] = modes.state_matrix
-    b[n : 2 * n] = into
-    for i, j in enumerate(slow):
-        a[n : 2 * n, 2 * n + i], b[n : 2 * n, j] = into[:, j], 0.0
-        rate = 1.0 / actuators[j].time_constant
-        a[2 * n + i, 2 * n + i], b[2 * n + i, j] = -rate, rate
-    delays = np.array([x.delay for x in actuators]) / dt
-    whole = np.floor(np.round(delays, 9)).astype(int)
-    part = np.maximum(delays - whole, 0.0)
-    memory = np.where(delays > 1e-9, whole + (part > 1e-9), 0)
-    starts = size + np.r_[0, np.cumsum(memory)[:-1]].astype(int)
-    total = size + int(memory.sum())
-    wide, entering = np.zeros((total, total)), np.zeros((total, n_u))
-    step, _ = _step(a, b, dt)
-    wide[:size, :size] = step
-    for share in np.unique(part):
-        # over a sample the older command acts for its share, the newer one for the rest
-        columns = np.flatnonzero(part == share)
-        _, late = _step(a, b[:, columns], (1.0 - share) * dt)
-        _, early = _step(a, b[:, columns], share * dt)
-        after = expm(a * (1.0 - share) * dt) if share else np.eye(size)
-        for k, j in enumerate(columns.tolist()):
-            for age, effect in ((whole[j], late[:, k]), (whole[j] + 1, after @ early[:, k] if share else None)):
-                if effect is None:
-                    continue
-                if age == 0:
-                    entering[:size, j] += effect
-                else:
-                    wide[:size, starts[j] + age - 1] += effect
-    for j in np.flatnonzero(memory).tolist():
-        entering[starts[j], j] = 1.0
-        for k in range(1, memory[j]):
-            wide[starts[j] + k, starts[j] + k - 1] = 1.0
+    n = modes.n_modes
     reads = np.zeros((len(sensors), total))
     shapes = output_matrix(modes, sensors)
     for i, sensor in enumerate(sensors):
@@ -151,17 +105,7 @@ def _plant(rig: Rig, controller: DigitalController, modes: Modes) -> tuple[np.nd
         for name, share in sensor.crosstalk:
             if name in names:
                 mixed[i, names.index(name)] += share * sensor.gain / sensors[names.index(name)].gain
-    reads = mixed @ reads
-    return wide, entering, reads
-
-
-def _step(a: np.ndarray, b: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray]:
-    """e^{A h} and ∫ e^{A s} ds B."""
-    size, n_u = b.shape
-    block = np.zeros((size + n_u, size + n_u))
-    block[:size, :size], block[:size, size:] = a, b
-    moved = expm(block * span)
-    return moved[:size, :size], moved[:size, size:]
+    return np.asarray(mixed @ reads)
 
 
 def small_gain_margin(rig: Rig, controller: DigitalController, modes: Modes | None = None) -> tuple[float, float]:

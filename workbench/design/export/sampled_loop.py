@@ -31,7 +31,7 @@ def sampled_loop(
     controller: DigitalController,
     computing_delay: float = 0.0,
 ) -> np.ndarray:
-    """The matrix (n_states, n_states) of the loop: plant, controller, then the commands that are still under way.
+    """The matrix (n_states, n_states) of the loop: plant, commands that are still under way, then controller.
 
     Args:
         modes: controlled and residual.
@@ -48,42 +48,66 @@ def sampled_loop(
         raise DesignError(f"sensor {late[0]} is late or reads others too; count its delay as computing delay")
     if not (np.isfinite(computing_delay) and computing_delay >= 0):
         raise DesignError(f"the computing delay must be 0 s or more; got {computing_delay:g} s")
-    a, b, c = _plant(modes, actuators, sensors)
-    period = controller.sample_time
-    n, n_actuators = a.shape[0], len(actuators)
-    parts = [_whole_and_rest(computing_delay + actuator.delay, period) for actuator in actuators]
-    kept = max(whole + (rest > 0) for whole, rest in parts)  # commands of the past that still act
-    step = expm(period * a)
-    if kept > MOST_PAST:
+    a, b, c = linear_plant(modes, actuators, sensors)
+    delays = np.array([computing_delay + actuator.delay for actuator in actuators])
+    stepped, into = held(a, b, controller.sample_time, delays)
+    reads = np.hstack([c, np.zeros((len(c), len(stepped) - len(a)))])
+    return closed_by(stepped, into, reads, controller)[0]
+
+
+def held(a: np.ndarray, b: np.ndarray, period: float, delays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B from sample to sample; the states are x, then each actuator's commands under way, newest first.
+
+    Args:
+        a: (n, n); b: (n, n_actuators).
+        period: s.
+        delays: (n_actuators,) until a command acts, s.
+
+    Raises:
+        DesignError: too many commands under way.
+    """
+    parts = [_whole_and_rest(float(delay), period) for delay in delays]
+    past = [whole + (rest > 0) for whole, rest in parts]
+    if max(past, default=0) > MOST_PAST:
         raise DesignError(
-            f"{kept} samples pass until a command acts, more than {MOST_PAST}; sample slower, or shorten the delays"
+            f"{max(past)} samples pass until a command acts, more than {MOST_PAST}; sample slower, or shorten the"
+            " delays"
         )
-    # column block i: of the command i samples ago
-    into = np.zeros((n, (kept + 1) * n_actuators))
+    n, starts = len(a), len(a) + np.r_[0, np.cumsum(past)].astype(int)
+    stepped, into = np.zeros((starts[-1],) * 2), np.zeros((starts[-1], len(parts)))
+    stepped[:n, :n] = expm(period * a)
     for j, (whole, rest) in enumerate(parts):
-        first = expm((period - rest) * a)
-        into[:, whole * n_actuators + j] += _integral(a, period - rest) @ b[:, j]
-        if rest > 0:
-            into[:, (whole + 1) * n_actuators + j] += first @ (_integral(a, rest) @ b[:, j])
-    command = controller.state_space()
-    read = np.hstack([np.asarray(command.D) @ c, np.asarray(command.C)])  # u_k from x_k and z_k
-    nz = command.nstates
-    past = kept * n_actuators
-    matrix = np.zeros((n + nz + past,) * 2)
-    matrix[:n, :n] = step
-    matrix[:n, : n + nz] += into[:, :n_actuators] @ read
-    matrix[:n, n + nz :] = into[:, n_actuators:]
-    matrix[n : n + nz, : n + nz] = np.hstack([np.asarray(command.B) @ c, np.asarray(command.A)])
-    if past:
-        matrix[n + nz : n + nz + n_actuators, : n + nz] = read
-        matrix[n + nz + n_actuators :, n + nz : -n_actuators] = np.eye(past - n_actuators)
-    return matrix
+        newer = _integral(a, period - rest) @ b[:, j]
+        older = expm((period - rest) * a) @ (_integral(a, rest) @ b[:, j]) if rest > 0 else None
+        for age, effect in ((whole, newer), (whole + 1, older)):
+            if effect is not None and age == 0:
+                into[:n, j] += effect
+            elif effect is not None:
+                stepped[:n, starts[j] + age - 1] += effect
+        if past[j]:
+            into[starts[j], j] = 1.0
+            stepped[starts[j] + 1 : starts[j + 1], starts[j] : starts[j + 1] - 1] = np.eye(past[j] - 1)
+    return stepped, into
 
 
-def _plant(
+def closed_by(
+    a: np.ndarray, b: np.ndarray, c: np.ndarray, controller: DigitalController
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The loop z ← A z, what errors of the readings add to it, and the readings: A, B, C; relays switched off."""
+    n_c, n_u = len(controller.a), len(controller.actuators)
+    rows, direct = controller.c, controller.d * controller.scale
+    if controller.relays is not None:
+        rows, direct = np.zeros((n_u, n_c)), np.zeros((n_u, len(controller.sensors)))
+    a_c = controller.a + controller.e @ rows
+    b_c = controller.b * controller.scale + controller.e @ direct
+    closed = np.block([[a + b @ direct @ c, b @ rows], [b_c @ c, a_c]])
+    return closed, np.vstack([b @ direct, b_c]), np.hstack([c, np.zeros((len(c), n_c))])
+
+
+def linear_plant(
     modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A, B and C of the structure, its actuators and sensors, as far as they are linear."""
+    """A, B and C of the structure, its actuators and sensors, as far as they are linear; delays left out."""
     drives = [
         replace(a, delay=0.0, dead_zone=0.0, limit=np.inf, rate_limit=np.inf, hysteresis_share=0.0, bias=0.0)
         for a in actuators
