@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from workbench.records.files import FORMATS, READ_ONLY, RecordFileError, read_record, write_record
 from workbench.records.record import Channel, Record
@@ -76,6 +77,28 @@ def test_a_file_that_is_something_else_is_refused(tmp_path, ending):
 def test_channels_of_unequal_length_are_named(tmp_path):
     np.savez(tmp_path / "x.npz", t=np.arange(5.0), a=np.arange(5.0), b=np.arange(4.0))
     with pytest.raises(RecordFileError, match="'b' has 4 samples"):
+        read_record(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("ending", [".npz", ".mat"])
+def test_arrays_of_several_rows_are_as_many_signals(tmp_path, ending):
+    """As benchmarks come: one array of accelerations, one of force, and the sample rate as `Fs`."""
+    rng, path = np.random.default_rng(0), tmp_path / f"x{ending}"
+    force, moved = rng.standard_normal((1, 40)), rng.standard_normal((3, 40))
+    for values in (moved, moved.T):
+        held = {"Force": force, "Acceleration": values, "Fs": np.array([[400.0]])}
+        np.savez(path, **held) if ending == ".npz" else savemat(path, held)
+        read = read_record(path, inputs=("Force",))
+        assert read.sample_rate_hz == pytest.approx(400.0)
+        assert read.output_names == ("Acceleration 1", "Acceleration 2", "Acceleration 3")
+        np.testing.assert_array_equal(read.outputs, moved)
+        np.testing.assert_array_equal(read.inputs, force)
+
+
+@pytest.mark.parametrize("shape", [(5, 5), (5, 4, 3), (3, 2)])
+def test_an_array_whose_time_axis_is_unknown_is_refused(tmp_path, shape):
+    np.savez(tmp_path / "x.npz", t=np.arange(5.0), a=np.ones(shape))
+    with pytest.raises(RecordFileError, match="rows of samples are needed"):
         read_record(tmp_path / "x.npz")
 
 

@@ -219,7 +219,7 @@ def _sampling(
         raise RecordFileError(f"{path}: sample_rate_hz must be positive; got {sample_rate_hz}")
     if time is None:
         if sample_rate_hz is None:
-            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz (--sample-rate-hz)")
+            raise RecordFileError(f"{path} has no sample instants; give sample_rate_hz")
         return Sampling(0.0, 1.0 / sample_rate_hz)
     if not np.isfinite(time).all():
         raise RecordFileError(f"{path}, time, row {int(np.argmax(~np.isfinite(time))) + 1}: not a number")

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from workbench.records.file_error import RecordFileError
+from workbench.records.limits import check_counts
+from workbench.records.transfer_assembly import SURE_RATES
 from workbench.records.units import time_factor
 
 HEADER = "record_header"
@@ -23,19 +25,26 @@ def numbered(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
     """Time or None, signals by name, header or None: vectors as they are, single values and texts left out.
 
+    An array of several rows, one axis as long as the other signals, is as many signals, `NAME 1` and so on. A single
+    value named `fs`, or another of `SURE_RATES`, gives the time where no array does.
+
     Raises:
-        RecordFileError: an array that is no row of samples, two of times, or numbered channels without their header.
+        RecordFileError: an array that is no rows of samples, two of times, or numbered channels without their header.
     """
     header = str(np.ravel(arrays[HEADER])[0]) if HEADER in arrays and np.size(arrays[HEADER]) else None
     time: np.ndarray | None = None
     signals: dict[str, np.ndarray] = {}
+    numbers = [values for values in arrays.values() if values.dtype.kind in "fiub" and values.size > 1]
+    lengths = {values.size for values in numbers if values.size == max(values.shape)}
     for name, values in arrays.items():
         if values.dtype.kind == "c" and values.size > 1:
             raise RecordFileError(f"{path}, channel {name!r} is complex: is it a transfer function?")
         if values.dtype.kind not in "fiub" or values.size == 1:
             continue
         if values.ndim > 1 and 1 not in values.shape:
-            raise RecordFileError(f"{path}, channel {name!r} has shape {values.shape}; one row of samples is needed")
+            for i, each in enumerate(_rows(path, name, values, lengths), 1):
+                signals[f"{name} {i}"] = each
+            continue
         row = values.reshape(-1).astype(float, copy=False)
         factor = time_factor(name)
         if factor is None:
@@ -44,12 +53,32 @@ def signals_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Signals:
             time, first = (row if factor == 1.0 else factor * row), name
         else:
             raise RecordFileError(f"{path} holds two arrays of times, {first} and {name}; leave one out")
+    if time is None and signals:
+        rates = [
+            float(v.item())
+            for n, v in arrays.items()
+            if n.lower() in SURE_RATES and v.size == 1 and v.dtype.kind in "fiu"
+        ]
+        if len(rates) == 1 and 0.0 < rates[0] < np.inf:
+            time = np.arange(max(row.size for row in signals.values())) / rates[0]
     if any(name.startswith(NUMBERED) for name in signals):
         counted = [f"{NUMBERED}{i}" for i in range(len(signals))]
         if header is None or sorted(signals) != sorted(counted):
             raise RecordFileError(f"{path} is damaged: its channels and their description do not belong together")
         signals = dict(zip(_keys(path, header), (signals[name] for name in counted)))
     return time, signals, header
+
+
+def _rows(path: Path, name: str, values: np.ndarray, lengths: set[int]) -> np.ndarray:
+    """The signals (n_signals, n_samples) of an array of two axes, the longer being time where no other signal says."""
+    along = [axis for axis, size in enumerate(values.shape) if size in (lengths or {max(values.shape)})]
+    if values.ndim != 2 or len(along) != 1:
+        raise RecordFileError(
+            f"{path}, channel {name!r} has shape {values.shape}; rows of samples are needed, as long as the other"
+            " signals"
+        )
+    check_counts(path, values.shape[1 - along[0]], 0)
+    return np.asarray(np.moveaxis(values, along[0], 1), float)
 
 
 def _keys(path: Path, header: str) -> list[str]:
