@@ -224,24 +224,25 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
     return Loop(modes, law, controller)
 
 
-def with_noise(loop: Loop, rig: Rig, factor: float) -> Loop | None:
-    """The loop with its Kalman filter designed for a multiple of the readings' noise; None where there is none."""
-    design: Any = loop.controller.designed_by
-    keywords = getattr(design, "keywords", {})
-    if "noise" not in keywords:
-        return None
-    other = partial(design.func, **{**keywords, "noise": factor * np.asarray(keywords["noise"])})
-    return designed_anew(loop._replace(controller=replace(loop.controller, designed_by=other)), rig, loop.modes)
+def tuned(loop: Loop, rig: Rig, setting: str, factor: float) -> Loop | None:
+    """The loop designed for a multiple of a setting; None where its design has no such setting.
 
+    Args:
+        loop: as it is.
+        rig: whose actuators and sensors are taken, by name.
+        setting: "weight" of the law's forces, or "noise" of the readings of a Kalman filter.
+        factor: by which it is multiplied.
 
-def with_weight(loop: Loop, rig: Rig, factor: float) -> Loop | None:
-    """The loop with its law designed for a multiple of the weight of the forces; None where it has none."""
-    design: Any = loop.law.designed_by
-    keywords = getattr(design, "keywords", {})
-    if "weight" not in keywords:
+    Raises:
+        DesignError: nothing can be designed with it.
+    """
+    name = "law" if setting == "weight" else "controller"
+    part: Any = getattr(loop, name)
+    keywords = getattr(part.designed_by, "keywords", {})
+    if setting not in keywords:
         return None
-    other = partial(design.func, **{**keywords, "weight": factor * np.asarray(keywords["weight"])})
-    return designed_anew(loop._replace(law=replace(loop.law, designed_by=other)), rig, loop.modes)
+    other = partial(part.designed_by.func, **{**keywords, setting: factor * np.asarray(keywords[setting])})
+    return designed_anew(loop._replace(**{name: replace(part, designed_by=other)}), rig, loop.modes)
 
 
 def _estimated(

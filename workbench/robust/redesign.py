@@ -15,7 +15,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
-from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, with_noise, with_weight
+from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.proof import Proof, drawn_with_errors, interval, prove
 from workbench.robust.relocation import Relocation, relocated
@@ -293,24 +293,21 @@ def _compensated(
             best, least, cost = trial, step.loss, step.cost
     # a limit holds the effort down: more gain wins vibration back for it
     bounded = any(np.isfinite(named(rig.actuators, a.name).limit) for a in loop.law.actuators)
-    tunings = [
-        ("gain", with_weight, WEIGHTS, "weight of the forces"),
-        ("estimator", with_noise, SPEEDS, "noise of the readings"),
-    ]
-    for name, tuned_by, factors, of in tunings if bounded else tunings[1:]:
+    tunings = [("gain", "weight", WEIGHTS), ("estimator", "noise", SPEEDS)]
+    for name, setting, factors in tunings if bounded else tunings[1:]:
         for factor in factors:
             try:
-                tuned = tuned_by(loop, rig, factor)
+                other = tuned(loop, rig, setting, factor)
             except DesignError:
                 continue  # none is that fast
-            if tuned is None:
+            if other is None:
                 break
-            trial = compensated(rig, tuned, test.sample_time, kept)
-            step = tried(name, f"{of} taken as {factor:g} times what was designed for", trial)
+            trial = compensated(rig, other, test.sample_time, kept)
+            step = tried(name, f"{setting} taken as {factor:g} times what was designed for", trial)
             pays = step.loss < least - PAYS if name == "gain" else step.cost < cost - PAYS and step.loss <= least
             if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
                 steps = [*(s for s in steps if s.name != name), step]
-                best, least, cost, chosen = trial, step.loss, step.cost, tuned
+                best, least, cost, chosen = trial, step.loss, step.cost, other
         loop = chosen
     removed: list[str] = []
     for name in _faulty(rig, loop):
