@@ -186,6 +186,94 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
     assert set(json.loads(found.read_text())["placements"][0]["positions"]) <= {1.5, 3, 4.5, 6.5, 7, 8.5}
 
 
+PLATE = """[structure]
+kind = "plate"
+length = [1.2, 0.8]
+mass_per_area = 8.0
+bending_stiffness = 175.0
+poisson_ratio = 0.3
+edges = {left = "simply supported", right = "simply supported", bottom = "simply supported", top = "simply supported"}
+damping_ratio = 0.005
+modes = 8
+[[input]]
+name = "F1"
+kind = "actuator"
+at = [0.3, 0.24]
+[[input]]
+name = "F2"
+kind = "actuator"
+at = [0.84, 0.52]
+[[input]]
+name = "hammer"
+kind = "hammer"
+at = [0.5, 0.46]
+[[output]]
+name = "w1"
+quantity = "displacement"
+at = [0.36, 0.56]
+noise_std = 1e-6
+[[output]]
+name = "w2"
+quantity = "displacement"
+at = [0.7, 0.2]
+noise_std = 1e-6
+"""
+
+
+@pytest.fixture
+def plate(tmp_path):
+    path = tmp_path / "plate.toml"
+    path.write_text(PLATE)
+    return path
+
+
+def test_a_plate_is_placed_outside_a_zone_and_drawn(plate, tmp_path):
+    found, picture = tmp_path / "places.json", tmp_path / "places.png"
+    zone = ("--forbid", "0.3,0.2:0.6,0.5")
+    result = run("place", plate, "--control", 2, "--weight", 0.01, *zone, "--figure", picture, "--json", found)
+    assert result.exit_code == 0, result.output
+    assert "unit impulse at (x, y) = (0.5, 0.46)" in result.output and "places [m]" in result.output
+    best, own = json.loads(found.read_text())["placements"]
+    assert own["positions"] == [[0.3, 0.24], [0.84, 0.52]]
+    assert best["residual_work"] < own["residual_work"] and best["effort"] <= 1.5 * own["effort"] * (1 + 1e-6)
+    assert not any(0.3 < x < 0.6 and 0.2 < y < 0.5 for x, y in best["positions"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_candidates_of_a_plate_are_proven(plate, tmp_path):
+    found = tmp_path / "places.json"
+    given = ("--at", "0.3,0.24; 0.4,0.4; 0.8,0.4; 0.84,0.52; 1.0,0.4", "--effort", 3, "--proof", 0.05)
+    result = run("place", plate, "--control", 2, "--weight", 0.01, *given, "--json", found)
+    assert result.exit_code == 0, result.output
+    # modes (1, 1) and (2, 1) from a third and two thirds of the length on the midline: nothing reaches (1, 2) or (3, 1)
+    assert json.loads(found.read_text())["placements"][0]["positions"] == [[0.4, 0.4], [0.8, 0.4]]
+
+
+def test_laws_on_a_plate_are_compared_with_an_observer(plate, tmp_path):
+    found = tmp_path / "laws.json"
+    result = run("design", plate, "--control", 2, "--weight", 0.01, "--json", found)
+    assert result.exit_code == 0, result.output
+    through = json.loads(found.read_text())["through_sensors"]
+    assert [row["design"] for row in through] == [f"{law} on a Luenberger observer" for law in ("IMSC", "coupled LQR")]
+    assert all(row["margin"] == pytest.approx(-max(row["poles_real"])) for row in through)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--impulse-at", "3,0.1"), "--impulse-at: (x, y) = (3, 0.1) lies outside the structure, 0 to 1.2 by 0 to 0.8"),
+        (("--impulse-at", "0.4"), "--impulse-at takes X,Y in m, such as 0.4,0.25; got '0.4'"),
+        (("--forbid", "0.2:0.3"), "--forbid takes X,Y in m, such as 0.4,0.25; got '0.2'"),
+        (("--at", "0.2,0.3"), "2 actuators need as many places; the limits leave 1"),
+        (("--control", 3), "there are 2 for 3 modes: describe 3 [[input]] of kind actuator"),
+    ],
+)
+def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
+    result = run("place", plate, "--control", 2, *arguments)
+    assert result.exit_code == 2, result.output
+    assert words in " ".join(result.output.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -7,8 +7,8 @@ from rich.table import Table
 
 from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, read_structure_rig
 from workbench.cli.terminal import JsonPath, console, guarded, say, write_json
-from workbench.structure.domain import position
 from workbench.structure.member import Structure
+from workbench.structure.printed import place_text
 
 if TYPE_CHECKING:
     from workbench.design.spillover.explain import Explanation
@@ -65,12 +65,12 @@ def design(
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         stable = "stable" if row.poles.real.max() < 0 else _undamped(row.poles.real.max())
         table.add_row(row.law.name, *(f"{value:.5g}" for value in numbers), most, stable)
-    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at x = {at:g} m, R = {weight:g}", bold=True)
+    say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
     console.print(table)
     mass = found.structure.mass_per_length if isinstance(found.structure, Structure) else None
-    tried = through_sensors(modes, laws, [position(s.at) for s in found.sensors], mass)
+    tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
     sensed = Table(
@@ -135,4 +135,7 @@ def _limit(explained: "Explanation") -> tuple[str, str]:
         return "none: unstable without any" if explained.reduced_margin <= 0 else "no single one", ""
     grows = explained.loop.stable or worst.closed_pole.real > 0
     pole = f"{worst.closed_pole.real:+.3g} 1/s" if grows else "stable without it"
-    return f"mode {worst.mode + 1}: {pole}", f"sensor at {worst.paths[0].sensor_at:g} to {worst.paths[0].actuator}"
+    return (
+        f"mode {worst.mode + 1}: {pole}",
+        f"sensor at {place_text(worst.paths[0].sensor_at)} to {worst.paths[0].actuator}",
+    )

@@ -1,15 +1,24 @@
 """`workbench place`: actuator placement."""
 
 import math
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
 
-from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, read_structure_rig
-from workbench.cli.terminal import JsonPath, console, guarded, progress_bar, reporter, say, write_json
+from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, place_in, read_structure_rig, typed_place
+from workbench.cli.terminal import JsonPath, console, guarded, progress_bar, reporter, say, short, write_json
+from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Place, Rectangle
+from workbench.structure.printed import place_text
 
-LEAST_SPACING = 1 / 20  # of the length, unless one is given
+if TYPE_CHECKING:
+    from workbench.design.placement.limits import Limits
+    from workbench.design.placement.placement import PlacementTask
+    from workbench.design.placement.task import Placement
+    from workbench.rig.rig import Rig
+
+LEAST_SPACING = 1 / 20  # of the size of the structure, unless one is given
 WRITTEN = ("positions", "residual_work", "by_mode", "effort", "peak_force", "condition", "status")
 
 
@@ -20,19 +29,24 @@ def place(
     weight: Weight = 1.0,
     impulse_at: ImpulseAt = None,
     effort: Annotated[
-        float, typer.Option(help="Effort limit, as a multiple of that of evenly spaced actuators.")
+        float, typer.Option(help="Effort limit: times that of even spacing on a beam, else of the rig's actuators.")
     ] = 1.5,
-    spacing: Annotated[float | None, typer.Option(help="Least distance between actuators, m; length/20.")] = None,
+    spacing: Annotated[float | None, typer.Option(help="Least distance between actuators, m; size/20.")] = None,
     peak_force: Annotated[float, typer.Option(help="Force limit of each actuator, N.")] = math.inf,
     condition: Annotated[float, typer.Option(help="Limit of the condition number of B (Frobenius).")] = math.inf,
     forbid: Annotated[
-        list[str] | None, typer.Option(metavar="FROM:TO", help="Interval without actuators, m; may be repeated.")
+        list[str] | None,
+        typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate."),
     ] = None,
     at: Annotated[
-        str | None, typer.Option(metavar="X,X,X", help="Candidate places, m: all combinations are evaluated.")
+        str | None,
+        typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names."),
     ] = None,
     proof: Annotated[
         float | None, typer.Option(help="Prove the optimum global to within this share, such as 0.05.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("--figure", help="Draw the placement to this file (.png, .svg, .pdf).")
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -46,24 +60,35 @@ def place(
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place as least_work
+    from workbench.design.placement.task import listed
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
+    check_target(picture)
     if proof is not None and not 0 < proof < 1:
         raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
     found = read_structure_rig(rig)
     modes, struck = found.modes, impulse_place(found, impulse_at)
+    domain = modes.domain
     with progress_bar() as progress:
         report = reporter(progress, "placing actuators")
         task = placement_task(modes, control, impulse_at=struck, weight=weight)
-        even = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
+        if isinstance(domain, Interval):
+            usual = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
+        else:
+            usual = task.placed(_own(found, control), "of the rig")
+            if not math.isfinite(usual.effort):
+                raise ValueError(
+                    "the rig's own actuators cannot control these modes (B is singular), so their effort is no measure"
+                    " for --effort: move one off the nodal lines"
+                )
         limits = Limits(
-            effort=effort * even.effort,
-            spacing=LEAST_SPACING * modes.length if spacing is None else spacing,
+            effort=effort * usual.effort,
+            spacing=_spacing(domain) if spacing is None else spacing,
             peak_force=peak_force,
             condition=condition,
-            forbidden=tuple(_interval(text) for text in forbid or ()),
-            candidates=None if at is None else tuple(_places(at, modes.length)),
+            forbidden=tuple(_zone(domain, text) for text in forbid or ()),
+            candidates=None if at is None else _places(domain, at),
         )
         best = least_work(task, limits)
         certificate = None
@@ -75,23 +100,37 @@ def place(
                 report(f"proving: at least {share:.1%} of W_R, {cells:,} cells", 0.5 + 0.5 * min(share / wanted, 1.0))
 
             certificate = certify(task, limits, placement=best, gap=proof, progress=proving)
-    rows = [best, even]
-    nodes = nodes_of_mode(modes, control)
-    if nodes.size == control:
+    rows = [best, usual]
+    nodes = nodes_of_mode(modes, control) if isinstance(domain, Interval) else None
+    if nodes is not None and nodes.size == control:
         rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
-    table = Table("places [m]", "W_R", "effort", "peak force", "condition of B", "", box=None, pad_edge=False)
+    table = Table(
+        "points" if isinstance(domain, NamedPoints) else r"places \[m]",
+        "W_R",
+        "effort",
+        "peak force",
+        "condition of B",
+        "",
+        box=None,
+        pad_edge=False,
+    )
     for row in rows:
-        where = ", ".join(f"{x:.4g}" for x in row.positions)
+        where = ("; " if isinstance(domain, Rectangle) else ", ").join(map(place_text, listed(row.positions)))
         numbers = (row.residual_work, row.effort, row.peak_force, row.condition)
         table.add_row(where, *(f"{value:.5g}" for value in numbers), row.status)
-    say(f"{control} of {modes.n_modes} modes controlled, unit impulse at x = {struck:g} m, R = {weight:g}", bold=True)
+    say(
+        f"{control} of {modes.n_modes} modes controlled, unit impulse at {domain.text(struck)}, R = {weight:g}",
+        bold=True,
+    )
     console.print(table)
     if certificate is not None:
         say(f"  {certificate}")
+    if picture is not None:
+        _draw(picture, task, {"least work": best, usual.status: usual}, limits, struck)
     write_json(
         json_path,
         {
-            "length": modes.length,
+            "length": None if isinstance(domain, NamedPoints) else domain.length,
             "impulse_at": struck,
             "weight": weight,
             "controlled": list(range(control)),
@@ -101,19 +140,55 @@ def place(
     )
 
 
-def _places(text: str, length: float) -> list[float]:
-    try:
-        places = sorted({float(x) for x in text.split(",")})
-    except ValueError:
-        raise ValueError(f"--at takes places between commas, such as 0.1,0.25,0.4; got {text!r}") from None
-    if not all(0 <= x <= length for x in places):
-        raise ValueError(f"--at names a place outside the structure, 0 to {length:g} m: {text}")
-    return places
+def _own(rig: "Rig", control: int) -> list[Place]:
+    """Where the rig's own actuators stand; as many as there are controlled modes."""
+    own = [a.at for a in rig.actuators if not a.direct and not isinstance(a.at, Between)]
+    if len(own) != control:
+        raise ValueError(
+            f"--effort counts from the rig's own actuators here, and there are {len(own)} for {control} modes:"
+            f" describe {control} [[input]] of kind actuator"
+        )
+    return own
 
 
-def _interval(text: str) -> tuple[float, float]:
+def _spacing(domain: Domain) -> float:
+    return 0.0 if isinstance(domain, NamedPoints) else LEAST_SPACING * domain.size
+
+
+def _places(domain: Domain, text: str) -> tuple[Place, ...]:
+    """Candidate places as they are typed: between semicolons on a plate, else between commas."""
+    parts = text.split(";" if isinstance(domain, Rectangle) else ",")
+    if isinstance(domain, Interval) and not all(_is_number(part) for part in parts):
+        raise ValueError(f"--at takes places between commas, such as 0.1,0.25,0.4; got {text!r}")
+    return tuple(dict.fromkeys(place_in(domain, part, "--at") for part in parts))
+
+
+def _is_number(text: str) -> bool:
     try:
-        low, high = (float(part) for part in text.split(":"))
+        float(text)
     except ValueError:
-        raise ValueError(f"--forbid takes FROM:TO in m, such as 0.2:0.3; got {text!r}") from None
+        return False
+    return True
+
+
+def _zone(domain: Domain, text: str) -> tuple[Place, Place]:
+    ends = text.split(":")
+    if len(ends) != 2:
+        raise ValueError(f"--forbid takes FROM:TO in m, such as 0.2:0.3, or 0.1,0.2:0.3,0.4 on a plate; got {text!r}")
+    low, high = (typed_place(domain, end, "--forbid") for end in ends)
     return low, high
+
+
+def _draw(
+    path: Path, task: "PlacementTask", placements: "dict[str, Placement]", limits: "Limits", struck: Place
+) -> None:
+    """The best placement as a picture: over a plate's nodal lines, elsewhere its work mode by mode."""
+    from workbench.draw.plot import plot
+    from workbench.draw.surface import plot_surface_placement
+
+    if isinstance(task.modes.domain, Rectangle):
+        figure = plot_surface_placement(task, placements, limits=limits, struck=struck)  # type: ignore[arg-type]
+    else:
+        figure = plot(next(iter(placements.values())))
+    figure.savefig(path)
+    say(f"  figure     {short(path)}")

@@ -6,14 +6,20 @@ from typing import Annotated
 import typer
 
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval, position
+from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Place, PlaceError
 
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
     Path,
     typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one."),
 ]
-ImpulseAt = Annotated[float | None, typer.Option(help="Place of a unit impulse, m; that of the hammer unless given.")]
+ImpulseAt = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PLACE",
+        help="Place of a unit impulse: m (X,Y on a plate) or a name; the hammer's unless given.",
+    ),
+]
 Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]
 
 
@@ -21,21 +27,57 @@ def read_structure_rig(path: Path) -> Rig:
     """The rig of a TOML file or a case folder.
 
     Raises:
-        ValueError: a rig of plain modal data, which has no shape between its points.
+        ValueError: plain modal data without a file of points, where nothing is known but the shapes at the rig itself.
     """
     from workbench.cases.case import read_rig
 
     found = read_rig(path / "case.toml" if path.is_dir() else path)
-    if found.structure is None:
-        raise ValueError(f"{path}: plain modal data have no shapes between points; describe a beam or a rod instead")
-    if not isinstance(found.modes.domain, Interval):
-        raise ValueError(f"{path}: a design from the command is for a beam or a rod; design on a plate from Python")
+    domain = found.modes.domain
+    if isinstance(domain, NamedPoints) and domain.positions is None:
+        raise ValueError(
+            f'{path}: plain modal data have no shapes between points; name a file of points (points = "points.csv"), or'
+            " describe a beam, a rod or a plate"
+        )
     return found
 
 
-def impulse_place(rig: Rig, at: float | None) -> float:
-    """Where the impulse acts, m: as given, or at the rig's hammer."""
-    hammers = [actuator.at for actuator in rig.actuators if actuator.direct]
-    if at is None and not hammers:
+def typed_place(domain: Domain, text: str, option: str) -> Place:
+    """A place as it is typed: m along a beam, X,Y on a plate, or the name of a point.
+
+    Raises:
+        ValueError: what is not written so, with the option that it was typed for.
+    """
+    if isinstance(domain, NamedPoints):
+        return text.strip()
+    form = "a position in m, such as 0.4" if isinstance(domain, Interval) else "X,Y in m, such as 0.4,0.25"
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != (1 if isinstance(domain, Interval) else 2):
+        raise ValueError(f"{option} takes {form}; got {text!r}")
+    return numbers[0] if len(numbers) == 1 else (numbers[0], numbers[1])
+
+
+def place_in(domain: Domain, text: str, option: str) -> Place:
+    """The same, where the structure has it.
+
+    Raises:
+        ValueError: what is no place of the structure.
+    """
+    at = typed_place(domain, text, option)
+    try:
+        domain.locate(at)
+    except PlaceError as error:
+        raise ValueError(f"{option}: {error}") from None
+    return at
+
+
+def impulse_place(rig: Rig, at: str | None) -> Place:
+    """Where the impulse acts: as given, or at the rig's hammer."""
+    if at is not None:
+        return place_in(rig.modes.domain, at, "--impulse-at")
+    hammers = [a.at for a in rig.actuators if a.direct and not isinstance(a.at, Between)]
+    if not hammers:
         raise ValueError("the place of the impulse is missing: give --impulse-at, or an [[input]] of kind hammer")
-    return position(hammers[0]) if at is None else at
+    return hammers[0]

@@ -16,6 +16,7 @@ from workbench.structure.domain import TRANSLATIONS, NamedPoints, Rectangle
 from workbench.structure.modes import Modes
 
 PER_SIDE = 61  # of the longer one: points where a shape is drawn
+SHOWN_WORK = 1e-8  # of the largest work in one mode: what is less is not drawn
 LEVELS = 12  # of colour on each side of zero
 COLUMNS = 4
 SWAY = 0.15  # of the structure's size: the largest motion as drawn
@@ -106,7 +107,8 @@ def plot_surface_placement(
     x, y, fields = _over(modes, np.eye(modes.n_modes)[:, n : n + 1])
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
     left.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
-    left.contour(x, y, fields[0].T, levels=[0.0], colors="black", linewidths=1.4)
+    # supported edges are zero but for rounding, which a line would show
+    left.contour(x[1:-1], y[1:-1], fields[0, 1:-1, 1:-1].T, levels=[0.0], colors="black", linewidths=1.4)
     for (x0, y0), (x1, y1) in limits.forbidden if limits is not None else ():  # type: ignore[misc, str-unpack]
         left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2)
     numbers = n + 1 + np.arange(modes.n_modes - n)
@@ -120,7 +122,9 @@ def plot_surface_placement(
     _bare(left, modes)
     left.set_title(f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, and its nodal lines", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
+    most = max(float(placement.by_mode.max()) for placement in placements.values())
     right.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers, yscale="log")
+    right.set_ylim(SHOWN_WORK * most, 3.0 * most)  # a mode at whose nodes they stand takes none but rounding
     return figure
 
 

@@ -13,6 +13,7 @@ from workbench.design.estimation.controller import Controller, reading
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
 from workbench.rig.statespace import input_matrix
+from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, frozen
 
 UNSEEN = 1e-9
@@ -127,8 +128,8 @@ def close_with(modes: Modes, controller: Controller | Law) -> ClosedLoop:
     return ClosedLoop(modes, controller.law, matrix, feedback)
 
 
-def impulse_state(modes: Modes, at: float, impulse: float = 1.0) -> Floats:
-    """State (2n,) just after an impulse (N s) at x: q_r' = impulse φ_r(x) (5.58)."""
+def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
+    """State (2n,) just after an impulse (N s) at a place: q_r' = impulse φ_r(x) (5.58)."""
     return np.concatenate([np.zeros(modes.n_modes), impulse * modes.phi(at)[0]])
 
 

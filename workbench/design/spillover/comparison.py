@@ -16,6 +16,7 @@ from workbench.design.spillover.explain import Explanation, explain
 from workbench.design.spillover.spillover import Spillover, effort, finite_spillover, quadratic_cost
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
+from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import ProfileLike
 from workbench.threads import one_blas_thread
@@ -111,20 +112,20 @@ def compare(
 
 
 def through_sensors(
-    modes: Modes, laws: Sequence[Law], places: Sequence[float], mass_per_length: ProfileLike | None
+    modes: Modes, laws: Sequence[Law], places: Sequence[Place], mass_per_length: ProfileLike | None
 ) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
     """Each law on what sensors of displacement and velocity at the places read: a modal filter, a Luenberger observer.
 
     Args:
         modes: controlled and residual.
         laws: to try.
-        places: of the sensors, m.
+        places: of the sensors.
         mass_per_length: for the filters; none are tried where it is not known.
 
     Returns:
         Controller, explanation on the full plant, and where it cannot be, (None, None, why).
     """
-    stands = np.unique(np.asarray(places, float))
+    stands = sorted(dict.fromkeys(places))
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
     for law in laws:
         own = modes.select(law.controlled)

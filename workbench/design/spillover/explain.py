@@ -195,10 +195,10 @@ class _OneMode:
 
     def paths(self, closed: complex) -> tuple[Path, ...]:
         exact, first = self._terms(closed), self._terms(self.pole)
-        at = np.array([sensor.at for sensor in self._rest.controller.sensors])
-        found = [
-            Path(actuator.name, place, complex(exact[j, at == place].sum()), complex(first[j, at == place].sum()))
-            for j, actuator in enumerate(self._rest.controller.law.actuators)
-            for place in self._rest.controller.places
-        ]
+        sensors = self._rest.controller.sensors
+        found = []
+        for j, actuator in enumerate(self._rest.controller.law.actuators):
+            for place in self._rest.controller.places:
+                here = [sensor.at == place for sensor in sensors]
+                found.append(Path(actuator.name, place, complex(exact[j, here].sum()), complex(first[j, here].sum())))
         return tuple(sorted(found, key=lambda path: -path.shift.real))
