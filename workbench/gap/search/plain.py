@@ -11,8 +11,9 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.finish import finished
 from workbench.gap.search.fit import Fit, fit
-from workbench.gap.search.pursuit import FINE, one_more
-from workbench.gap.search.search import Search, spread_over_kinds
+from workbench.gap.search.pursuit import FINE
+from workbench.gap.search.screening import Weighed
+from workbench.gap.search.search import Search
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
@@ -96,9 +97,13 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | Non
 
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...]) -> Fit | None:
-    """The effects and another, linear as errors are, that stands for those of every mode and wave."""
-    search = replace(search, catalogue=tuple(kind for kind in search.catalogue if not kind.nonlinear))
+    """The effects and another in the structure, linear as errors are, that stands for those of every mode and wave."""
+    alike = tuple(kind for kind in search.catalogue if kind.path == "structure" and not kind.nonlinear)
+    if not alike:
+        return None
     given = fit(search.rig, effects, search.quick, iterations=PLAINLY).effects
     evidence = search.evidence_of(apply_all(search.rig, given))
-    ahead = [f.effects for f in spread_over_kinds(one_more(search, given, evidence), 1)][:LIKELIEST]
-    return _explaining(search, [set_ for more in ahead for set_ in dict.fromkeys((more, (*more, *common)))])
+    weighed = Weighed.of(replace(search, catalogue=alike), given, evidence).likeliest()
+    likeliest = {effect.kind: effect for effect in reversed(weighed)}  # the best of each kind
+    more = [(*given, effect) for effect in weighed if effect is likeliest[effect.kind]][:LIKELIEST]
+    return _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))])
