@@ -110,7 +110,7 @@ def diagnose(
             case=name,
             outcome=outcome,
             effects=attribution.best.effects,
-            alternatives=tuple((" + ".join(fit.labels), probability) for fit, probability in attribution.rivals),
+            alternatives=tuple((fit.named, probability) for fit, probability in attribution.rivals),
             where=locate(nominal, effects, place() if as_seen else locate_force(nominal.without(faulty))),
             shrinkage=shrinkage,
             corrected=corrected,

@@ -50,7 +50,7 @@ def next_experiment(rig: Rig, best: Fit, rival: Fit, data: FitData, workers: Wor
     For each variation both corrected rigs are simulated, and what small changes of either one's parameters could make
     up for is projected out; what is left of their difference, in units of the noise, grows with time.
     """
-    names = (" + ".join(best.labels), " + ".join(rival.labels))
+    names = (best.named, rival.named)
 
     def experiment(record: Record, inputs: tuple[str, ...], level: float) -> Experiment:
         rate = _separation(rig, best, rival, replace(data, records=(_varied(record, inputs, level),)))
@@ -98,7 +98,7 @@ def _response(rig: Rig, effects: tuple[Effect, ...], trial: FitData) -> tuple[np
     centre = trial.residual(apply_all(rig, effects))
     slopes = []
     for i, effect in enumerate(effects):
-        for parameter in effect.parameters(rig):
+        for parameter in () if effect.kind.first else effect.parameters(rig):  # errors of the model stay as they are
             step = 1e-4 * max(abs(effect.values[parameter.name]), 1e-6)
             moved = dict(effect.values)
             moved[parameter.name] += step

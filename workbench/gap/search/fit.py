@@ -58,6 +58,11 @@ class Fit:
         return tuple(effect.label for effect in self.effects)
 
     @property
+    def named(self) -> str:
+        """Labels of the effects, without errors of the nominal model, in one string."""
+        return " + ".join(effect.label for effect in self.effects if not effect.kind.first)
+
+    @property
     def key(self) -> tuple[str, ...]:
         """What tells this set from another, numbers apart."""
         return key_of(self.effects)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect, apply_all, key_of
 from workbench.gap.effects.limiting_cases import simpler_sets
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
@@ -59,6 +59,7 @@ class StepwiseSettings:
         in_part: likewise, for effects that are named although something else is there.
         credible: times the stated noise that noise found may be; more is a gap.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
+        excluded: probability below which another set that explains the records is no rival.
         jump: times the power of the change over the span before a sample that the change after it has at a jump.
         astray: share of the nominal gap's power from which on errors may be fitted out of step.
     """
@@ -106,6 +107,7 @@ class StepwiseSettings:
     in_part: float = 0.2
     credible: float = 3.0
     no_gap: float = 0.15
+    excluded: float = 1e-3
     jump: float = 10.0
     astray: float = 0.02
 
@@ -122,12 +124,14 @@ class Step:
         sensor_noise: (n_outputs,) mean square of each sensor's noise as found, over that of the stated noise.
         logged: noise of the logged inputs, as a share of their rms.
         noise_power: (n_records, n_outputs) mean square of both, over that of the stated noise of the sensors.
+        others: sets that it was chosen from, fitted to all records too.
     """
 
     fit: Fit
     sensor_noise: np.ndarray
     logged: float
     noise_power: np.ndarray
+    others: "tuple[Step, ...]" = ()
 
     @property
     def effects(self) -> tuple[Effect, ...]:
@@ -331,7 +335,7 @@ class Stepwise:
         left = best.excess(best.noise_power)
         if not self.explains(best) and left > SETTINGS.further * float(self.search.nominal.mean()):
             return False
-        best = self._simplest(best, self._alone[1:])
+        best = replace(self._simplest(best, self._alone[1:]), others=tuple(self._alone))
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
         self.steps.append(best)
@@ -395,10 +399,23 @@ class Stepwise:
         if self.plain is not None:
             return Decision("explained", self.plain, noise=noise)
         if effects and (self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)):
-            return Decision("explained", self.last.fit, noise=noise)
+            return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise)
         if self.is_nothing:
             return Decision("none", self.last.fit, noise=noise)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise)
+
+    def _rivals(self) -> tuple[tuple[Fit, float], ...]:
+        """Other sets that leave only noise too, with their probabilities by description length."""
+        key = key_of(self.last.effects)
+        chosen = next((s for s in reversed(self.steps) if s.others and key_of(s.effects) == key), None)
+        if chosen is None:
+            return ()
+        others = [s for s in chosen.others if key_of(s.effects) != key and self.explains(s)]
+        a_number = 0.5 * np.log(self.search.data.n_values)
+        length = [s.description(chosen.sensor_noise) + a_number * s.fit.n_parameters for s in (chosen, *others)]
+        odds = np.exp(min(length) - np.array(length))
+        likely = sorted(zip(others, odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
+        return tuple((s.fit, float(p)) for s, p in likely if p > SETTINGS.excluded)
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
@@ -451,7 +468,7 @@ class Stepwise:
             return step
         near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
         whole = sorted((s if s in alone else self._whole(s) for s in near), key=lambda s: s.fit.cost)
-        return self._simplest(whole[0], whole[1:])
+        return replace(self._simplest(whole[0], whole[1:]), others=tuple(whole))
 
     def _is_worth(self, best: Step, step: Step) -> bool:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
