@@ -190,8 +190,13 @@ def _crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     return lambda s: {"output": names[row], "from": names[source], "share": sign * 0.2 * s * ratio}
 
 
+def _late(scene: Scene, strength: float) -> float:
+    """A time, s, of half a sample and no less than a twentieth: an accelerometer shows the least delay as a jump."""
+    return max(0.5 * strength, 0.05) * scene.bench.sample_time
+
+
 def _time(scene: Scene, rng: np.random.Generator) -> Number:
-    return lambda s: 0.5 * s * scene.bench.sample_time
+    return lambda s: _late(scene, s)
 
 
 def _moved_actuator(scene: Scene, rng: np.random.Generator) -> Numbers:
@@ -247,7 +252,7 @@ def _step(scene: Scene, rng: np.random.Generator) -> Numbers:
 
 def _sensor_lag(scene: Scene, rng: np.random.Generator) -> OfStrength:
     which = "all" if rng.random() < 0.6 else str(rng.choice([s.name for s in scene.bench.rig.sensors]))
-    return lambda s: {"output": which, "time_constant": 0.5 * s * scene.bench.sample_time}
+    return lambda s: {"output": which, "time_constant": _late(scene, s)}
 
 
 def _tone(scene: Scene, rng: np.random.Generator) -> OfStrength:
@@ -330,7 +335,7 @@ DRAWS: dict[str, Draw] = {
     "sensor_drift": _reading("drift_over_record", _in_rms(0.5)),
     "sensor_lag": _sensor_lag,
     "sensor_misplacement": _moved_sensor,
-    "sensor_delay": _reading("delay", lambda c, row, r: lambda s: 0.5 * s * c.bench.sample_time),
+    "sensor_delay": _reading("delay", lambda c, row, r: lambda s: _late(c, s)),
     "sensor_crosstalk": _crosstalk,
     "swapped_outputs": _swapped_outputs,
     "sensor_clipping": _reading("limit", _clip),

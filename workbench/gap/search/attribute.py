@@ -293,14 +293,14 @@ def _with_a_second(
     if beside.is_enough or beside.by_singles():
         beside.run()
         return beside.decision()
-    if beside.last.fit.cost < min(f.cost for f in (start, *singles)):
+    law = one_law(search, evidence)
+    if law is None and beside.last.fit.cost < min(f.cost for f in (start, *singles)):
         beside.run()
         decision = beside.decision()
         if decision.outcome == "explained":
             return decision
         if decision.outcome == "none" and beside.is_quiet:
             return decision
-    law = one_law(search, evidence)
     pairs = Pairs(search)
     explained = pairs.at_once(weighed) or (law is None and pairs.with_a_third())
     decision = pairs.decision(start)

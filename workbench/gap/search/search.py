@@ -62,9 +62,9 @@ class Search:
     def explains(self, candidate: Fit) -> bool:
         """Whether what is left is noise, in every record, up to the error of integration.
 
-        Two effects of a kind beside one another stand for one law that the catalogue does not hold.
+        Effects that crowd about one place stand for one law that the catalogue does not hold.
         """
-        if self._doubled(candidate.effects):
+        if self.crowded(candidate.effects):
             return False
         left = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
@@ -77,14 +77,15 @@ class Search:
         """The cost of a set that explains the records, at most."""
         return float(1.0 + SLACK + INTEGRATION_SHARE * self.nominal.mean())
 
-    def _doubled(self, effects: Sequence[Effect]) -> bool:
+    def crowded(self, effects: Sequence[Effect]) -> bool:
+        """Whether nonlinear effects stand for one law: two of a kind, or three of any, side by side."""
         point = [effect for effect in effects if effect.kind.nonlinear and effect.at is not None]
-        near = (
-            not apart(one, other, self.rig.modes.domain)
-            for one, other in combinations(point, 2)
-            if one.kind is other.kind
-        )
-        return any(near)
+
+        def side_by_side(some: Sequence[Effect]) -> bool:
+            return not any(apart(one, other, self.rig.modes.domain) for one, other in combinations(some, 2))
+
+        alike = any(one.kind is other.kind and side_by_side((one, other)) for one, other in combinations(point, 2))
+        return alike or any(side_by_side(three) for three in combinations(point, 3))
 
     def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
         """Whether the gain in likelihood pays for `extra` more numbers."""

@@ -297,6 +297,7 @@ class Stepwise:
         singles: the likeliest effects alone, without errors, which the first one is chosen among too.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
+        is_beyond: whether effects crowd about one place, as they do where a law is beyond the catalogue.
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
@@ -305,6 +306,7 @@ class Stepwise:
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.plain: Fit | None = None
+        self.is_beyond = False
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
         self.steps.append(self._afresh(()))
@@ -398,6 +400,8 @@ class Stepwise:
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         if self.plain is not None:
             return Decision("explained", self.plain, noise=noise)
+        if self.is_beyond:
+            return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise)
         if effects and (self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)):
             return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise)
         if self.is_nothing:
@@ -440,7 +444,10 @@ class Stepwise:
             self.steps[-1] = sided
             return self._with_one_more(sided)
         best = self._best_of(tried, step)
-        return best if self._is_worth(best, step) else None
+        if not self._is_worth(best, step):
+            return None
+        self.is_beyond = search.crowded(best.effects)
+        return None if self.is_beyond else best
 
     def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
         """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
