@@ -195,7 +195,7 @@ def attribute(
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
     outcome, best, random, rivals, noise = decision
-    best = common_as_errors(search, best)
+    best = common_as_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
         best = widened(search, best)
     if seen:

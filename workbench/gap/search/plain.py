@@ -33,14 +33,24 @@ def are_common(effects: Sequence[Effect]) -> bool:
     )
 
 
-def common_as_errors(search: Search, found: Fit) -> Fit:
-    """The fit with common errors, small and beside an effect, as errors of the nominal model."""
+def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
+    """The fit with both common errors, small and beside an effect, as errors of the nominal model.
+
+    A model that is a little off is so in both; one of them alone is an effect.
+
+    Args:
+        alone: whether one alone counts too, where a random force hides the other.
+    """
     common = {e.kind.name: float(np.log(e.values["factor"])) for e in found.effects if e.kind in COMMON}
     others = [e for e in found.effects if e.kind not in COMMON]
     late = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
     named = [e for e in others if e is not late]
     most = MOST_ALONE if len(common) == 1 else MOST_COMMON
-    if not common or not named or any(abs(size) >= most[name] for name, size in common.items()):
+    if (
+        len(common) < (1 if alone else len(COMMON))
+        or not named
+        or any(abs(size) >= most[name] for name, size in common.items())
+    ):
         return found
     if not isinstance(search.rig.structure, Structure) or (late is not None and set(late.target.groups) != {"delay"}):
         return found
