@@ -33,6 +33,12 @@ def with_one_simpler(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effe
             yield (*effects[:i], simpler, *effects[i + 1 :])
 
 
+def each_left_out(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    """The set without each of its effects in turn."""
+    for effect in effects:
+        yield tuple(other for other in effects if other is not effect)
+
+
 def wider_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     """The sets with one effect as what it is a limiting case of."""
     for i, effect in enumerate(effects):

@@ -61,9 +61,12 @@ def _with_stepping(search: Search, finely: Fit) -> Fit:
 
 def widened(search: Search, found: Fit) -> Fit:
     """The fit, or one with an effect as what it is a limiting case of, where the records surely prefer that."""
+    sets = list(wider_sets(found.effects))
+    if not sets:
+        return found
     data = search.data.stepped(FINE)
     cost = cost_of(search.rig, found.effects, data)
-    for effects in wider_sets(found.effects):
+    for effects in sets:
         trial = fit(search.rig, effects, data, iterations=WIDENING, workers=search.workers, chord=True)
         if search.tells_apart(trial.cost, cost, trial.n_parameters - found.n_parameters):
             return trial

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.limiting_cases import simpler_sets
+from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.finish import finished
@@ -27,9 +27,8 @@ LIKELIEST = 4  # kinds of the one more that are tried
 
 def are_common(effects: Sequence[Effect]) -> bool:
     """Whether effects are the errors common to all modes and all along, each no larger than errors may be."""
-    most = {kind.name: MOST_COMMON[kind.name] for kind in COMMON}
     return {effect.kind for effect in effects} == set(COMMON) and all(
-        abs(np.log(effect.values["factor"])) < most[effect.kind.name] for effect in effects
+        abs(np.log(effect.values["factor"])) < MOST_COMMON[effect.kind.name] for effect in effects
     )
 
 
@@ -82,7 +81,7 @@ def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effe
         return _one_more(search, (*common, *late), ())
     sets = [effects, *((*effects, effect) for effect in common), (*effects, *common)]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
-        fewer = [tuple(other for other in effects if other is not effect) for effect in effects]
+        fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
     return _explaining(search, [(*s, *late) for s in sets]) or _one_more(search, (*effects, *late), common)
 

@@ -1,6 +1,6 @@
 """Effects added one after the other, each beside a nominal model that is a little wrong everywhere."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all, key_of
-from workbench.gap.effects.limiting_cases import simpler_sets
+from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
@@ -400,9 +400,8 @@ class Stepwise:
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         if self.plain is not None:
             return Decision("explained", self.plain, noise=noise)
-        if self.is_beyond:
-            return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise)
-        if effects and (self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)):
+        closed = self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)
+        if effects and closed and not self.is_beyond:
             return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise)
         if self.is_nothing:
             return Decision("none", self.last.fit, noise=noise)
@@ -501,7 +500,7 @@ class Stepwise:
             each = zip(whole, without, scales, strict=True)
             return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
 
-        return all(altered(effects) > self.tolerance for effects in _each_left_out(step.effects))
+        return all(altered(effects) > self.tolerance for effects in each_left_out(step.effects))
 
     def _is_timing(self, step: Step) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
@@ -567,7 +566,7 @@ class Stepwise:
         """The set without effects that a later one has made needless."""
         if not step.effects:
             return step
-        fewer = self._fitted(list(_each_left_out(step.effects)), step, self._slopes(step))
+        fewer = self._fitted(list(each_left_out(step.effects)), step, self._slopes(step))
         best = min(fewer, key=lambda s: s.fit.cost)
         enough = (1.0 + SETTINGS.needless) * max(step.excess(step.sensor_noise), SETTINGS.simpler)
         return self._without_needless(best) if best.excess(step.sensor_noise) < enough else step
@@ -595,8 +594,3 @@ class Stepwise:
         if not added:
             return step
         return fit_jointly(self.search, (*step.effects, *added), replace(step.errors, values=reset), rounds=2)
-
-
-def _each_left_out(effects: tuple[Effect, ...]) -> Iterator[tuple[Effect, ...]]:
-    for effect in effects:
-        yield tuple(other for other in effects if other is not effect)
