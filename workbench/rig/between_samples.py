@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.rig.stepping import propagators
 
 SETTLED = 1e-6  # of the largest eigenvalue: directions of force that hardly move a mode over a sample are left alone
@@ -14,32 +15,33 @@ class BetweenSamples:
     """Modal motion at any time: in each sample interval every mode moves exactly under a force linear in time.
 
     q'' + c q' + ω² q = p_0 + (p_1 - p_0) t / Δt in [0, Δt], p_0 and p_1 such that q and q' come out at both ends as
-    they are. So it is exact for inputs held over each sample, and of second order for forces that follow laws.
+    they are. So it is exact for inputs held over each sample, and of second order for forces that follow laws. p_0 and
+    p_1 are linear in the motion at both ends, so a reading at any time is a weighted sum of that.
 
     Attributes:
         omega, damping: (n_modes,) of each mode alone.
-        start: (2, n_modes, n_intervals) displacement and velocity where each interval begins; the last one begins with
-            the last sample.
-        forces: (2, n_modes, n_intervals) p_0 and p_1.
+        series: (3 n_modes, n_samples) displacements, velocities, and forces beside those of stiffness and damping.
+        ends: (2, 5, n_modes) p_0 and p_1, of displacement, velocity and force where an interval begins, displacement
+            and velocity where it ends.
         sample_time: s.
         rests: whether the motion begins at rest.
     """
 
-    omega: np.ndarray
-    damping: np.ndarray
-    start: np.ndarray
-    forces: np.ndarray
+    omega: Floats
+    damping: Floats
+    series: Floats
+    ends: Floats
     sample_time: float
     rests: bool
 
     @classmethod
     def of(
         cls,
-        displacement: np.ndarray,
-        velocity: np.ndarray,
-        forces: np.ndarray,
-        stiffness: np.ndarray,
-        damping: np.ndarray,
+        displacement: Floats,
+        velocity: Floats,
+        forces: Floats,
+        stiffness: Floats,
+        damping: Floats,
         sample_time: float,
         *,
         held: bool = False,
@@ -53,62 +55,92 @@ class BetweenSamples:
         """
         omega, own = np.sqrt(stiffness.mean(axis=1)), np.diag(damping).copy()
         # what a mode alone does not have counts as a force
-        beside = forces - (stiffness - omega[:, None] ** 2) * displacement - (damping - np.diag(own)) @ velocity
-        start = np.stack([displacement, velocity])
-        if held:
-            return cls(omega, own, start, np.stack([beside] * 2), sample_time, not start[:, :, 0].any())
-        step = _propagators(omega, own, sample_time)
-        free = step[:, 0, :, None] * displacement[:, :-1] + step[:, 1, :, None] * velocity[:, :-1]
-        moved = np.stack([displacement[:, 1:], velocity[:, 1:]])
-        missing = moved - free - (step[:, 2] + step[:, 3])[:, :, None] * beside[:, :-1]
-        weight = np.array([1.0, sample_time])[:, None, None]
-        by_force = np.moveaxis(weight * step[:, 2:], 2, 0)  # (n_modes, 2 motions, 2 forces)
-        gram = by_force @ np.swapaxes(by_force, 1, 2)
-        gram += SETTLED * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(2)
-        change = np.swapaxes(by_force, 1, 2) @ np.linalg.solve(gram, np.moveaxis(weight * missing, 1, 0))
-        ends = np.moveaxis(change, 1, 0) + beside[:, :-1]
-        # after the last sample its force is held
-        ends = np.concatenate([ends, np.stack([beside[:, -1:]] * 2)], axis=2)
-        return cls(omega, own, start, ends, sample_time, not start[:, :, 0].any())
+        beside, coupled = forces, damping - np.diag(own)
+        if stiffness.shape[1] > 1:
+            beside = beside - (stiffness - omega[:, None] ** 2) * displacement
+        if coupled.any():
+            beside = beside - coupled @ velocity
+        ends = _held(omega.size) if held else _ends(omega, own, sample_time)
+        rests = not (displacement[:, 0].any() or velocity[:, 0].any())
+        return cls(omega, own, np.concatenate([displacement, velocity, beside]), ends, sample_time, rests)
 
-    def earlier(self, order: int, shape: np.ndarray, delay: float) -> np.ndarray:
-        """What `shape` (n_modes,) reads `delay` seconds before each sample, (n_samples,), zero before a start at rest.
+    def earlier(self, order: int, shapes: Floats, delays: Floats) -> Floats:
+        """What each sensor reads its delay before each sample, (n_sensors, n_samples), zero before a start at rest.
 
         Args:
             order: 0 for displacement, 1 for velocity, 2 for acceleration.
-            delay: s; negative, by less than a sample, for what is read ahead.
+            shapes: (n_sensors, n_modes) at the sensors.
+            delays: (n_sensors,) s; negative, by less than a sample, for what is read ahead.
         """
-        n_intervals = self.start.shape[2]
-        back = delay / self.sample_time
-        whole = int(np.ceil(round(back, 9)))
-        ahead = round(whole - back, 9)  # a span of next to nothing would be divided by
-        within = self.sample_time * ahead
-        interval = np.arange(n_intervals) - whole
-        read = self._at(order, shape, within)[np.clip(interval, 0, n_intervals - 1)]
-        early = np.flatnonzero(interval < 0)
-        for k in early:  # before the record: at rest, or by the first interval drawn on backwards
-            back_there = within + self.sample_time * interval[k]
-            read[k] = 0.0 if self.rests else self._at(order, shape, back_there, slice(0, 1))[0]
+        back = [delay / self.sample_time for delay in delays]
+        whole = [int(np.ceil(round(samples, 9))) for samples in back]
+        # a span of next to nothing would be divided by
+        within = [self.sample_time * round(n - samples, 9) for n, samples in zip(whole, back, strict=True)]
+        rows = np.array([self._rows(order, time) for time in within])
+        read = self._read(shapes, rows)
+        n_samples = read.shape[1]
+        found = np.zeros_like(read)
+        for j, n in enumerate(whole):
+            found[j, n:] = read[j, : max(n_samples - n, 0)]
+            for k in range(0 if self.rests else min(n, n_samples)):  # the first interval drawn on backwards
+                there = self._rows(order, within[j] + self.sample_time * (k - n))
+                found[j, k] = self._read(shapes[j : j + 1], there[None], slice(0, 2))[0, 0]
+        return found
+
+    def _read(self, shapes: Floats, rows: Floats, samples: slice = slice(None)) -> Floats:
+        """Readings (n_sensors, n_samples) in each interval, by rows (n_sensors, 4, n_modes) of q, q', p_0 and p_1."""
+        n_modes, series = self.omega.size, self.series[:, samples]
+
+        def weights(ends: Floats) -> Floats:
+            by_motion = np.einsum("jfm,fsm->jsm", rows[:, 2:], ends)
+            by_motion[:, :2] += rows[:, :2]
+            each: Floats = shapes[:, None] * by_motion
+            return each.reshape(len(shapes), -1)
+
+        by_motion = weights(self.ends)
+        read: Floats = by_motion[:, : 3 * n_modes] @ series
+        read[:, :-1] += by_motion[:, 3 * n_modes :] @ series[: 2 * n_modes, 1:]
+        # after the last sample its force is held
+        read[:, -1] = weights(_held(n_modes))[:, : 3 * n_modes] @ series[:, -1]
         return read
 
-    def _at(self, order: int, shape: np.ndarray, time: float, intervals: slice = slice(None)) -> np.ndarray:
-        """What is read at a time after the beginning of each interval, (n_intervals,)."""
+    def _rows(self, order: int, time: float) -> Floats:
+        """(4, n_modes): what is read at a time after the beginning of an interval, of q, q', p_0 and p_1."""
         motion = _propagators(self.omega, self.damping, self.sample_time, time)
-        if order == 2:
-            share = time / self.sample_time
-            n_modes = self.omega.size
-            force = np.stack(
-                [np.zeros(n_modes), np.zeros(n_modes), np.full(n_modes, 1.0 - share), np.full(n_modes, share)]
-            )
-            rows = force - self.omega**2 * motion[0] - self.damping * motion[1]
-        else:
-            rows = motion[order]
-        sources = (*self.start, *self.forces)
-        parts = [(shape * row) @ source[:, intervals] for row, source in zip(rows, sources, strict=True)]
-        return np.asarray(np.sum(parts, axis=0))
+        if order < 2:
+            row: Floats = motion[order]
+            return row
+        share = time / self.sample_time
+        rows: Floats = -(self.omega**2) * motion[0] - self.damping * motion[1]
+        rows[2] += 1.0 - share
+        rows[3] += share
+        return rows
 
 
-def _propagators(omega: np.ndarray, damping: np.ndarray, span: float, time: float | None = None) -> np.ndarray:
+def _held(n_modes: int) -> Floats:
+    """`ends` of forces that stay as they are where the interval begins."""
+    ends = np.zeros((2, 5, n_modes))
+    ends[:, 2] = 1.0
+    return ends
+
+
+def _ends(omega: Floats, damping: Floats, sample_time: float) -> Floats:
+    """`ends` of forces that lead to the motion where the interval ends, as near to those where it begins as can be."""
+    step = _propagators(omega, damping, sample_time)
+    weight = np.array([1.0, sample_time])[:, None, None]
+    by_force = np.moveaxis(weight * step[:, 2:], 2, 0)  # (n_modes, 2 motions, 2 forces)
+    gram = by_force @ np.swapaxes(by_force, 1, 2)
+    gram += SETTLED * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(2)
+    change = np.swapaxes(by_force, 1, 2) @ np.linalg.solve(gram, np.eye(2) * weight[:, 0])  # of forces, by motion
+    missing = np.zeros((2, 5, omega.size))  # what the forces where it begins do not lead to
+    missing[:, :2], missing[:, 2] = -step[:, :2], -(step[:, 2] + step[:, 3])
+    missing[0, 3] = missing[1, 4] = 1.0
+    ends: Floats = np.einsum("mfd,dsm->fsm", change, missing)
+    ends[:, 2] += 1.0
+    return ends
+
+
+def _propagators(omega: Floats, damping: Floats, span: float, time: float | None = None) -> Floats:
     """(2, 4, n_modes): q and q' at `time`, of q, q', p_0 and p_1 at the start of a span, the force linear over it."""
     time = span if time is None else time
     out = np.zeros((2, 4, omega.size))

@@ -182,10 +182,12 @@ def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
     late = motion.between_samples(sample_time) if any(sensor.delay for sensor in rig.sensors) else None
     for order, here, shapes in _shapes_at_sensors(rig):
-        outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
-        for j, shape in zip(here, shapes, strict=True):
-            if late is not None and rig.sensors[j].delay:
-                outputs[j] = late.earlier(order, shape, rig.sensors[j].delay)
+        delays = np.array([rig.sensors[j].delay for j in here])
+        if late is None or not delays.all():
+            outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
+        if late is not None and delays.any():
+            behind = np.flatnonzero(delays)
+            outputs[np.array(here)[behind]] = late.earlier(order, shapes[behind], delays[behind])
     for row, leak in _leaks(rig, outputs):
         outputs[row] += leak
     for j, sensor in enumerate(rig.sensors):

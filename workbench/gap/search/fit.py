@@ -156,7 +156,7 @@ class _Problem:
             return np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j])
 
         fresh = [j for j in range(len(self.parameters)) if self.known is None or j not in self.believed]
-        jacobian = np.zeros((residual.size, len(self.parameters)))
+        jacobian = np.zeros((residual.size, len(self.parameters)), order="F")
         for j, found in zip(fresh, self.workers.map(column, fresh), strict=True):
             jacobian[:, j] = found
         n_values = residual.size - len(self.believed)
@@ -256,7 +256,7 @@ def fit(
             promised = -(2.0 * gradient + normal @ straight) @ straight
             if promised < PROMISED * tolerance * cost:
                 break
-            bend = _bend(problem, free, nearly, coarsely, jacobian, damped, straight, moving)
+            bend = _bend(problem, free, nearly, coarsely, jacobian, normal, damped, straight, moving)
             step = _bounded(problem, free, straight + bend)
             trial = problem.residual(free + step)
             if trial is not None and trial @ trial < cost:
@@ -304,6 +304,7 @@ def _bend(
     residual: Floats,
     coarsely: bool,
     jacobian: Floats,
+    normal: Floats,
     damped: Floats,
     step: Floats,
     moving: Flags,
@@ -318,8 +319,9 @@ def _bend(
     beside = problem.residual(free + BENT * step, coarsely=coarsely)
     if beside is None:
         return turn
-    curvature = 2.0 / BENT * ((beside - residual) / BENT - jacobian @ step)
-    turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], jacobian[:, moving].T @ curvature)
+    # J' times the second derivative along the step
+    curvature = 2.0 / BENT * (jacobian.T @ (beside - residual) / BENT - normal @ step)
+    turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
     with np.errstate(over="ignore"):
         small = 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step)
     return turn if small else np.zeros_like(step)
