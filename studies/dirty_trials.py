@@ -5,13 +5,14 @@ from time import process_time
 
 import numpy as np
 
-from workbench.draw.trials import plot_dirt
+from workbench.draw.trials import plot_dirt, plot_reliability
 from workbench.trials.dirt import DIRT_CLASSES, SIZES
 from workbench.trials.hold import hold_trials
 from workbench.trials.make import draw_dirty_kinds
-from workbench.trials.scoring import NONE, tally_dirty
+from workbench.trials.scoring import NONE, reliability, tally_dirty
 
 CASES, SEED = 54, 620417
+FEW = 10  # claims: a share of fewer is chance
 
 
 def trial(dirt, size, kinds, seed):
@@ -54,4 +55,9 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.check("share of places within 3 % of the length", whole["placed"], 0.9, at_least=True)
     outcome.check("share of numbers within their 95 % interval", whole["covered"], 0.9, at_least=True)
     outcome.check("share of budgets right to 0.05", whole["honest"], 0.9, at_least=True)
+    points = reliability(scores)
+    outcome.table("reliability", [point._asdict() for point in points])
+    off = max((abs(p.right - p.probability) for p in points if p.claims >= FEW), default=0.0)
+    outcome.check(f"reliability: distance from the diagonal of {FEW} claims or more", off, 0.1)
     outcome.figure("named", plot_dirt(scores), "Share named rightly, by class and size of the small errors.")
+    outcome.figure("reliability", plot_reliability(points), "Share of claims that are right, by the probability told.")

@@ -17,7 +17,7 @@ from workbench.trials.dirt import DIRT_CLASSES, MIMICS, SIZES, Dirt, draw_dirt
 from workbench.trials.finite_elements import Alterations, element_modes
 from workbench.trials.make import TWINS, draw_dirty_kinds, make_trial
 from workbench.trials.plant import Plant
-from workbench.trials.scoring import score_dirty, tally_dirty
+from workbench.trials.scoring import reliability, score_dirty, tally_dirty
 
 
 @pytest.fixture(scope="module")
@@ -204,3 +204,40 @@ def test_shares_are_of_what_there_is_to_count():
     counted = tally_dirty([right, silent])
     assert counted["named"] == 0.5 and counted["wrong"] == 0.0 and counted["false_alarms"] == 0
     assert counted["covered"] == pytest.approx(2 / 3) and counted["honest"] == 0.0 and counted["placed"] == 1.0
+
+
+def test_claims_are_those_of_the_verdict_and_its_alternatives():
+    verdict = {
+        "outcome": "explained",
+        "effects": [TOLD],
+        "alternatives": [{"kind": "one_sided_stop", "probability": 0.2}, {"kind": "clearance", "probability": 0.1}],
+    }
+    right = score_dirty(verdict, LABEL, length=10.0)["claims"]
+    np.testing.assert_allclose(right, [(0.7, 1), (0.2, 0), (0.1, 1)])
+    pair = {**LABEL, "effects": [*LABEL["effects"], {"kind": "sensor_gain", "output": "d1", "gain": 1.1}]}
+    verdict["alternatives"] = [{"kind": "sensor_gain[d1] + clearance", "probability": 0.4}]
+    np.testing.assert_allclose(score_dirty(verdict, pair, length=10.0)["claims"], [(0.6, 0), (0.4, 1)])
+    assert not score_dirty({**verdict, "outcome": "part"}, pair, length=10.0)["claims"]
+
+
+def test_reliability_of_claims_that_are_right_as_often_as_they_say():
+    scores = [{"claims": [(0.9, i < 9), (0.1, i >= 9)]} for i in range(10)]
+    low, high = reliability(scores)
+    assert low == pytest.approx((0.1, 0.1, 10)) and high == pytest.approx((0.9, 0.9, 10))
+    assert not reliability([{"claims": []}])
+
+
+def test_a_strong_effect_alters_the_readings_by_more_than_a_diagnosis_leaves_alone():
+    """The first draw of this seed hides a lag as large as what the dirt does, and below a hundredth of the signal."""
+    case, label = make_trial(620445, kinds=["actuator_lag"], dirt="shape", size=0.5)
+    (effect,) = label["effects"]
+    kind = kind_named("actuator_lag")
+    there = Effect(kind, effect.get("input", "all"), {"time_constant": effect["time_constant"]})
+    gaps = []
+    for record in case.fit:
+        without, lagged = (
+            simulate(rig, record.inputs, sample_time=record.sample_time).outputs
+            for rig in (case.rig, apply_all(case.rig, [there]))
+        )
+        gaps.append(np.sqrt(np.mean(((lagged - without) / lagged.std(axis=1, keepdims=True)) ** 2)))
+    assert max(gaps) > 0.018

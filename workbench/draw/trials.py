@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.trials.scoring import Tally
+from workbench.trials.scoring import Reliability, Tally
 
 _FAMILY = {
     "single": "one effect:",
@@ -70,6 +70,23 @@ def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
     ax.set(xlim=(0, 112), ylim=(len(classes) - 0.4, -0.6), xlabel="verdicts that are right, %")
     ax.set_ylabel("small errors of the test")
     ax.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=len(sizes), fontsize=8)
+    return figure
+
+
+def plot_reliability(points: Sequence[Reliability]) -> Figure:
+    """Reliability diagram: the share of claims that are right against the probability that they were told with."""
+    figure, ax = new_figure(width=5.5, height=5)
+    ax.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color=GREY, alpha=0.25, linewidth=0, label="within 0.1")
+    ax.plot([0, 1], [0, 1], color=GREY, linewidth=1)
+    # two binomial standard deviations of a share of so few
+    bars = [2 * (max(p.right * (1 - p.right), 0.25 / p.claims) / p.claims) ** 0.5 for p in points]
+    x, y = [p.probability for p in points], [p.right for p in points]
+    ax.errorbar(x, y, bars, fmt="o", color=COLOURS[0], capsize=3, label="± 2 standard deviations")
+    for point in points:
+        beside = (8, -12) if point.probability < 0.7 else (-60, -12)
+        ax.annotate(f"{point.claims} claims", (point.probability, point.right), beside, textcoords="offset points")
+    ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="probability told", ylabel="share right")
+    ax.legend(loc="upper left", fontsize=8)
     return figure
 
 

@@ -158,7 +158,7 @@ def _case(
     nominal = Plant.of(bench.rig).solved()
     real = hide(dirty, effects).solved()
     if dirt != Dirt() and effects:
-        _check_strong(bench, tests, nominal, dirty.solved(), real, rng)
+        _check_strong(bench, tests, effects, nominal, dirty.solved(), real, rng)
     fit: list[Record] = []
     validation: list[Record] = []
     figures = {}
@@ -196,13 +196,18 @@ def _case(
 def _check_strong(
     bench: Bench,
     tests: dict[str, np.ndarray],
+    effects: list[dict[str, Any]],
     nominal: SolvedPlant,
     dirty: SolvedPlant,
     real: SolvedPlant,
     rng: np.random.Generator,
 ) -> None:
-    """Some record to fit must show the effects at least nearly as strongly as the dirt, else nothing strong hides."""
-    ratios = []
+    """Some record to fit must show the effects well, and at least nearly as strongly as the dirt.
+
+    Else nothing strong hides: what alters the readings by less than a diagnosis explains has no right name.
+    """
+    rounded = any(e["kind"] == "sensor_quantisation" for e in effects)
+    gaps, ratios = [], []
     for test, commands in tests.items():
         if test == "validate":
             continue
@@ -212,7 +217,10 @@ def _check_strong(
             y.append(plant.readings(moved, bench.sample_time))
         if not np.isfinite(y).all():
             raise Unsuitable("the altered structure runs away")
-        ratios.append(_gap(y[2], y[1]) / max(_gap(y[1], y[0]), 1e-12))
+        gaps.append(_gap(y[2], y[1]))
+        ratios.append(gaps[-1] / max(_gap(y[1], y[0]), 1e-12))
+    if not rounded and max(gaps) < VISIBLE:
+        raise Unsuitable(f"the effects alone alter the readings by {max(gaps):.2g}, at most")
     if max(ratios) < STRONG:
         raise Unsuitable(f"the effects make {max(ratios):.2g} times the gap that the dirt makes, at most")
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,15 @@ NEAR = 0.02  # of the length: how far off a place may be
 NEAR_IN_DIRT = 0.03  # likewise beside the small errors of a real test
 HONEST = 0.05  # of the nominal residual's mean square: how far off a budget's unexplained share may be
 NORMAL_95 = 1.96  # standard deviations on each side of a 95 % interval
+BINS = 5  # of a reliability diagram, of equal width
+
+
+class Reliability(NamedTuple):
+    """Claims of about one probability: the mean of that, the share of them that are right, how many they are."""
+
+    probability: float
+    right: float
+    claims: int
 
 
 @dataclass(frozen=True)
@@ -90,7 +99,9 @@ def score_dirty(
         "wrong": a kind, or a channel, is named that does not hide; "false_alarm": anything is, and nothing hides;
         "position_errors": of effects named rightly, shares of the length;
         "covered": (within their 95 % interval, of) of the numbers and places of those effects;
-        "budget_error": of the unexplained share; None without a budget, or where not all that hides is named}.
+        "budget_error": of the unexplained share; None without a budget, or where not all that hides is named;
+        "claims": (probability, whether it is right) of the set named and of each alternative, where a gap is explained
+        by effects; an alternative is right that has the kinds of what hides}.
     """
     hidden = [e for e in label["effects"] if e["kind"] not in (NONE, UNKNOWN)]
     told = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
@@ -113,7 +124,30 @@ def score_dirty(
         "position_errors": errors,
         "covered": (sum(covered), len(covered)),
         "budget_error": off,
+        "claims": _claims(verdict, label, complete) if told and verdict.get("outcome") == "explained" else [],
     }
+
+
+def _claims(verdict: dict[str, Any], label: dict[str, Any], complete: bool) -> list[tuple[float, bool]]:
+    kinds = _words(label["effects"])
+    others = [(o["probability"], _words_of(o["kind"]) == kinds) for o in verdict.get("alternatives", [])]
+    return [(1.0 - sum(p for p, _ in others), complete), *others]
+
+
+def _words_of(named: str) -> str:
+    """The kinds of a set that is named by the labels of its effects, in words."""
+    return " + ".join(sorted(one.split("[")[0] for one in named.split(" + ")))
+
+
+def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:
+    """How often claims of a probability are right: one entry for each of five equal ranges that holds any.
+
+    The points of a reliability diagram (Murphy & Winkler, Applied Statistics 26 (1977) 41).
+    """
+    claims = np.array([claim for s in scores for claim in s["claims"]], float).reshape(-1, 2)
+    ranges = np.minimum((claims[:, 0] * BINS).astype(int), BINS - 1)
+    there = [claims[ranges == k] for k in range(BINS)]
+    return [Reliability(*map(float, some.mean(axis=0)), len(some)) for some in there if len(some)]
 
 
 def tally_dirty(scores: Iterable[dict[str, Any]]) -> dict[str, float]:
