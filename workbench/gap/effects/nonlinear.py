@@ -262,7 +262,9 @@ COULOMB_FRICTION = Kind(
 
 
 def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
-    for place in evidence.at_peaks[:2]:
+    # between named points the likeliest places are not neighbours of the right one: it may come third
+    most = None if isinstance(evidence.rig.modes.domain, NamedPoints) else 2
+    for place in evidence.at_peaks[:most]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
             k = strength_along(place.force, hysteresis(place.displacement, share * size))
