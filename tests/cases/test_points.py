@@ -10,12 +10,14 @@ from workbench.cases.points import read_points, write_points
 from workbench.cases.tables import CaseError
 from workbench.cases.writing import write_case
 from workbench.records.record import Channel, Record
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.elements import LinearSpring
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
+from workbench.rig.statespace import input_matrix
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Rectangle
+from workbench.structure.member import Beam
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
 
@@ -77,6 +79,12 @@ def test_a_plate_is_read_with_its_places(tmp_path):
     assert rig.structure is not None and rig.modes.zeta == pytest.approx([0.01] * 4)
 
 
+def test_a_patch_is_read_with_its_sides_and_its_axis(tmp_path):
+    rig = read_case(written(tmp_path, PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\npatch = [0.2, 0.1]\naxis = "y"'))).rig
+    (patch,) = rig.actuators
+    assert patch == piezo_patch("F1", (0.3, 0.2), length=(0.2, 0.1), direction="y")
+
+
 def test_named_points_are_read_with_their_shapes(tmp_path):
     rig = read_case(written(tmp_path, FRAME)).rig
     np.testing.assert_array_equal(rig.modes.phi(rig.sensors[0].at), [[1.5, -1.0]])
@@ -107,7 +115,12 @@ def test_a_written_plate_is_read_as_it_was(tmp_path):
     )
     rig = Rig(
         plate.modes(3),
-        (Actuator("F", (0.5, 0.1)), Actuator("tap", (0.2, 0.3), direct=True)),
+        (
+            Actuator("F", (0.5, 0.1)),
+            Actuator("tap", (0.2, 0.3), direct=True),
+            piezo_patch("P", (0.3, 0.1), length=(0.2, 0.1)),
+            piezo_patch("M", (0.4, 0.3), length=(0.1, 0.1), direction="x"),
+        ),
         (Sensor("a", (0.3, 0.2), "acceleration", noise_std=0.01),),
         structure=plate,
     )
@@ -123,6 +136,18 @@ def test_a_written_plate_is_read_as_it_was(tmp_path):
     ):
         with pytest.raises(ValueError, match=words):
             again(replace(rig, structure=replace(plate, **change)), tmp_path / "no")
+
+
+def test_a_written_beam_with_a_patch_is_read_as_it_was(tmp_path):
+    beam = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="clamped", right="free",
+        damping=ModalDamping(0.01),
+    )  # fmt: skip
+    sensors = (Sensor("a", 1.7, "acceleration", noise_std=0.01),)
+    rig = Rig(beam.modes(4), (piezo_patch("P", 0.3, length=0.2),), sensors, structure=beam)
+    read = again(rig, tmp_path)
+    np.testing.assert_allclose(input_matrix(read.modes, read.actuators), input_matrix(rig.modes, rig.actuators))
+    assert read.actuators[0].kind == "moment"
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["positions known", "not known"])
@@ -174,6 +199,12 @@ def test_points_go_through_a_file_unchanged(tmp_path):
     [
         (PLATE.replace("[0.5, 0.4]", "[0.5, 1.4]"), POINTS, r"\(0.5, 1.4\) lies outside the structure"),
         (PLATE.replace("[0.5, 0.4]", "0.5"), POINTS, "at must be a list of 2 numbers; got 0.5"),
+        (PLATE.replace("[0.3, 0.2]", "[0.3, 0.2]\npatch = 0.1"), POINTS, "'F1': patch must be a list of 2 numbers"),
+        (PLATE.replace("[0.3, 0.2]", "[0.05, 0.2]\npatch = [0.2, 0.1]"), POINTS, "'F1': a patch of 0.2 m by 0.1 m at"),
+        (PLATE.replace("[0.3, 0.2]", "[0.3, 0.2]\npatch = [0.2, 0.1]\naxis = 1"), POINTS, "axis is x or y"),
+        (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\naxis = "x"'), POINTS, "give patch, its two sides"),
+        (PLATE.replace('"actuator"\nat', '"hammer"\npatch = [0.2, 0.1]\nat'), POINTS, "a patch is no hammer"),
+        (FRAME.replace('"a.x"', '"a.x"\npatch = [0.2, 0.1]'), POINTS, "no key 'patch'"),
         (PLATE.replace("bottom =", "botom ="), POINTS, "did you mean 'bottom'"),
         (PLATE.replace('left = "simply', 'left = "hardly'), POINTS, "hardly supported"),
         (FRAME.replace('"b.y"', '"c.y"'), POINTS, "there is no point 'c.y'; the points are a.x, a.y, b.y"),

@@ -258,6 +258,24 @@ def test_laws_on_a_plate_are_compared_with_an_observer(plate, tmp_path):
     assert all(row["margin"] == pytest.approx(-max(row["poles_real"])) for row in through)
 
 
+def test_patches_on_a_plate_are_placed_and_designed(plate, tmp_path):
+    text = plate.read_text()
+    for at in ("[0.3, 0.24]", "[0.84, 0.52]"):
+        text = text.replace(f"at = {at}", f"at = {at}\npatch = [0.2, 0.15]")
+    plate.write_text(text)
+    found = tmp_path / "places.json"
+    result = run("place", plate, "--control", 2, "--weight", 10, "--json", found)
+    assert result.exit_code == 0, result.output
+    best, own = json.loads(found.read_text())["placements"]
+    assert own["positions"] == [[0.3, 0.24], [0.84, 0.52]] and best["residual_work"] < own["residual_work"]
+    assert all(0.1 <= x <= 1.1 and 0.075 <= y <= 0.725 for x, y in best["positions"])
+    result = run("design", plate, "--control", 2, "--weight", 10)
+    assert result.exit_code == 0 and "IMSC" in result.output, result.output
+    plate.write_text(text.replace("patch = [0.2, 0.15]", "patch = [0.2, 0.1]", 1))
+    result = run("place", plate, "--control", 2)
+    assert result.exit_code == 2 and "F2 is no patch like F1" in " ".join(result.output.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -25,7 +25,7 @@ from workbench.records.files import read_record
 from workbench.records.limits import check_size
 from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import HOLDS, Channel, Record
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
@@ -56,6 +56,7 @@ PLATE = (
 EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
+PATCH = ("patch", "axis")  # of an input along a beam or on a plate
 RECORD = ("name", "file", "sample_time", "use", "input_hold")
 
 
@@ -148,7 +149,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
-    _check_ports(inputs, outputs, "at")
+    _check_ports(inputs, outputs, "at", more=PATCH[:1] if kind == "beam" else ())
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
@@ -166,14 +167,14 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     else:
         structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
-    actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]")) for e in inputs)
+    actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]"), modes) for e in inputs)
     sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]")) for e in outputs)
     return Rig(modes, actuators, sensors, structure=structure)
 
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     check_keys(table, PLATE, "[structure]")
-    _check_ports(inputs, outputs, "at")
+    _check_ports(inputs, outputs, "at", more=PATCH)
     edges = table.get("edges")
     if not isinstance(edges, dict):
         raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
@@ -194,7 +195,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         modes.domain.locate((x, y))
         return (float(x), float(y))
 
-    actuators = tuple(_actuator(e, pair(e, "[[input]]")) for e in inputs)
+    actuators = tuple(_actuator(e, pair(e, "[[input]]"), modes) for e in inputs)
     return Rig(modes, actuators, tuple(_sensor(e, pair(e, "[[output]]")) for e in outputs), structure=structure)
 
 
@@ -260,8 +261,10 @@ def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
     return np.diag(rates)
 
 
-def _check_ports(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], *places: str) -> None:
-    for key, entries, keys in (("input", inputs, INPUT), ("output", outputs, OUTPUT)):
+def _check_ports(
+    inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], *places: str, more: tuple[str, ...] = ()
+) -> None:
+    for key, entries, keys in (("input", inputs, (*INPUT, *more)), ("output", outputs, OUTPUT)):
         for entry in entries:
             check_keys(entry, (*keys, *places), f"[[{key}]] {entry['name']!r}")
 
@@ -273,11 +276,30 @@ def _place(entry: dict[str, Any], length: float, where: str) -> float:
     return at
 
 
-def _actuator(entry: dict[str, Any], at: Place) -> Actuator:
-    kind = entry.get("kind")
+def _actuator(entry: dict[str, Any], at: Place, modes: Modes | None = None) -> Actuator:
+    """An input; on a beam or a plate, whose modes are given, it may be a piezo patch."""
+    kind, where = entry.get("kind"), f"[[input]] {entry['name']!r}"
     if kind not in ("actuator", "hammer"):
-        raise CaseError(f"[[input]] {entry['name']!r}: kind is actuator or hammer; got {shown(kind)}")
-    return Actuator(entry["name"], at, direct=kind == "hammer")
+        raise CaseError(f"{where}: kind is actuator or hammer; got {shown(kind)}")
+    if "patch" not in entry or modes is None:
+        if "axis" in entry:
+            raise CaseError(
+                f"{where}: axis is of the moments of a patch; give patch, its two sides in m, or leave it out"
+            )
+        return Actuator(entry["name"], at, direct=kind == "hammer")
+    if kind == "hammer":
+        raise CaseError(f"{where}: a patch is no hammer; its kind is actuator")
+    on_plate = isinstance(at, tuple)
+    sides = numbers(entry, "patch", where, 2).tolist() if on_plate else number(entry, "patch", where)
+    axis = entry.get("axis")
+    if axis not in (None, "x", "y"):
+        raise CaseError(f"{where}: axis is x or y, or left out for moments about both; got {shown(axis)}")
+    try:
+        patch = piezo_patch(entry["name"], at, length=tuple(sides) if on_plate else sides, direction=axis)
+        modes.phi_at(patch.at, 1, direction=axis)
+    except ValueError as error:
+        raise CaseError(f"{where}: {error}") from error
+    return patch
 
 
 def _sensor(entry: dict[str, Any], at: Place) -> Sensor:

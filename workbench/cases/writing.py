@@ -14,7 +14,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.domain import Between, NamedPoints, Patch, middle, position
 from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Plate
@@ -23,6 +23,7 @@ from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
 Support = TypeVar("Support", End, Edge)
+Port = Actuator | Sensor
 
 
 def write_case(case: Case, folder: str | Path) -> Path:
@@ -34,7 +35,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
     Raises:
         ValueError: what the format cannot say: profiles that are not linear between their breaks, a plate that varies,
             attachments, ends or edges without a name, damping that differs from mode to mode of a structure or couples
-            modes, an input that is no ideal point force, elements.
+            modes, an input that is no ideal point force or piezo patch, elements.
     """
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
@@ -64,9 +65,9 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
     _check_ports(rig)
     structure, points = rig.structure, rig.modes.domain
     if isinstance(structure, Structure):
-        return [_member(structure, rig.modes.n_modes), *_ports(rig, at=lambda where: {"at": where})]
+        return [_member(structure, rig.modes.n_modes), *_ports(rig, at=_along)]
     if isinstance(structure, Plate):
-        return [_plate(structure, rig.modes.n_modes), *_ports(rig, at=lambda where: {"at": list(where)})]
+        return [_plate(structure, rig.modes.n_modes), *_ports(rig, at=_over)]
     if not isinstance(points, NamedPoints):
         raise ValueError(
             "a case folder describes a beam, a rod, a plate, or modes at named points; this is a membrane, or a rig"
@@ -74,14 +75,14 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
         )
     if points.positions is not None:
         write_points(folder / POINTS, points, rig.modes.phi(points.names))
-        return [_modal(rig.modes, points=POINTS), *_ports(rig, at=lambda where: {"point": where})]
+        return [_modal(rig.modes, points=POINTS), *_ports(rig, at=lambda port: {"point": port.at})]
     unused = set(points.names) - {a.at for a in rig.actuators} - {s.at for s in rig.sensors}
     if unused:
         raise ValueError(
             f"point {sorted(unused)[0]!r} has no position and is neither input nor output, so the format has no place"
             " for it; give the points positions"
         )
-    return [_modal(rig.modes), *_ports(rig, at=lambda where: {"shape": rig.modes.phi(where)[0].tolist()})]
+    return [_modal(rig.modes), *_ports(rig, at=lambda port: {"shape": rig.modes.phi(port.at)[0].tolist()})]
 
 
 def _member(member: Structure, n_modes: int) -> str:
@@ -178,27 +179,49 @@ def _check_ports(rig: Rig) -> None:
         raise ValueError(
             f"the case format knows no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
         )
-    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+    ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
     for port in ports:
-        plain = type(port)(port.name, port.at)  # type: ignore[arg-type]
-        kept = ("direct",) if isinstance(port, Actuator) else ("quantity", "noise_std")
+        patch = isinstance(port, Actuator) and _is_patch(port, rig)
+        kind = "moment" if patch else "force"
+        plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, kind)
+        kept = ("direction",) if patch else ("direct",) if isinstance(port, Actuator) else ("quantity", "noise_std")
         other = [f.name for f in fields(port) if f.name not in kept and getattr(port, f.name) != getattr(plain, f.name)]
-        if other or isinstance(port.at, Between):
+        if other or (isinstance(port.at, Between) and not patch):
             raise ValueError(
                 f"{port.name!r} has {other[0] if other else 'two places'} beside what the case format holds: a point"
-                " force or a reading at one place, with nothing lost on the way"
+                " force, a piezo patch or a reading at one place, with nothing lost on the way"
             )
 
 
-def _ports(rig: Rig, *, at: Callable[[Any], dict[str, object]]) -> list[str]:
-    """Inputs and outputs; `at` gives the key of a place and its value."""
+def _is_patch(actuator: Actuator, rig: Rig) -> bool:
+    on_beam = isinstance(rig.structure, Beam) and isinstance(actuator.at, Between) and actuator.kind == "moment"
+    return isinstance(actuator.at, Patch) or on_beam
+
+
+def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
+    """Inputs and outputs; `at` gives the keys of a place and their values."""
     inputs = [
-        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", **at(a.at)) for a in rig.actuators
+        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", **at(a)) for a in rig.actuators
     ]
     outputs = [
-        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s.at), noise_std=s.noise_std) for s in rig.sensors
+        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), noise_std=s.noise_std) for s in rig.sensors
     ]
     return [*inputs, *outputs]
+
+
+def _along(port: Port) -> dict[str, Any]:
+    """Its place along a member, and the length of a patch."""
+    if isinstance(port.at, Between):
+        return {"at": middle(port.at), "patch": position(port.at.first) - position(port.at.second)}
+    return {"at": port.at}
+
+
+def _over(port: Port) -> dict[str, Any]:
+    """Its place on a plate, and the sides and the axis of a patch."""
+    if isinstance(port.at, Patch):
+        axis = {} if port.direction is None else {"axis": port.direction}
+        return {"at": list(port.at[:2]), "patch": [port.at.width, port.at.height], **axis}
+    return {"at": list(port.at)}  # type: ignore[arg-type]
 
 
 def _table(header: str, **entries: object) -> str:

@@ -9,13 +9,14 @@ from rich.table import Table
 
 from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import JsonPath, console, guarded, progress_bar, reporter, say, short, write_json
-from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Place, Rectangle
+from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, middle, reach
 from workbench.structure.printed import place_text
 
 if TYPE_CHECKING:
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import PlacementTask
     from workbench.design.placement.task import Placement
+    from workbench.rig.actuators import Actuator
     from workbench.rig.rig import Rig
 
 LEAST_SPACING = 1 / 20  # of the size of the structure, unless one is given
@@ -50,7 +51,7 @@ def place(
     ] = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Place actuators for the least spillover work, within the limits of a rig.
+    """Place actuators for the least spillover work, within the limits of a rig; its piezo patches, where it has some.
 
     Example: workbench place case.toml --control 3 --weight 20 --effort 1.2 --forbid 0.2:0.3 --proof 0.05
     """
@@ -72,7 +73,7 @@ def place(
     domain = modes.domain
     with progress_bar() as progress:
         report = reporter(progress, "placing actuators")
-        task = placement_task(modes, control, impulse_at=struck, weight=weight)
+        task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=_placed(found))
         if isinstance(domain, Interval):
             usual = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
         else:
@@ -140,9 +141,32 @@ def place(
     )
 
 
+def _placed(rig: "Rig") -> "Actuator | None":
+    """The rig's piezo patch that is to be placed; None where its actuators are point forces.
+
+    Raises:
+        ValueError: actuators that differ in more than their place.
+    """
+    import numpy as np
+
+    own, domain = [a for a in rig.actuators if not a.direct], rig.modes.domain
+    patch = next((a for a in own if a.kind == "moment"), None)
+    if patch is None or isinstance(domain, NamedPoints):
+        return None
+    half = reach(domain, patch.at)[0]
+    for other in own:
+        alike = (other.kind, other.direction) == (patch.kind, patch.direction)
+        if not (alike and np.allclose(reach(domain, other.at)[0], half)):
+            raise ValueError(
+                f"actuators of one kind are placed, and {other.name} is no patch like {patch.name}: give them one size"
+                " and axis, or describe point forces"
+            )
+    return patch
+
+
 def _own(rig: "Rig", control: int) -> list[Place]:
     """Where the rig's own actuators stand; as many as there are controlled modes."""
-    own = [a.at for a in rig.actuators if not a.direct and not isinstance(a.at, Between)]
+    own = [middle(a.at) for a in rig.actuators if not a.direct]
     if len(own) != control:
         raise ValueError(
             f"--effort counts from the rig's own actuators here, and there are {len(own)} for {control} modes:"

@@ -143,7 +143,7 @@ class _Net:
         rest: (n_spots, 2) at rest, m, as they are seen.
         lines: pairs of spots that are joined.
         moves: modes -> (n_spots, 2, n_modes) displacements as they are seen.
-        at: place -> (2,) where it is seen.
+        at: place -> (2,) where it, or the middle of a patch, is seen.
     """
 
     rest: np.ndarray
@@ -175,7 +175,7 @@ def _plate_net(domain: Rectangle) -> _Net:
         up = modes.phi(places)
         return np.stack([np.zeros_like(up), up], axis=1)
 
-    return _Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place) @ flat))
+    return _Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place)[:2] @ flat))
 
 
 def _frame_net(domain: Domain) -> _Net:

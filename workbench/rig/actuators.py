@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.structure.domain import Between, Where, same_place
+from workbench.structure.domain import Between, Patch, Place, PlaceError, Where, centred_at, same_place
 
 
 @dataclass(frozen=True)
@@ -15,9 +15,9 @@ class Actuator:
 
     Attributes:
         name: of the input.
-        at: its place on the structure: x (m), (x, y), the name of a point, or `Between` two of these, where it acts
-            on the first and, opposite, on the second.
-        kind: "force" (N) or "moment" (N m).
+        at: its place on the structure: x (m), (x, y), the name of a point, `Between` two of these, where it acts on
+            the first and, opposite, on the second, or a `Patch` of a plate, where it acts along the edges.
+        kind: "force" (N) or "moment" (N m; of a patch, N m/m).
         hysteresis_share: of u that goes through z: (1 - share) u + share z, z' = u' - (|u'| z + u' |z|) / (2 width).
         hysteresis_width: the z that large commands come to.
         gain: force per command.
@@ -50,6 +50,8 @@ class Actuator:
         object.__setattr__(self, "at", same_place(self.at))
         if self.kind not in ("force", "moment"):
             raise ValueError(f"actuator {self.name}: kind is force or moment; got {self.kind!r}")
+        if isinstance(self.at, Patch) and self.kind != "moment":
+            raise ValueError(f"actuator {self.name} acts by moments along the edges of its patch; give kind='moment'")
         for quantity in ("dead_zone", "delay", "time_constant"):
             if not (np.isfinite(getattr(self, quantity)) and getattr(self, quantity) >= 0):
                 raise ValueError(f"actuator {self.name}: {quantity} must be 0 or more; got {getattr(self, quantity)}")
@@ -64,19 +66,42 @@ class Actuator:
         return bool(unbounded and not (self.dead_zone or self.delay or self.hysteresis_share or self.bias))
 
 
-def piezo_patch(name: str, at: float, *, length: float, gain: float = 1.0) -> Actuator:
-    """A piezo patch on a beam: the pair of opposite moments ± gain u at its ends, x = at ± length/2.
+def piezo_patch(
+    name: str,
+    at: Place,
+    *,
+    length: float | tuple[float, float],
+    gain: float = 1.0,
+    direction: str | None = None,
+) -> Actuator:
+    """A piezo patch on a beam or a plate: moments along its ends or edges, opposite ones of opposite sign.
 
-    The modal force is gain u (φ_r'(at + length/2) - φ_r'(at - length/2)); Crawley & de Luis, AIAA J. 25 (1987) 1373.
+    On a beam ± gain u at x = at ± length/2, and the modal force is gain u (φ_r'(at + length/2) - φ_r'(at - length/2));
+    Crawley & de Luis, AIAA J. 25 (1987) 1373. On a plate line moments gain u along its four edges, and the modal force
+    is gain u ∮ ∂φ_r/∂n ds, n outward; Dimitriadis, Fuller & Rogers, J. Vib. Acoust. 113 (1991) 100.
 
     Args:
-        at: its middle, m.
-        length: m.
-        gain: moment per command, N m/V where the command is a voltage.
+        at: its middle: x, or (x, y) on a plate, m.
+        length: m; on a plate (width along x, height along y).
+        gain: moment per command, N m/V where the command is a voltage; on a plate moment per length, N m/(m V).
+        direction: of a patch on a plate that acts one way only: "y", about which the moments on the two edges across x
+            act, or "x" for the other two.
 
     Raises:
-        ValueError: a length that is not positive.
+        ValueError: a length that is not positive, one length of a patch on a plate.
     """
-    if not (np.isfinite(length) and length > 0):
-        raise ValueError(f"piezo patch {name}: its length must be positive; got {length}")
-    return Actuator(name, Between(at + 0.5 * length, at - 0.5 * length), kind="moment", gain=gain)
+    sides = np.atleast_1d(np.asarray(length, float))
+    on_plate = np.ndim(at) == 1
+    if sides.shape != ((2,) if on_plate else (1,)):
+        wanted = "a patch on a plate has two, (width, height)" if on_plate else "a patch on a beam has one"
+        raise ValueError(f"piezo patch {name}: {wanted}, m; got {length}")
+    if not (np.isfinite(sides) & (sides > 0)).all():
+        raise ValueError(f"piezo patch {name}: its length must be positive, m; got {length}")
+    try:
+        x, *y = (float(each) for each in np.atleast_1d(np.asarray(at, float)))
+    except (TypeError, ValueError):
+        raise PlaceError(
+            f"piezo patch {name}: its middle is x along a beam, or (x, y) on a plate; got {at!r}"
+        ) from None
+    where: Where = Patch(x, *y, *sides.tolist()) if on_plate else centred_at(Between(sides[0], 0.0), x)
+    return Actuator(name, where, kind="moment", gain=gain, direction=direction)

@@ -50,7 +50,7 @@ from workbench.rig.stepping import (
     ramped,
     step_record,
 )
-from workbench.structure.domain import Between
+from workbench.structure.domain import Between, Patch
 
 LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
@@ -239,7 +239,7 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
 def participation_of(rig: Rig) -> np.ndarray:
     """(n_modes, n_actuators), the actuators' gains left out: those belong to the path before the structure."""
     shapes = np.empty((rig.modes.n_modes, len(rig.actuators)))
-    kinds = [(a.kind, a.direction, isinstance(a.at, Between)) for a in rig.actuators]
+    kinds = [(a.kind, a.direction, isinstance(a.at, Between | Patch)) for a in rig.actuators]
     for kind, direction, apart in set(kinds):
         group = [j for j, other in enumerate(kinds) if other == (kind, direction, apart)]
         at, derivative = [rig.actuators[j].at for j in group], 1 if kind == "moment" else 0

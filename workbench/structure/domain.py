@@ -1,7 +1,8 @@
 """Which places a structure has: along an interval, over a rectangle, or at named points.
 
 A place is a float (m, along an interval), a pair (x, y) of floats (m, on a rectangle) or a name (of a point). What acts
-between two places, on the displacement of the first less that of the second, stands at `Between(first, second)`.
+between two places, on the displacement of the first less that of the second, stands at `Between(first, second)`. What
+acts along the edges of a patch of a plate stands at `Patch(x, y, width, height)`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,16 @@ class Between(NamedTuple):
     second: Place
 
 
-Where = Place | Between
+class Patch(NamedTuple):
+    """A rectangular patch of a plate, m: its middle (x, y), its width along x and its height along y."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+
+
+Where = Place | Between | Patch
 Derivative = int | tuple[int, int]
 
 
@@ -178,6 +188,48 @@ class Rectangle:
             raise PlaceError(f"a slope or moment on a plate is about an axis: direction 'x' or 'y'; got {direction!r}")
         raise PlaceError(f"a plate moves along its normal, direction 'z' or none; got {direction!r}")
 
+    def around(
+        self, patches: Any, direction: str | None, n: int
+    ) -> Iterator[tuple[np.ndarray, tuple[int, int], Floats]]:
+        """The edges of patches, one pair of opposite ones after the other, for ∮ ∂w/∂n ds along them.
+
+        Args:
+            patches: (n_patches, 4) middle, width and height, m.
+            direction: "y" for the two edges across x, whose moments act about y, "x" for the two across y; None for
+                all four.
+            n: Gauss-Legendre points of an edge.
+
+        Yields:
+            Points (n_patches, 2 n, 2), the derivative along their outward normal, and weights (n_patches, 2 n), m,
+            negative where the normal is.
+
+        Raises:
+            PlaceError: a patch that reaches outside, or another axis.
+        """
+        if direction not in (None, "x", "y"):
+            raise PlaceError(f"the moments of a patch act about axis 'x' or 'y', or both (None); got {direction!r}")
+        found = np.asarray(patches, float).reshape(-1, 4)
+        middle, half = found[:, :2], 0.5 * found[:, 2:]
+        outside = (
+            (half <= 0) | (middle - half < -SLACK * self.size) | (middle + half > np.array(self.length) * (1 + SLACK))
+        )
+        if (outside.any(axis=1) | ~np.isfinite(found).all(axis=1)).any():
+            x, y, width, height = found[np.argmax(outside.any(axis=1))]
+            raise PlaceError(
+                f"a patch of {width:g} m by {height:g} m at (x, y) = ({x:g}, {y:g}) does not lie on the structure, 0 to"
+                f" {self.length[0]:g} by 0 to {self.length[1]:g}; move its middle, or make it smaller"
+            )
+        points, weights = _gauss(n)
+        for across, axis in ((0, "y"), (1, "x")):
+            if direction not in (None, axis):
+                continue
+            along = middle[:, 1 - across, None] + half[:, 1 - across, None] * points
+            edges = [np.broadcast_to(middle[:, across, None] + s * half[:, across, None], along.shape) for s in (1, -1)]
+            pairs = [(edge, along) if across == 0 else (along, edge) for edge in edges]
+            at = np.concatenate([np.stack(pair, axis=-1) for pair in pairs], axis=1)
+            weight = half[:, 1 - across, None] * weights
+            yield at, ((1, 0), (0, 1))[across], np.concatenate([weight, -weight], axis=1)
+
     def grid(self, n: int) -> tuple[tuple[float, float], ...]:
         """Places inside, `n` spacings along the longer side and as many a metre along the other."""
         spacing = max(self.length) / n
@@ -208,6 +260,8 @@ class Rectangle:
         """How a place is written: (x, y) = (0.63, 0.72)."""
         if isinstance(place, Between):
             return f"between {self.text(place.first)} and {self.text(place.second)}"
+        if isinstance(place, Patch):
+            return f"a patch of {place.width:.3g} m by {place.height:.3g} m at {self.text((place.x, place.y))}"
         (x, y), *_ = self.locate(place)
         return f"(x, y) = ({x:.3g}, {y:.3g})"
 
@@ -386,7 +440,7 @@ def as_domain(domain: Domain | float) -> Domain:
 
 
 def same_place(place: Any) -> Any:
-    """A place in a form that can be kept and compared: a float, a pair of floats, a name, or `Between` two of these.
+    """A place in a form that can be kept and compared: a float, a pair of floats, a name, `Between` two, or a `Patch`.
 
     Raises:
         PlaceError: nothing of the kind.
@@ -395,6 +449,8 @@ def same_place(place: Any) -> Any:
         return place
     if isinstance(place, Between):
         return Between(same_place(place.first), same_place(place.second))
+    if isinstance(place, Patch):
+        return Patch(*map(float, place))
     try:
         values = np.asarray(place, float)
         if values.shape in ((), (1,)):
@@ -404,6 +460,40 @@ def same_place(place: Any) -> Any:
     except (TypeError, ValueError):
         pass
     raise PlaceError(f"a place is a position x, a pair (x, y), or the name of a point; got {place!r}")
+
+
+def middle(where: Where) -> Place:
+    """The middle of a patch or of the stretch between two positions; a place itself.
+
+    Raises:
+        PlaceError: between two places that are no positions along an interval.
+    """
+    if isinstance(where, Patch):
+        return (where.x, where.y)
+    if isinstance(where, Between):
+        return 0.5 * (position(where.first) + position(where.second))
+    return where
+
+
+def centred_at(where: Where, at: Place) -> Where:
+    """A place, or a patch or the stretch between two positions with its middle there."""
+    if isinstance(where, Patch):
+        x, y = at  # type: ignore[misc]
+        return Patch(x, y, where.width, where.height)  # type: ignore[arg-type]
+    if isinstance(where, Between) and not isinstance(where.first, str | tuple):
+        half, x = 0.5 * (position(where.first) - position(where.second)), position(at)
+        return Between(x + half, x - half)
+    return at
+
+
+def reach(domain: Interval | Rectangle, where: Where) -> tuple[np.ndarray, np.ndarray]:
+    """Where the middle of what stands at a place can stand at most: from, to (n_coordinates,) m."""
+    half = np.zeros(len(domain.coordinates))
+    if isinstance(where, Patch):
+        half = 0.5 * np.array([where.width, where.height])
+    elif isinstance(where, Between) and isinstance(domain, Interval):
+        half = np.array([0.5 * abs(position(where.first) - position(where.second))])
+    return half, np.atleast_1d(domain.length) - half
 
 
 def _unordered(place: Where) -> Any:

@@ -10,11 +10,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.arrays import Complexes, Floats, Integers
-from workbench.structure.domain import Between, Derivative, Domain, Interval, NamedPoints, Where, as_domain
+from workbench.structure.domain import (
+    Between,
+    Derivative,
+    Domain,
+    Interval,
+    NamedPoints,
+    Patch,
+    PlaceError,
+    Rectangle,
+    Where,
+    as_domain,
+)
 from workbench.structure.printed import Printed, counted
 
 Shapes = Callable[[np.ndarray, Any], np.ndarray]
 HELD = 1e-9  # of the largest motion anywhere: what moves less is held by a support
+EDGE_POINTS = 12, 2.0  # of a patch's edge, for its integrals: besides, and for each half wave that may lie on it
+PATCHES_AT_ONCE = 256
 
 
 def frozen(array: ArrayLike, dtype: type = float) -> np.ndarray:
@@ -158,13 +171,46 @@ class Modes(Printed):
         return found if sign == 1.0 else sign * found
 
     def phi_at(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> Floats:
-        """Mode shapes (n_modes,) at one place, or at the first of two less those at the second."""
+        """Mode shapes (n_modes,) at a place, at the first of two less those at the second, or ∮ ∂φ/∂n ds of a patch."""
         if isinstance(where, Between):
             first, second = (self.phi(place, derivative, direction=direction)[0] for place in where)
             difference: Floats = first - second
             return difference
+        if isinstance(where, Patch):
+            if derivative != 1:
+                raise PlaceError("a patch turns a plate by moments along its edges and has no force or displacement")
+            turned: Floats = self.edge_slopes([where], direction=direction)[0]
+            return turned
         shape: Floats = self.phi(where, derivative, direction=direction)[0]
         return shape
+
+    def edge_slopes(self, patches: Any, *, direction: str | None = None) -> Floats:
+        """Slopes across the edges of patches of a plate, integrated along them: (n_patches, n_modes).
+
+        ∮ ∂φ_r/∂n ds with n outward: the modal force of a line moment of 1 N m/m along all four edges, equal to
+        ∫∫ ∇²φ_r dA (Dimitriadis, Fuller & Rogers, J. Vib. Acoust. 113 (1991) 100).
+
+        Args:
+            patches: (n_patches, 4) middle (x, y), width and height, m.
+            direction: "y" for the two edges across x alone, whose moments act about y; "x" for the other two.
+
+        Raises:
+            PlaceError: another domain, or a patch that reaches outside.
+        """
+        if not isinstance(self.domain, Rectangle):
+            raise PlaceError(f"a patch has its place on a plate; these modes are of {self.domain}")
+        found = np.asarray(patches, float).reshape(-1, 4)
+        if len(found) > PATCHES_AT_ONCE:
+            parts = np.array_split(found, -(-len(found) // PATCHES_AT_ONCE))
+            return np.concatenate([self.edge_slopes(part, direction=direction) for part in parts])
+        # no mode of so many has more half waves along a side than its number
+        besides, each = EDGE_POINTS
+        n_points = besides + round(each * self.n_modes * (found[:, 2:] / self.domain.length).clip(0, 1).max(initial=0))
+        total = np.zeros((len(found), self.n_modes))
+        for at, derivative, weights in self.domain.around(found, direction, n_points):
+            slopes = self.phi(at.reshape(-1, 2), derivative).reshape(*weights.shape, -1)
+            total += np.einsum("pk,pkr->pr", weights, slopes)
+        return total
 
     def is_held(self, where: Where, derivative: Derivative = 0, *, direction: str | None = None) -> bool:
         """Whether a support holds the displacement, or the slope, at a place, so that no mode moves it."""

@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from html import escape
 
+from workbench.structure.domain import Patch
+
 
 class Printed:
     """A result with a line, headings, rows and remarks of its own."""
@@ -36,7 +38,9 @@ def counted(number: int, word: str) -> str:
 
 
 def place_text(place: object) -> str:
-    """A place: x in m, (x, y), a name, or two of these; empty where unknown."""
+    """A place: x in m, (x, y), a name, or two of these, a patch of a plate; empty where unknown."""
+    if isinstance(place, Patch):
+        return f"{place.x:.4g}, {place.y:.4g} ({place.width:.4g} by {place.height:.4g})"
     if isinstance(place, tuple):
         return ", ".join(place_text(part) for part in place)
     return "" if place is None else f"{place:.4g}" if isinstance(place, int | float) else str(place)

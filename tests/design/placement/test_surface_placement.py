@@ -11,7 +11,7 @@ from workbench.design.placement.certificate import certify
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place, placement_task, symbolic_work
 from workbench.design.placement.scan import best_of_candidates, scan
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Beam
 from workbench.structure.modes import Modes, PointShapes
@@ -62,6 +62,20 @@ def test_a_plate_is_placed_as_well_as_by_a_fine_grid_and_outside_the_zone(task):
     assert best.spacing >= 0.1 - 1e-9
 
     assert [len(actuator.at) for actuator in best.law.actuators] == [2, 2]
+
+
+def test_patches_are_placed_as_well_as_by_a_fine_grid_and_lie_on_the_plate(task):
+    patch = piezo_patch("P", (0.6, 0.45), length=(0.2, 0.16))
+    patches = placement_task(task.modes, 2, impulse_at=(0.4, 0.35), weight=1e4, actuator=patch)
+    at = np.array([[0.31, 0.22], [0.85, 0.61]])
+    work = float(symbolic_work(patches)(at.ravel())[0])
+    assert work == pytest.approx(patches.placed(at, "").residual_work, rel=1e-6)
+    limits = Limits(effort=2.0 * patches.placed(at, "").effort, spacing=0.2)
+    best = place(patches, limits, starts=3)
+    on_grid, _ = scan(patches, limits, n_places=12)
+    assert best.residual_work <= on_grid.residual_work
+    assert (best.positions >= (0.1, 0.08)).all() and (best.positions <= (1.1, 0.82)).all()
+    assert {actuator.at[2:] for actuator in best.law.actuators} == {(0.2, 0.16)}
 
 
 @pytest.mark.slow

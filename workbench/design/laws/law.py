@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
-from workbench.structure.domain import Between, NamedPoints, Rectangle
+from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle, reach
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, place_text
 
@@ -146,6 +146,11 @@ def _largest_participation(modes: Modes, actuators: Sequence[Actuator]) -> np.nd
         turns = actuator.kind == "moment"
         if isinstance(modes.domain, NamedPoints):
             shapes = modes.phi(modes.domain.rotations() if turns else modes.domain.grid())
+        elif isinstance(modes.domain, Rectangle) and isinstance(actuator.at, Patch):
+            low, high = reach(modes.domain, actuator.at)
+            middles = np.clip(modes.domain.grid(PER_SIDE), low, high)
+            sides = np.broadcast_to(actuator.at[2:], middles.shape)
+            shapes = modes.edge_slopes(np.hstack([middles, sides]), direction=actuator.direction)
         elif isinstance(modes.domain, Rectangle):
             shapes = modes.phi(modes.domain.grid(PER_SIDE), int(turns), direction=actuator.direction)
         else:

@@ -13,7 +13,7 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
-from workbench.structure.domain import Interval, NamedPoints, Place, position, same_place
+from workbench.structure.domain import Interval, NamedPoints, Place, position, reach, same_place
 
 TOLERANCE = 2e-6
 APART = 1e-6  # of the length: actuators closer than this stand at one place
@@ -34,7 +34,7 @@ class Limits:
         spacing: least distance between neighbours, m.
         margin: least distance from the ends or edges, m.
         forbidden: zones where no actuator can stand, m: intervals (from, to), or on a rectangle boxes between two
-            corners ((x, y), (x, y)).
+            corners ((x, y), (x, y)). The middle of a patch keeps out of them.
         candidates: the only places there are; None where an actuator may stand anywhere else. Of named points all that
             are displacements (for moments, rotations), unless given.
     """
@@ -109,7 +109,7 @@ class Limits:
         zones = tuple((np.atleast_1d(low), np.atleast_1d(high)) for low, high in self.forbidden)
         if any(part.shape != (2,) for zone in zones for part in zone):
             raise DesignError(f"a forbidden zone of a rectangle is ((x, y), (x, y)), m; got {self.forbidden}")
-        return free_boxes(domain, self.margin, zones)
+        return free_boxes(domain, np.maximum(self.margin, reach(domain, task.actuator.at)[0]), zones)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """The same, where n actuators find room at all.

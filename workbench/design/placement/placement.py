@@ -19,7 +19,7 @@ from workbench.design.placement.limits import Limits, conflict, takes_former_lim
 from workbench.design.placement.places import Box
 from workbench.design.placement.scan import best_of_candidates, scan
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs, placement_task
-from workbench.structure.domain import Interval, NamedPoints, Rectangle
+from workbench.structure.domain import Interval, NamedPoints, Rectangle, reach
 from workbench.structure.modes import Modes
 from workbench.threads import one_blas_thread
 
@@ -202,7 +202,8 @@ def _spline(task: PlacementTask) -> tuple[list[list[float]], ca.DM]:
         waves = np.sqrt(modes.n_modes) * np.array(domain.length) / np.sqrt(np.prod(domain.length))
         each, besides = SPLINE_POINTS["side"]
         grids = [
-            np.linspace(0.0, side, round(each * n) + besides) for side, n in zip(domain.length, waves, strict=True)
+            np.linspace(low, high, round(each * n) + besides)
+            for low, high, n in zip(*reach(domain, task.actuator.at), waves, strict=True)
         ]
         values = task.shapes(np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1))
         along_x = make_interp_spline(grids[0], values, k=SPLINE_DEGREE, axis=0)
@@ -289,7 +290,8 @@ def _usual_work(task: PlacementTask) -> float:
         n = task.n_controlled
         places = (first + (last - first) * (np.arange(n) + 1) / (n + 1))[None]
     else:
-        places = np.random.default_rng(0).random((101, task.n_controlled, 2)) * domain.length  # type: ignore
+        low, high = reach(domain, task.actuator.at)  # type: ignore[arg-type]
+        places = low + (high - low) * np.random.default_rng(0).random((101, task.n_controlled, 2))
     work = batch_costs(task, task.shapes(places)).work
     reference = float(np.median(work[np.isfinite(work)])) if np.isfinite(work).any() else 0.0
     return reference if reference > 0 else 1.0

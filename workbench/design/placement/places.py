@@ -51,15 +51,18 @@ def least_distances(at: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(at[:, first] - at[:, second], axis=2).min(axis=1, initial=np.inf))
 
 
-def free_boxes(domain: Rectangle, margin: float, zones: tuple[Box, ...]) -> list[Box]:
+def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) -> list[Box]:
     """The largest boxes (low, high), m, within the margin of a rectangle, that overlap no forbidden zone.
 
     Together they hold every place that is left; they overlap one another.
 
+    Args:
+        margin: (2,) from the edges along x and along y, m.
+
     Raises:
         DesignError: none is left.
     """
-    free: list[Box] = [(np.full(2, margin), np.array(domain.length) - margin)]
+    free: list[Box] = [(margin, np.array(domain.length) - margin)]
     for zone_low, zone_high in zones:
         parts: list[Box] = []
         for low, high in free:
@@ -75,7 +78,8 @@ def free_boxes(domain: Rectangle, margin: float, zones: tuple[Box, ...]) -> list
         free = [part for i, part in enumerate(free) if not any(_inside(part, other) for other in free[i + 1 :])]
     if not free or not all((low <= high).all() for low, high in free):
         raise DesignError(
-            f"margin {margin:g} and the forbidden zones leave no place of {domain}; lower the margin or forbid less"
+            f"margin {margin.max():g} and the forbidden zones leave no place of {domain}; lower the margin or forbid"
+            " less"
         )
     return free
 

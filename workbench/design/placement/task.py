@@ -19,7 +19,7 @@ from workbench.design.laws.law import DesignError, Law
 from workbench.design.placement.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.rig.actuators import Actuator
-from workbench.structure.domain import Between, Interval, Place, Rectangle, position
+from workbench.structure.domain import Between, Interval, Patch, Place, Rectangle, centred_at
 from workbench.structure.modes import Modes, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
@@ -36,7 +36,8 @@ class Placement(Printed):
 
     Attributes:
         positions: of the actuators: along an interval (n_actuators,) m, increasing, the middles of those that act
-            between two places; over a rectangle (n_actuators, 2) m; names of points (n_actuators,).
+            between two places; over a rectangle (n_actuators, 2) m, the middles of patches; names of points
+            (n_actuators,).
         law: with the actuators there; None where B is singular.
         residual_work: W_R.
         by_mode: (n_residual,) W_r.
@@ -125,8 +126,12 @@ class PlacementTask:
         places = as_places(domain, positions)
         shape = places.shape[:-1] if isinstance(domain, Rectangle) else places.shape
         flat = places.reshape(-1, *places.shape[len(shape) :])
-        order = int(actuator.kind == "moment")
-        found = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
+        if isinstance(actuator.at, Patch):
+            patches = np.hstack([flat, np.broadcast_to(actuator.at[2:], flat.shape)])
+            found = actuator.gain * self.modes.edge_slopes(patches, direction=actuator.direction)
+        else:
+            order = int(actuator.kind == "moment")
+            found = actuator.gain * self.modes.phi(list(flat), order, direction=actuator.direction)
         return found.reshape(*shape, self.modes.n_modes)
 
     @property
@@ -142,7 +147,10 @@ class PlacementTask:
             DesignError: places from which the modes cannot be controlled one by one.
         """
         places = listed(as_places(self.modes.domain, positions))
-        actuators = [placed_at(self.actuator, f"F{i + 1}", place) for i, place in enumerate(places)]
+        actuators = [
+            replace(self.actuator, name=f"F{i + 1}", at=centred_at(self.actuator.at, place))
+            for i, place in enumerate(places)
+        ]
         return imsc(self.modes, self.n_controlled, actuators, weight=self.weight)
 
     def placed(self, positions: Any, status: str, optima: Sequence[tuple[np.ndarray, float]] = ()) -> Placement:
@@ -286,15 +294,6 @@ def placement_task(
 def extent(actuator: Actuator) -> float:
     """Length of an actuator along an interval, m: from the first to the second of two places, else 0."""
     return float(actuator.at.first - actuator.at.second) if isinstance(actuator.at, Between) else 0.0  # type: ignore
-
-
-def placed_at(actuator: Actuator, name: str, at: Place) -> Actuator:
-    """The actuator, renamed, with its middle at a place."""
-    half = 0.5 * extent(actuator)
-    if not half:
-        return replace(actuator, name=name, at=at)
-    x = position(at)
-    return replace(actuator, name=name, at=Between(x + half, x - half))
 
 
 def listed(places: np.ndarray) -> list[Place]:

@@ -12,7 +12,7 @@ from workbench.gap.effects.evidence import Evidence
 from workbench.gap.effects.scales import Scales
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval, NamedPoints
+from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
 
 OF_THE_SENSOR = "unit of the sensor"
 ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
@@ -292,12 +292,32 @@ def _movable(targets: Callable[[Rig], tuple[str, ...]]) -> Callable[[Rig], tuple
     return where_there_is_room
 
 
+def _standing(rig: Rig, target: str) -> Where:
+    """Where an actuator stands in the nominal rig."""
+    return next(a.at for a in rig.actuators if a.name == target)
+
+
+def _actuator_places(rig: Rig, target: str) -> tuple[Parameter, ...]:
+    """The coordinates of its middle, so far inside that all of it lies on the structure."""
+    domain = rig.modes.domain
+    if isinstance(domain, NamedPoints):
+        return place_parameters(rig)
+    ends = zip(place_parameters(rig), *reach(domain, _standing(rig, target)), strict=True)
+    return tuple(replace(p, low=float(low), high=float(high)) for p, low, high in ends)
+
+
+def _actuator_starts(evidence: Evidence, target: str) -> list[dict[str, Any]]:
+    bounds = {p.name: p for p in _actuator_places(evidence.rig, target)}
+    starts = _position_starts(evidence, target)
+    return [v for v in starts if all(p.low <= v[name] <= p.high for name, p in bounds.items())]
+
+
 ACTUATOR_MISPLACEMENT = Kind(
     name="actuator_misplacement",
     path="actuator",
-    parameters=lambda rig, _: place_parameters(rig),
-    apply=lambda rig, target, v: _change_actuators(rig, target, at=place_of(v)),
-    starts=_position_starts,
+    parameters=_actuator_places,
+    apply=lambda rig, target, v: _change_actuators(rig, target, at=centred_at(_standing(rig, target), place_of(v))),
+    starts=_actuator_starts,
     targets=_movable(each_actuator),
     phrase="an actuator that stands elsewhere",
 )
