@@ -289,13 +289,17 @@ def _actuator(entry: dict[str, Any], at: Place, modes: Modes | None = None) -> A
         return Actuator(entry["name"], at, direct=kind == "hammer")
     if kind == "hammer":
         raise CaseError(f"{where}: a patch is no hammer; its kind is actuator")
-    on_plate = isinstance(at, tuple)
-    sides = numbers(entry, "patch", where, 2).tolist() if on_plate else number(entry, "patch", where)
+    length: float | tuple[float, float]
+    if isinstance(at, tuple):
+        width, height = numbers(entry, "patch", where, 2).tolist()
+        length = (width, height)
+    else:
+        length = number(entry, "patch", where)
     axis = entry.get("axis")
     if axis not in (None, "x", "y"):
         raise CaseError(f"{where}: axis is x or y, or left out for moments about both; got {shown(axis)}")
     try:
-        patch = piezo_patch(entry["name"], at, length=tuple(sides) if on_plate else sides, direction=axis)
+        patch = piezo_patch(entry["name"], at, length=length, direction=axis)
         modes.phi_at(patch.at, 1, direction=axis)
     except ValueError as error:
         raise CaseError(f"{where}: {error}") from error

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Place, PlaceError
+from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Patch, Place, PlaceError
 
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
@@ -77,7 +77,7 @@ def impulse_place(rig: Rig, at: str | None) -> Place:
     """Where the impulse acts: as given, or at the rig's hammer."""
     if at is not None:
         return place_in(rig.modes.domain, at, "--impulse-at")
-    hammers = [a.at for a in rig.actuators if a.direct and not isinstance(a.at, Between)]
+    hammers = [a.at for a in rig.actuators if a.direct and not isinstance(a.at, Between | Patch)]
     if not hammers:
         raise ValueError("the place of the impulse is missing: give --impulse-at, or an [[input]] of kind hammer")
     return hammers[0]

@@ -478,7 +478,7 @@ def middle(where: Where) -> Place:
 def centred_at(where: Where, at: Place) -> Where:
     """A place, or a patch or the stretch between two positions with its middle there."""
     if isinstance(where, Patch):
-        x, y = at  # type: ignore[misc]
+        x, y = at  # type: ignore[misc, str-unpack]
         return Patch(x, y, where.width, where.height)  # type: ignore[arg-type]
     if isinstance(where, Between) and not isinstance(where.first, str | tuple):
         half, x = 0.5 * (position(where.first) - position(where.second)), position(at)
