@@ -249,12 +249,13 @@ def test_candidates_of_a_plate_are_proven(plate, tmp_path):
     assert json.loads(found.read_text())["placements"][0]["positions"] == [[0.4, 0.4], [0.8, 0.4]]
 
 
-def test_laws_on_a_plate_are_compared_with_an_observer(plate, tmp_path):
+def test_laws_on_a_plate_are_compared_through_a_filter_and_an_observer(plate, tmp_path):
     found = tmp_path / "laws.json"
     result = run("design", plate, "--control", 2, "--weight", 0.01, "--json", found)
     assert result.exit_code == 0, result.output
     through = json.loads(found.read_text())["through_sensors"]
-    assert [row["design"] for row in through] == [f"{law} on a Luenberger observer" for law in ("IMSC", "coupled LQR")]
+    ways = ("through a modal filter", "on a Luenberger observer")
+    assert [row["design"] for row in through] == [f"{law} {way}" for law in ("IMSC", "coupled LQR") for way in ways]
     assert all(row["margin"] == pytest.approx(-max(row["poles_real"])) for row in through)
 
 

@@ -4,12 +4,17 @@ import http.client
 import json
 import socket
 import threading
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
+from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
+from workbench.design.loop.closed_loop import close_loop, impulse_state
+from workbench.design.spillover.spillover import effort, finite_spillover
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.study.bench import bench_server
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import describe, run_study
@@ -18,16 +23,60 @@ from workbench.study.saved_design import save
 from workbench.study.trying import asked, read_structure, shown, start, try_out
 
 RIG, TEXT = read_structure(None)
+PLATE = """[structure]
+kind = "plate"
+length = [1.2, 0.8]
+mass_per_area = 8.0
+bending_stiffness = 175.0
+poisson_ratio = 0.3
+edges = {left = "simply supported", right = "simply supported", bottom = "simply supported", top = "simply supported"}
+damping_ratio = 0.005
+modes = 6
+[[input]]
+name = "F1"
+kind = "actuator"
+at = [0.3, 0.24]
+[[input]]
+name = "F2"
+kind = "actuator"
+at = [0.84, 0.52]
+[[input]]
+name = "hammer"
+kind = "hammer"
+at = [0.5, 0.46]
+[[output]]
+name = "w1"
+quantity = "displacement"
+at = [0.36, 0.56]
+noise_std = 1e-6
+"""
+PATCHES = PLATE.replace("at = [0.3, 0.24]", "at = [0.3, 0.24]\npatch = [0.2, 0.12]").replace(
+    "at = [0.84, 0.52]", "at = [0.84, 0.52]\npatch = [0.2, 0.12]"
+)
 
 
-@pytest.fixture
-def bench(tmp_path):
-    with bench_server(RIG, TEXT, folder=tmp_path / "studies") as server:
+@contextmanager
+def serving(rig, text, folder):
+    with bench_server(rig, text, folder=folder) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         yield server.server_address[1]
         server.shutdown()
         thread.join()
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with serving(RIG, TEXT, tmp_path / "studies") as port:
+        yield port
+
+
+@pytest.fixture(params=["forces", "patches"])
+def plate(request, tmp_path):
+    """A plate with two actuators: its rig and its description."""
+    path = tmp_path / "plate.toml"
+    path.write_text(PLATE if request.param == "forces" else PATCHES)
+    return read_structure(path)
 
 
 def plain(design) -> dict:
@@ -52,9 +101,6 @@ def test_it_begins_with_the_design_of_section_5_8():
 
 
 def test_effort_is_that_of_the_lyapunov_equation():
-    from workbench.design.loop.closed_loop import impulse_state
-    from workbench.design.spillover.spillover import effort
-
     tried = try_out(RIG, replace(start(RIG), final_time=120.0))
     exact = effort(RIG.modes, tried.law, impulse_state(RIG.modes, 6.3))
     assert tried.effort == pytest.approx(exact, rel=1e-4)
@@ -83,6 +129,8 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"actuators": [2.0] * 41}, "at most 40"),
         ({"actuators": ["a"]}, "finite numbers; got 'a'"),
         ({"struck_at": 11.0}, "outside the structure"),
+        ({"struck_at": [1.0, 2.0]}, "a place is a position along the structure, m; got"),
+        ({"sensors": [[1.0, "b"]]}, "sensors is made of finite numbers; got 'b'"),
         ({"sensors": [3.0, 3.0]}, "increasing"),
         ({"law": "bang"}, "law is one of"),
         ({"final_time": 0}, "final_time must be positive"),
@@ -93,6 +141,47 @@ def test_sensors_close_the_loop_through_modal_filters():
 def test_what_makes_no_design_is_refused(change, words):
     with pytest.raises(ValueError, match=words):
         shown(RIG, asked({**plain(start(RIG)), **change}))
+
+
+def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
+    rig, _ = plate
+    design = start(rig)
+    assert design.actuators == ((0.3, 0.24), (0.84, 0.52)) and design.struck_at == (0.5, 0.46)
+    moved = replace(design, actuators=((0.35, 0.3), (0.8, 0.5)))
+    found = shown(rig, asked(plain(moved)))
+    sizes = {"length": (0.2, 0.12)} if rig.actuators[0].kind == "moment" else None
+    actuators = [piezo_patch("P", at, **sizes) if sizes else Actuator("F", at) for at in moved.actuators]
+    law = imsc(rig.modes, 2, [replace(a, name=f"F{i}") for i, a in enumerate(actuators)], weight=design.weight)
+    state = impulse_state(rig.modes, (0.5, 0.46)) * np.r_[np.ones(6), 1, 1, 0, 0, 0, 0]
+    exact = finite_spillover(close_loop(rig.modes, law), state, design.final_time).by_mode
+    np.testing.assert_allclose(found["by_mode"], exact, rtol=1e-5, atol=1e-9)
+    many = tuple((x, y) for x in np.linspace(0.1, 1.1, 9) for y in np.linspace(0.1, 0.7, 6))
+    assert shown(rig, replace(moved, sensors=many))["residual"] == pytest.approx(found["residual"], rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"actuators": [[0.3, 0.24], [1.3, 0.5]]}, "1.3.* 0 to 1.2 by 0 to 0.8"),
+        ({"actuators": [0.3, [0.8, 0.5]]}, "a place is a pair .* m; got 0.3"),
+        ({"struck_at": 0.3}, "a place is a pair .* m; got 0.3"),
+        ({"sensors": [[0.3, 0.2], [0.3, 0.2]]}, "two of the 2 sensors stand at one place"),
+    ],
+)
+def test_what_makes_no_design_on_a_plate_is_refused(change, words, tmp_path):
+    path = tmp_path / "plate.toml"
+    path.write_text(PLATE)
+    rig, _ = read_structure(path)
+    with pytest.raises(ValueError, match=words):
+        shown(rig, asked({**plain(start(rig)), **change}))
+
+
+def test_a_design_saved_on_a_plate_is_a_study_that_runs_and_agrees(plate, tmp_path):
+    rig, text = plate
+    path = save(rig, text, replace(start(rig), sensors=((0.4, 0.3), (0.8, 0.3), (0.6, 0.6))), "found", tmp_path)
+    outcome = Outcome("found", figures_folder=tmp_path / "figures")
+    run_study(describe(path), None, outcome, tmp_path)
+    assert outcome.holds and len(outcome.checks) == 3 and len(outcome.figures) == 2
 
 
 def test_a_loop_that_runs_away_is_said_to():
@@ -145,7 +234,7 @@ def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     def bars():
         return len(browser.find_elements("css selector", "#work .marks rect"))
 
-    assert card("residual") == "1.499e−3" and card("stable") == "stable" and bars() == 5
+    assert card("residual") == "1.499e−3" and card("stable") == "undamped" and bars() == 5
     assert moves(browser.find_element("css selector", ".stand .track"))
 
     second = browser.find_elements("css selector", ".handle.actuators")[1]
@@ -177,6 +266,35 @@ def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     assert errors == []
 
 
+@pytest.mark.parametrize("width", [390, 1200])
+def test_actuators_are_dragged_over_a_plate(plate, look, until, width, tmp_path):
+    from selenium.webdriver import ActionChains, Keys
+
+    rig, text = plate
+    with serving(rig, text, tmp_path / "studies") as port:
+        browser = look(f"http://127.0.0.1:{port}/", width)
+        until(lambda: browser.find_elements("css selector", "#work .marks rect"))
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        track, pictures = browser.find_element("css selector", ".track"), set()
+        until(lambda: pictures.add(track.get_attribute("href")) or len(pictures) > 3)
+
+        second = browser.find_elements("css selector", ".handle.actuators")[1]
+        scale = track.size["width"] / 1.2
+        grip = second.find_element("css selector", ".halo")
+        drag = ActionChains(browser).click_and_hold(grip)
+        drag.move_by_offset(round(-0.1 * scale), round(0.2 * scale)).release().perform()
+        ActionChains(browser).send_keys(Keys.ARROW_UP).perform()
+        x, y = (float(part) for part in second.get_attribute("aria-valuetext").split(","))
+        assert (x, y) == pytest.approx((0.74, 0.32 + 0.008), abs=0.02)
+        moved = shown(rig, replace(start(rig), actuators=((0.3, 0.24), (x, y))))["residual"]
+        residual = browser.find_element("id", "residual")
+        until(lambda: float(residual.text.replace("−", "-")) == pytest.approx(moved, rel=0.02))
+        ActionChains(browser).click_and_hold(grip).move_by_offset(0, round(-0.5 * scale)).release().perform()
+        highest = 0.74 if rig.actuators[0].kind == "moment" else 0.8
+        until(lambda: float(second.get_attribute("aria-valuetext").split(",")[1]) == pytest.approx(highest, abs=1e-3))
+        assert [entry for entry in browser.get_log("browser") if "422" not in entry["message"]] == []
+
+
 def test_plain_modal_data_know_no_places_to_stand(tmp_path):
     path = tmp_path / "modal.toml"
     path.write_text(
@@ -184,7 +302,7 @@ def test_plain_modal_data_know_no_places_to_stand(tmp_path):
         '[[input]]\nname = "F"\nkind = "actuator"\nshape = [1.0]\n'
         '[[output]]\nname = "y"\nquantity = "displacement"\nshape = [1.0]\nnoise_std = 0.001\n'
     )
-    with pytest.raises(StudyError, match="plain modal data know no places"):
+    with pytest.raises(StudyError, match="modal data and points know no places between them"):
         bench_server(*read_structure(path))
 
 

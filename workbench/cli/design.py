@@ -7,7 +7,6 @@ from rich.table import Table
 
 from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, read_structure_rig
 from workbench.cli.terminal import JsonPath, console, guarded, say, write_json
-from workbench.structure.member import Structure
 from workbench.structure.printed import place_text
 
 if TYPE_CHECKING:
@@ -69,8 +68,7 @@ def design(
     for why in refused:
         say(f"  {why}")
     console.print(table)
-    mass = found.structure.mass_per_length if isinstance(found.structure, Structure) else None
-    tried = through_sensors(modes, laws, [s.at for s in found.sensors], mass)
+    tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
     sensed = Table(

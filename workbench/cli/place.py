@@ -9,14 +9,13 @@ from rich.table import Table
 
 from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import JsonPath, console, guarded, progress_bar, reporter, say, short, write_json
-from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, middle, reach
+from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, middle
 from workbench.structure.printed import place_text
 
 if TYPE_CHECKING:
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import PlacementTask
     from workbench.design.placement.task import Placement
-    from workbench.rig.actuators import Actuator
     from workbench.rig.rig import Rig
 
 LEAST_SPACING = 1 / 20  # of the size of the structure, unless one is given
@@ -61,7 +60,7 @@ def place(
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place as least_work
-    from workbench.design.placement.task import listed
+    from workbench.design.placement.task import listed, patch_of
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
@@ -73,7 +72,7 @@ def place(
     domain = modes.domain
     with progress_bar() as progress:
         report = reporter(progress, "placing actuators")
-        task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=_placed(found))
+        task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=patch_of(found))
         if isinstance(domain, Interval):
             usual = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
         else:
@@ -139,29 +138,6 @@ def place(
             "lower_bound": None if certificate is None else certificate.lower_bound,
         },
     )
-
-
-def _placed(rig: "Rig") -> "Actuator | None":
-    """The rig's piezo patch that is to be placed; None where its actuators are point forces.
-
-    Raises:
-        ValueError: actuators that differ in more than their place.
-    """
-    import numpy as np
-
-    own, domain = [a for a in rig.actuators if not a.direct], rig.modes.domain
-    patch = next((a for a in own if a.kind == "moment"), None)
-    if patch is None or isinstance(domain, NamedPoints):
-        return None
-    half = reach(domain, patch.at)[0]
-    for other in own:
-        alike = (other.kind, other.direction) == (patch.kind, patch.direction)
-        if not (alike and np.allclose(reach(domain, other.at)[0], half)):
-            raise ValueError(
-                f"actuators of one kind are placed, and {other.name} is no patch like {patch.name}: give them one size"
-                " and axis, or describe point forces"
-            )
-    return patch
 
 
 def _own(rig: "Rig", control: int) -> list[Place]:

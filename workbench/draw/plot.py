@@ -151,9 +151,11 @@ def _(result: HowMany) -> Figure:
 @plot.register
 def _(result: ModalFilter) -> Figure:
     figure, ax = new_figure(width=9, height=4)
+    along = result.positions.ndim == 1
+    where = result.positions if along else 1 + np.arange(len(result.positions))
     for r, weights in enumerate(result.displacement):
-        ax.plot(result.positions, weights, "o-", label=f"mode {r + 1}")
-    ax.set(xlabel="x of the sensor", ylabel="weight of its displacement", title="modal filter")
+        ax.plot(where, weights, "o-" if along else "o", label=f"mode {r + 1}")
+    ax.set(xlabel="x of the sensor" if along else "sensor", ylabel="weight of its displacement", title="modal filter")
     ax.legend(ncols=2)
     return figure
 

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.domain import PlaceError
 from workbench.structure.modes import Modes
 
 
@@ -20,21 +21,29 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     columns = []
     for actuator in actuators:
         derivative = 1 if actuator.kind == "moment" else 0
-        if modes.is_held(actuator.at, derivative, direction=actuator.direction):
+        try:
+            shape = modes.phi_at(actuator.at, derivative, direction=actuator.direction)
+            held = modes.is_held(actuator.at, derivative, direction=actuator.direction)
+        except PlaceError as error:
+            raise PlaceError(f"actuator {actuator.name}: {error}") from None
+        if held:
             raise ValueError(
                 f"actuator {actuator.name} stands on the support at {modes.domain.text(actuator.at)}, where it moves"
                 " no mode; move it inside"
             )
-        columns.append(actuator.gain * modes.phi_at(actuator.at, derivative, direction=actuator.direction))
+        columns.append(actuator.gain * shape)
     return np.array(columns).reshape(len(columns), modes.n_modes).T
 
 
 def output_matrix(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
     """Mode shapes (or their slopes) at the sensors, times gain: (n_sensors, n_modes)."""
-    rows = [
-        sensor.gain * modes.phi_at(sensor.at, MEASURED[sensor.quantity][0], direction=sensor.direction)
-        for sensor in sensors
-    ]
+    rows = []
+    for sensor in sensors:
+        try:
+            shape = modes.phi_at(sensor.at, MEASURED[sensor.quantity][0], direction=sensor.direction)
+        except PlaceError as error:
+            raise PlaceError(f"sensor {sensor.name}: {error}") from None
+        rows.append(sensor.gain * shape)
     return np.array(rows).reshape(len(rows), modes.n_modes)
 
 

@@ -88,6 +88,8 @@ class Interval:
             x = np.atleast_1d(np.asarray(places, float))
         except (TypeError, ValueError):
             raise PlaceError(f"a place along an interval is a position x in m; got {places!r}") from None
+        if x.ndim != 1:
+            raise PlaceError(f"a place along an interval is a position x in m; got {places!r}")
         slack = SLACK * self.length
         outside = (x < -slack) | (x > self.length + slack) | ~np.isfinite(x)
         if outside.any():

@@ -21,6 +21,7 @@ from workbench.structure.domain import (
     Rectangle,
     Where,
     as_domain,
+    position,
 )
 from workbench.structure.printed import Printed, counted
 
@@ -181,7 +182,8 @@ class Modes(Printed):
                 raise PlaceError("a patch turns a plate by moments along its edges and has no force or displacement")
             turned: Floats = self.edge_slopes([where], direction=direction)[0]
             return turned
-        shape: Floats = self.phi(where, derivative, direction=direction)[0]
+        at = position(where) if isinstance(self.domain, Interval) else where
+        shape: Floats = self.phi(at, derivative, direction=direction)[0]
         return shape
 
     def edge_slopes(self, patches: Any, *, direction: str | None = None) -> Floats:

@@ -11,12 +11,14 @@ from typing import Any
 from jinja2 import Environment
 
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Interval, Rectangle
 from workbench.study.cases import StudyError
 from workbench.study.page import asset, in_script
 from workbench.study.saved_design import save
 from workbench.study.trying import asked, setting, shown
 
 HERE = "127.0.0.1"
+SEEN = {Interval: "Grey: without control.", Rectangle: "Red is up, blue is down."}
 MOST_BYTES = 65536
 CLIENT_SECONDS = 10.0  # after which a client that sends nothing is dropped
 MOST_WAITING = 128  # connections not yet taken
@@ -36,12 +38,16 @@ def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path
         folder: where designs are saved as studies.
 
     Raises:
-        StudyError: plain modal data, which know no places, or a port that cannot be had.
+        StudyError: modes known at points alone, or a port that cannot be had.
     """
     content = {**setting(rig), "folder": str(folder)}
     template = Environment(autoescape=True, trim_blocks=True).from_string(asset("bench.html"))
     page = template.render(
-        css=asset("page.css"), figures=asset("figure.js"), script=asset("bench.js"), setting=in_script(content)
+        css=asset("page.css"),
+        figures=asset("figure.js"),
+        script=asset("bench.js"),
+        setting=in_script(content),
+        seen=SEEN[type(rig.modes.domain)],
     )
     handler = partial(_Handler, rig, structure, folder, page.encode())
     try:

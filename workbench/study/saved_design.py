@@ -4,6 +4,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from workbench.rig.rig import Rig
+from workbench.structure.domain import Rectangle
 from workbench.study.templates import free_path
 from workbench.study.trying import Design, try_out
 from workbench.study.whole_file import write_whole
@@ -14,10 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.draw.beam import plot_motion
-from workbench.draw.design import plot_work
-from workbench.draw.motion import response_motion
 from workbench.cases.case import read_rig
+from workbench.draw.design import plot_work
+{imports}
 from workbench.study.trying import Design, try_out
 
 DESIGN = {design}
@@ -34,12 +34,29 @@ def study(outcome, data=None):
     outcome.check("stable or not, against the bench", float(tried.loop.stable is not STABLE), 0.0)
     outcome.say(f"The closed loop is {{'stable' if tried.loop.stable else 'unstable'}}.")
     outcome.say("W_R = {{W_R:.3e}} for an effort of {{effort:.3e}}.".format(**found))
-    motion = response_motion({{"controlled": tried.response}}, actuators=tried.law.actuators)
-    outcome.motion(motion, "The structure after the impulse, controlled; triangles are actuators.")
     outcome.figure("work", plot_work({{"this design": tried.work}}), "Spillover work by residual mode.")
+{motion}'''
+# what shows the motion: of a member, and of a plate
+MEMBER = (
+    """from workbench.draw.beam import plot_motion
+from workbench.draw.motion import response_motion""",
+    """    motion = response_motion({"controlled": tried.response}, actuators=tried.law.actuators)
+    outcome.motion(motion, "The structure after the impulse, controlled; triangles are actuators.")
     x = np.linspace(0.0, rig.modes.length, 201)
-    outcome.figure("motion", plot_motion({{"controlled": tried.response}}, x), "Displacement over place and time.")
-'''
+    outcome.figure("motion", plot_motion({"controlled": tried.response}, x), "Displacement over place and time.")
+""",
+)
+PLATE = (
+    "from workbench.draw.surface import plot_surface_motion",
+    """    figure = plot_surface_motion(
+        {"controlled": tried.response},
+        DESIGN.final_time * np.array([0.0, 0.1, 0.25, 0.5, 1.0]),
+        actuators=np.array(DESIGN.actuators),
+        struck=DESIGN.struck_at,
+    )
+    outcome.figure("motion", figure, "Displacement after the impulse (star), controlled (crosses are actuators).")
+""",
+)
 
 
 def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> Path:
@@ -51,8 +68,12 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
     path = free_path(name, folder)
     tried = try_out(rig, design)
     found = {"W_R": tried.work.residual_total, "effort": tried.effort}
+    imports, motion = PLATE if isinstance(rig.modes.domain, Rectangle) else MEMBER
+    script = SCRIPT.format(
+        design=_written(design), shown=found, stable=tried.loop.stable, imports=imports, motion=motion
+    )
     write_whole(path.with_suffix(".toml"), structure)
-    return write_whole(path, SCRIPT.format(design=_written(design), shown=found, stable=tried.loop.stable))
+    return write_whole(path, script)
 
 
 def _written(design: Design) -> str:

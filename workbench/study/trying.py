@@ -1,7 +1,7 @@
 """A design tried out: what actuators, sensors and gains at these places do to a structure after an impulse."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, cast
@@ -11,22 +11,23 @@ from numpy.typing import ArrayLike
 from scipy.integrate import simpson
 
 from workbench.cases.case import read_rig
-from workbench.design.estimation.modal_filter import displacement_filter
+from workbench.design.estimation.surface_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
+from workbench.design.placement.task import patch_of
 from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval
-from workbench.structure.member import Bar, Beam
+from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
 from workbench.study.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
 MOST_PORTS = 40
 LARGEST = 1e100
-N_TIMES, N_FRAMES, N_PLACES = 2001, 251, 121
+N_TIMES, N_FRAMES, N_PLACES, N_CELLS = 2001, 251, 121, 44
+USUAL_WEIGHT, FIRMNESS = 20.0, 25.0
 ON_AXIS = 1e-9  # damping ratio below which a pole stands on the imaginary axis
 MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
 
@@ -35,22 +36,24 @@ MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
 class Design:
     """What can be moved on the bench.
 
+    Places are x along a member and (x, y) on a plate, m.
+
     Attributes:
-        actuators: places, m.
-        sensors: places, m, of displacement sensors whose modal filters feed the law; none for exact modal coordinates.
+        actuators: places; middles of piezo patches, where the rig has these.
+        sensors: places of displacement sensors whose modal filters feed the law; none for exact modal coordinates.
         controlled: how many of the lowest modes.
         weight: R of force against motion, one for each controlled mode; coupled LQR takes the first.
         law: one of LAWS.
-        struck_at: place of a unit impulse, m.
+        struck_at: place of a unit impulse.
         final_time: until which the work is counted, s.
     """
 
-    actuators: tuple[float, ...]
-    sensors: tuple[float, ...]
+    actuators: tuple[Place, ...]
+    sensors: tuple[Place, ...]
     controlled: int
     weight: tuple[float, ...]
     law: str
-    struck_at: float
+    struck_at: Place
     final_time: float
 
 
@@ -84,22 +87,30 @@ def asked(content: Mapping[str, Any]) -> Design:
         raise StudyError(f"a design has {', '.join(sorted(names))}")
     for name in ("actuators", "sensors", "weight"):
         if not isinstance(content[name], list) or len(content[name]) > MOST_PORTS:
-            raise StudyError(f"{name} is a list of at most {MOST_PORTS} numbers")
-    lists = {name: tuple(_number(v, name) for v in content[name]) for name in ("actuators", "sensors", "weight")}
+            raise StudyError(f"{name} is a list of at most {MOST_PORTS} entries")
+    places = {name: tuple(_place(v, name) for v in content[name]) for name in ("actuators", "sensors")}
+    weight = tuple(_number(v, "weight") for v in content["weight"])
     count = content["controlled"]
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise StudyError(f"controlled is how many modes are controlled, at least 1; got {count!r:.40}")
     if content["law"] not in LAWS:
         raise StudyError(f"law is one of {', '.join(LAWS)}; got {content['law']!r:.40}")
-    if len(lists["weight"]) != count or min(lists["weight"]) <= 0:
+    if len(weight) != count or min(weight) <= 0:
         raise StudyError(f"weight is one positive number for each of the {count} controlled modes")
     final_time = _number(content["final_time"], "final_time")
     if final_time <= 0:
         raise StudyError(f"final_time must be positive; got {final_time:g}")
     return Design(
-        **lists, controlled=count, law=content["law"], struck_at=_number(content["struck_at"], "struck_at"),
-        final_time=final_time,
+        **places, controlled=count, weight=weight, law=content["law"],
+        struck_at=_place(content["struck_at"], "struck_at"), final_time=final_time,
     )  # fmt: skip
+
+
+def _place(value: object, name: str) -> Place:
+    """A position, or a pair of them."""
+    if isinstance(value, list | tuple) and len(value) == 2:
+        return (_number(value[0], name), _number(value[1], name))
+    return _number(value, name)
 
 
 def _number(value: object, name: str) -> float:
@@ -112,23 +123,40 @@ def start(rig: Rig) -> Design:
     """The design that a rig begins with: its actuators, as many modes as these, its hammer, exact modal coordinates.
 
     Raises:
-        StudyError: plain modal data, which know no places, or no elastic mode.
+        StudyError: a structure known at points alone, or without an elastic mode.
     """
-    _check_along(rig)
+    domain = _domain(rig)
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size == 0:
         raise StudyError("the structure has no elastic mode; ask for more modes")
-    places = sorted({cast(float, a.at) for a in rig.actuators if not a.direct}) or [0.37 * rig.modes.length]
-    struck = next((cast(float, a.at) for a in rig.actuators if a.direct), 0.63 * rig.modes.length)
+    places = sorted({middle(a.at) for a in rig.actuators if not a.direct}) or [_share(domain, 0.37)]
+    struck = next((a.at for a in rig.actuators if a.direct), _share(domain, 0.63))
     count = min(len(places), rig.modes.n_modes)
-    return Design(tuple(places), (), count, (20.0,) * count, LAWS[0], struck, float(2.0 * np.pi / elastic[0]))
+    # on a plate a damping ratio of some 0.14 of the first mode; along a member that of section 5.8
+    weight = USUAL_WEIGHT if isinstance(domain, Interval) else float(f"{FIRMNESS / elastic[0] ** 2:.3g}")
+    return Design(
+        tuple(places), (), count, (weight,) * count, LAWS[0], cast(Place, struck), float(2.0 * np.pi / elastic[0])
+    )
 
 
-def _check_along(rig: Rig) -> None:
-    if rig.structure is None:
-        raise StudyError("plain modal data know no places; describe the structure as a beam or a rod")
-    if not isinstance(rig.modes.domain, Interval):
-        raise StudyError("the bench moves actuators along a beam or a rod, not over a plate; describe one of these")
+def _domain(rig: Rig) -> Interval | Rectangle:
+    """Where actuators can be moved about.
+
+    Raises:
+        StudyError: modes known at points alone.
+    """
+    domain = rig.modes.domain
+    if rig.structure is None or isinstance(domain, NamedPoints):
+        raise StudyError(
+            "modal data and points know no places between them; describe the structure as a beam, a rod or a plate"
+        )
+    return domain
+
+
+def _share(domain: Interval | Rectangle, share: float) -> Place:
+    if isinstance(domain, Interval):
+        return share * domain.length
+    return (share * domain.length[0], share * domain.length[1])
 
 
 def try_out(rig: Rig, design: Design) -> Tried:
@@ -137,19 +165,22 @@ def try_out(rig: Rig, design: Design) -> Tried:
     Raises:
         ValueError: places, weights or numbers that make no design, and the way out.
     """
-    modes = rig.modes
+    modes, domain = rig.modes, _domain(rig)
+    for at in (*design.actuators, *design.sensors, design.struck_at):
+        if isinstance(at, tuple) != isinstance(domain, Rectangle):
+            wanted = "a pair (x, y) on the plate" if isinstance(domain, Rectangle) else "a position along the structure"
+            raise StudyError(f"a place is {wanted}, m; got {at}")
     if design.controlled > modes.n_modes:
         raise DesignError(f"{design.controlled} modes controlled of {modes.n_modes} at hand; control fewer")
-    actuators = [Actuator(f"F{i + 1}", at) for i, at in enumerate(design.actuators)]
+    kind = patch_of(rig) or Actuator("F", design.struck_at)
+    actuators = [replace(kind, name=f"F{i + 1}", at=centred_at(kind.at, at)) for i, at in enumerate(design.actuators)]
     if design.law == "IMSC":
         law = imsc(modes, design.controlled, actuators, weight=design.weight)
     else:
         law = coupled_lqr(modes, design.controlled, actuators, weight=design.weight[0])
     through = None
     if design.sensors and rig.structure is not None:
-        kept = modes.select(range(design.controlled))
-        member = cast(Bar | Beam, rig.structure)
-        through = displacement_filter(kept, sorted(design.sensors), member.mass_per_length)
+        through = filter_on(rig.structure, modes.select(range(design.controlled)), design.sensors)
     loop = close_loop(modes, law, through)
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:
@@ -184,17 +215,25 @@ def shown(rig: Rig, design: Design) -> dict[str, Any]:
         "modal": _plain(tried.response.modal[: rig.modes.n_modes, ::step]),
         "energy": _plain(energy),
         "forces": _plain(tried.response.forces[:, ::step]),
+        "struck": _plain(rig.modes.phi(design.struck_at)[0]),
     }
 
 
 def setting(rig: Rig) -> dict[str, Any]:
     """What the bench needs to know once: the structure, its modes and its shapes."""
-    _check_along(rig)
-    x = np.linspace(0.0, rig.modes.length, N_PLACES)
+    domain, patch = _domain(rig), patch_of(rig)
+    if isinstance(domain, Interval):
+        shown_at, across = np.linspace(0.0, domain.length, N_PLACES), [N_PLACES]
+    else:  # middles of cells, each a spot of one colour
+        across = [max(round(N_CELLS * side / max(domain.length)), 8) for side in domain.length]
+        x, y = ((np.arange(n) + 0.5) / n * side for n, side in zip(across, domain.length, strict=True))
+        shown_at = np.column_stack([np.repeat(x, y.size), np.tile(y, x.size)])
     return {
-        "length": rig.modes.length,
-        "x": _plain(x),
-        "shapes": _plain(rig.modes.phi(x)),
+        "length": domain.length,
+        "cells": across,
+        "x": _plain(shown_at),
+        "shapes": _plain(rig.modes.phi(shown_at)),
+        "patch": [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0]),
         "omega": _plain(rig.modes.omega),
         "zeta": _plain(rig.modes.zeta),
         "most": MOST_PORTS,

@@ -85,8 +85,8 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
                 np.vstack([np.zeros_like(weight)] * order + [weight] + [np.zeros_like(weight)] * (1 - order))
             )
             sensors += [
-                Sensor(f"{'v' if order else 'y'}{kind[2]}{i + 1}", float(x), kind[order])
-                for i, x in enumerate(filter_.positions)
+                Sensor(f"{'v' if order else 'y'}{kind[2]}{i + 1}", place, kind[order])
+                for i, place in enumerate(filter_.places)
             ]
     estimator = np.hstack(columns)
     empty = np.zeros((0, 0)), np.zeros((0, estimator.shape[1])), np.zeros((len(law.actuators), 0))

@@ -1,4 +1,4 @@
-"""Modal filters: from sensors to modal coordinates, by interpolation between them; weights computed once.
+"""Modal filters: from sensors along a structure to modal coordinates, by interpolation; weights computed once.
 
 Dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors.
 """
@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import BSpline, make_interp_spline
 
 from workbench.arrays import Floats
+from workbench.structure.domain import Place, same_place
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 
@@ -23,7 +24,7 @@ class ModalFilter:
     """Weights that turn readings into modal coordinates; rates go through the same weights.
 
     Attributes:
-        positions: (n_sensors,) m, increasing.
+        positions: (n_sensors,) m, increasing; on a plate (n_sensors, 2) m.
         displacement: (n_modes, n_sensors) weights of the displacements (or velocities).
         slope: (n_modes, n_sensors) weights of the slopes (or angular velocities); no columns where none are read.
         designed_by: designs it anew, with the settings that it has, for other modes.
@@ -37,6 +38,11 @@ class ModalFilter:
     def __post_init__(self) -> None:
         for name in ("positions", "displacement", "slope"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    @property
+    def places(self) -> list[Place]:
+        """The positions as places: floats, or pairs of floats."""
+        return [same_place(at) for at in self.positions]
 
     def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> Floats:
         """Modal coordinates (n_modes, ...) from readings (n_sensors, ...), time last."""

@@ -96,6 +96,7 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
             f"{len(controlled)} controlled modes need as many actuators; there are {len(actuators)}:"
             " control fewer modes or add actuators"
         )
+    b = controllable_input(modes, controlled, actuators)
     text = modes.domain.text
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
@@ -105,7 +106,6 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
                     f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
                     " move one by more than 1e-6 of the length"
                 )
-    b = controllable_input(modes, controlled, actuators)
     condition = np.linalg.cond(b)
     if condition > SINGULAR:
         raise DesignError(

@@ -15,6 +15,7 @@ from workbench.design.laws.law import Law
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import place_text
 
 UNSEEN = 1e-9
 WELL_CONDITIONED = 1e6
@@ -106,7 +107,7 @@ def close_loop(modes: Modes, law: Law, filter_: ModalFilter | None = None) -> Cl
         strength = np.abs(seen[np.arange(law.n_controlled), list(law.controlled)])
         if strength.min() < UNSEEN:
             raise ValueError(
-                f"the filter's sensors at {', '.join(f'{x:g}' for x in filter_.positions)} cannot see mode"
+                f"the filter's sensors at {'; '.join(map(place_text, filter_.places))} cannot see mode"
                 f" {law.controlled[strength.argmin()] + 1}: they all stand at its nodes; move or add a sensor"
             )
     estimate = np.kron(np.eye(2), seen)

@@ -19,7 +19,8 @@ from workbench.design.laws.law import DesignError, Law
 from workbench.design.placement.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.rig.actuators import Actuator
-from workbench.structure.domain import Between, Interval, Patch, Place, Rectangle, centred_at
+from workbench.rig.rig import Rig
+from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Place, Rectangle, centred_at, reach
 from workbench.structure.modes import Modes, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
@@ -289,6 +290,27 @@ def placement_task(
         weight=frozen(np.broadcast_to(np.asarray(weight, float), n)),
         actuator=Actuator("F", modes.domain.grid(2)[0]) if actuator is None else actuator,
     )
+
+
+def patch_of(rig: Rig) -> Actuator | None:
+    """The piezo patch that the actuators of a rig are, all of one size; None where they are point forces.
+
+    Raises:
+        DesignError: actuators that differ in more than their place.
+    """
+    own, domain = [a for a in rig.actuators if not a.direct], rig.modes.domain
+    patch = next((a for a in own if a.kind == "moment"), None)
+    if patch is None or isinstance(domain, NamedPoints):
+        return None
+    half = reach(domain, patch.at)[0]
+    for other in own:
+        alike = (other.kind, other.direction) == (patch.kind, patch.direction)
+        if not (alike and np.allclose(reach(domain, other.at)[0], half)):
+            raise DesignError(
+                f"actuators of one kind are placed, and {other.name} is no patch like {patch.name}: give them one size"
+                " and axis, or describe point forces"
+            )
+    return patch
 
 
 def extent(actuator: Actuator) -> float:

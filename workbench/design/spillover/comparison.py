@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.design.estimation.controller import Controller, filtered
-from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import luenberger
+from workbench.design.estimation.surface_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
@@ -17,8 +17,9 @@ from workbench.design.spillover.spillover import Spillover, effort, finite_spill
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Place
+from workbench.structure.member import Structure
 from workbench.structure.modes import Modes, frozen
-from workbench.structure.profile import ProfileLike
+from workbench.structure.plate import Membrane, Plate
 from workbench.threads import one_blas_thread
 
 # as fast as the mode that is watched, and damped enough to forget where it started within two periods
@@ -112,7 +113,7 @@ def compare(
 
 
 def through_sensors(
-    modes: Modes, laws: Sequence[Law], places: Sequence[Place], mass_per_length: ProfileLike | None
+    modes: Modes, laws: Sequence[Law], places: Sequence[Place], structure: Structure | Plate | Membrane | None
 ) -> tuple[tuple[Controller | None, Explanation | None, str], ...]:
     """Each law on what sensors of displacement and velocity at the places read: a modal filter, a Luenberger observer.
 
@@ -120,7 +121,7 @@ def through_sensors(
         modes: controlled and residual.
         laws: to try.
         places: of the sensors.
-        mass_per_length: for the filters; none are tried where it is not known.
+        structure: whose mass the filters need; none are tried where it is not known.
 
     Returns:
         Controller, explanation on the full plant, and where it cannot be, (None, None, why).
@@ -130,10 +131,10 @@ def through_sensors(
     for law in laws:
         own = modes.select(law.controlled)
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)]
-        for mass in (mass_per_length, None) if mass_per_length is not None else (None,):
+        for by_filter in (True, False) if structure is not None else (False,):
             try:
-                if mass is not None:
-                    controller = filtered(law, displacement_filter(own, stands, mass))
+                if by_filter and structure is not None:
+                    controller = filtered(law, filter_on(structure, own, stands))
                 else:
                     controller = luenberger(modes, law, sensors, poles=OBSERVER_POLES * own.omega)
                 tried.append((controller, explain(modes, controller), ""))

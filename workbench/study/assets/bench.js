@@ -5,6 +5,7 @@
   var svg = workbench.svg, html = workbench.html, shown = workbench.shown, by = function (id) { return document.getElementById(id); };
   var stand = document.querySelector(".stand"), say = document.querySelector(".say"), hint = say.textContent;
   var answer = null, busy = false, waiting = false, calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
+  var plate = Array.isArray(setting.length), sides = [].concat(setting.length), usual = Math.floor(Math.log10(design.weight[0]));
   var COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
 
   document.querySelector(".theme").addEventListener("click", function () {
@@ -78,8 +79,13 @@
       });
     });
   }
-  // the middle of the widest gap between those that stand already
+  // the middle of the widest gap between those that stand already; on a plate the spot farthest from them and the rim
   function gap(places) {
+    if (plate) {
+      var spots = setting.x.filter(function (_, i) { return i % 7 === 0; }).map(function (p) { return held("actuators", p); });
+      var far = function (p) { return Math.min.apply(null, places.map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); }).concat([p[0], sides[0] - p[0], p[1], sides[1] - p[1]])); };
+      return spots.reduce(function (one, other) { return far(other) > far(one) ? other : one; });
+    }
     var all = [0].concat(places.slice().sort(function (a, b) { return a - b; }), [setting.length]), best = 0;
     for (var i = 1; i < all.length - 1; i++) if (all[i + 1] - all[i] > all[best + 1] - all[best]) best = i;
     return 0.5 * (all[best] + all[best + 1]);
@@ -90,7 +96,7 @@
     var imsc = design.law === "IMSC", n = imsc ? design.controlled : 1;
     for (var r = 0; r < n; r++) (function (r) {
       var label = row(imsc ? "R of mode " + (r + 1) : "R"), reading;
-      var slider = html("input", { type: "range", min: -2, max: 4, step: 0.02, value: Math.log10(design.weight[r]), "aria-label": "weight " + (r + 1) }, label);
+      var slider = html("input", { type: "range", min: usual - 3, max: usual + 3, step: 0.02, value: Math.log10(design.weight[r]), "aria-label": "weight " + (r + 1) }, label);
       reading = html("output", {}, label, shown(design.weight[r]));
       slider.addEventListener("input", function () {
         design.weight[r] = +Math.pow(10, +slider.value).toPrecision(4);
@@ -101,53 +107,120 @@
     })(r);
   }
 
-  // the structure with what stands on it
-  var X, height, line, still, free, beamY, marks = [], reach = 1;
+  // the structure with what stands on it: a line seen from the side, or a plate seen from above
+  var X, Y, line, still, free, beamY, reach = 1, INSET = 0.3;
   function layout() {
     var width = stand.clientWidth;
     if (!width) return;
-    height = Math.max(210, Math.min(300, 0.4 * width));
-    beamY = 0.42 * height;
-    X = workbench.scale([0, setting.length], false, 18, width - 18);
+    stand.textContent = "";
+    var height = plate ? above(width) : aside(width);
     stand.setAttribute("viewBox", "0 0 " + width + " " + height);
     stand.setAttribute("height", height);
-    stand.textContent = "";
-    svg("line", { x1: X(0), x2: X(setting.length), y1: beamY, y2: beamY, stroke: "var(--line)", "stroke-width": 2 }, stand);
-    workbench.ticks({}, [0, setting.length], Math.round(width / 90)).forEach(function (t) {
-      svg("text", { x: X(t[0]), y: height - 4, "text-anchor": "middle" }, stand, t[1]);
-    });
-    still = svg("path", { fill: "none", stroke: "var(--soft)", "stroke-width": 1.2, opacity: 0.6 }, stand);
-    line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
     free = svg("g", {}, stand);
     handles();
     animate();
   }
+  function aside(width) {
+    var height = Math.max(210, Math.min(300, 0.4 * width));
+    beamY = 0.42 * height;
+    X = workbench.scale([0, setting.length], false, 18, width - 18);
+    svg("line", { x1: X(0), x2: X(setting.length), y1: beamY, y2: beamY, stroke: "var(--line)", "stroke-width": 2 }, stand);
+    along(height - 4, width);
+    still = svg("path", { fill: "none", stroke: "var(--soft)", "stroke-width": 1.2, opacity: 0.6 }, stand);
+    line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
+    return height;
+  }
+  function along(y, width) {
+    workbench.ticks({}, [0, sides[0]], Math.round(width / 90)).forEach(function (t) {
+      svg("text", { x: X(t[0]), y: y, "text-anchor": "middle" }, stand, t[1]);
+    });
+  }
+  // the plate as it is controlled, and small beside it as it is without control
+  function above(width) {
+    var left = 34, small = width > 640, most = (small ? 1 - INSET : 1) * width - left - 16;
+    var scale = Math.min(most / sides[0], 420 / sides[1]), w = scale * sides[0], h = scale * sides[1];
+    X = workbench.scale([0, sides[0]], false, left, left + w);
+    Y = workbench.scale([0, sides[1]], false, 12 + h, 12);
+    line = field("track", left, 12, w, h);
+    along(28 + h, w);
+    workbench.ticks({}, [0, sides[1]], Math.max(2, Math.round(h / 90))).forEach(function (t) {
+      svg("text", { x: left - 6, y: Y(t[0]) + 4, "text-anchor": "end" }, stand, t[1]);
+    });
+    var share = Math.min(INSET * width - 20, 0.55 * w) / w, x = small ? left + w + 24 : left, y = small ? 12 : 44 + h;
+    still = field("still", x, y, share * w, share * h);
+    svg("text", { x: x, y: y + share * h + 16 }, stand, "without control");
+    return Math.max(h + 34, y + share * h + 24);
+  }
+  function field(name, x, y, w, h) {
+    var image = svg("image", { class: name, x: x, y: y, width: w, height: h, preserveAspectRatio: "none" }, stand);
+    svg("rect", { x: x, y: y, width: w, height: h, fill: "none", stroke: "var(--soft)" }, stand);
+    return image;
+  }
+  var canvas = document.createElement("canvas"), paint = canvas.getContext("2d");
+  // red up and blue down, the stronger the farther; a cell of the plate is a spot of the picture
+  function painted(values) {
+    var nx = setting.cells[0], ny = setting.cells[1];
+    canvas.width = nx;
+    canvas.height = ny;
+    var spots = paint.createImageData(nx, ny);
+    values.forEach(function (w, i) {
+      var k = 4 * ((ny - 1 - i % ny) * nx + Math.floor(i / ny)), v = Math.max(-1, Math.min(1, w / reach));
+      spots.data.set(v > 0 ? [202, 0, 32, 255 * v] : [5, 113, 176, -255 * v], k);
+    });
+    paint.putImageData(spots, 0, 0);
+    return canvas.toDataURL();
+  }
   function handles() {
     if (!free) return;
     free.textContent = "";
-    design.actuators.forEach(function (at, i) { handle("actuators", i, height - 42, "M0,-10L8,6H-8Z", "var(--bad)", "actuator " + (i + 1)); });
-    design.sensors.forEach(function (at, i) { handle("sensors", i, beamY, "M0,-6A6,6 0 1 1 -0.01,-6Z", "var(--paper)", "sensor " + (i + 1)); });
-    handle("struck_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", "var(--soft)", "hammer");
+    design.actuators.forEach(function (_, i) { handle("actuators", i, stand.viewBox.baseVal.height - 42, "M0,-10L8,6H-8Z", "var(--bad)", "actuator " + (i + 1)); });
+    design.sensors.forEach(function (_, i) { handle("sensors", i, beamY, "M0,-6A6,6 0 1 1 -0.01,-6Z", "var(--paper)", "sensor " + (i + 1)); });
+    handle("struck_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", plate ? "var(--ink)" : "var(--soft)", "hammer");
   }
-  function handle(kind, i, y, path, fill, name) {
-    var g = svg("g", { class: "handle " + kind, tabindex: 0, role: "slider", "aria-label": name, "aria-valuemin": 0, "aria-valuemax": setting.length }, free);
+  // a place inside, all of a patch on the structure
+  function held(kind, place) {
+    var inside = [].concat(place).map(function (v, d) {
+      var half = kind === "actuators" && setting.patch.length ? setting.patch[d] / 2 : 0;
+      return +Math.max(half, Math.min(sides[d] - half, v)).toPrecision(5);
+    });
+    return plate ? inside : inside[0];
+  }
+  function handle(kind, i, lane, path, fill, name) {
+    var g = svg("g", { class: "handle " + kind, tabindex: 0, role: "slider", "aria-label": name, "aria-valuemin": 0, "aria-valuemax": sides[0] }, free);
+    if (kind === "actuators" && setting.patch.length) {
+      var w = X(setting.patch[0]) - X(0), h = plate ? Y(0) - Y(setting.patch[1]) : 6;
+      svg("rect", { x: -w / 2, y: plate ? -h / 2 : 7, width: w, height: h, fill: "var(--bad)", "fill-opacity": 0.18, stroke: "var(--bad)" }, g);
+    }
     svg("circle", { class: "halo", r: 20 }, g);
-    svg("path", { d: path, fill: fill, stroke: "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : 0 }, g);
-    var label = svg("text", { y: kind === "struck_at" ? 5 : kind === "sensors" ? 20 : 20, x: kind === "struck_at" ? 14 : 0, "text-anchor": kind === "struck_at" ? "start" : "middle" }, g);
+    svg("path", { d: path, fill: fill, stroke: plate && kind !== "sensors" ? "var(--paper)" : "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : plate ? 1 : 0 }, g);
+    var beside = kind === "struck_at" && !plate;
+    var label = svg("text", { y: beside ? 5 : 20, x: beside ? 14 : 0, "text-anchor": beside ? "start" : "middle" }, g);
     function at() { return i === null ? design[kind] : design[kind][i]; }
-    function put() { g.setAttribute("transform", "translate(" + X(at()) + "," + y + ")"); g.setAttribute("aria-valuenow", at()); label.textContent = at().toPrecision(3); }
-    function move(v) {
-      v = +Math.max(0, Math.min(setting.length, v)).toPrecision(5);
-      if (i === null) design[kind] = v; else design[kind][i] = v;
+    function put() {
+      var spot = plate ? [X(at()[0]), Y(at()[1])] : [X(at()), lane], text = [].concat(at()).map(function (v) { return v.toPrecision(3); }).join(", ");
+      g.setAttribute("transform", "translate(" + spot + ")");
+      g.setAttribute("aria-valuenow", [].concat(at())[0]);
+      if (plate) g.setAttribute("aria-valuetext", text);
+      label.textContent = text;
+    }
+    function move(place) {
+      place = held(kind, place);
+      if (i === null) design[kind] = place; else design[kind][i] = place;
       put();
       ask();
     }
     g.addEventListener("pointerdown", function (e) { g.setPointerCapture(e.pointerId); g.focus(); e.preventDefault(); g.dragged = true; });
-    g.addEventListener("pointermove", function (e) { if (g.dragged) move(X.back(e.clientX - stand.getBoundingClientRect().left)); });
+    g.addEventListener("pointermove", function (e) {
+      if (!g.dragged) return;
+      var box = stand.getBoundingClientRect(), x = X.back(e.clientX - box.left);
+      move(plate ? [x, Y.back(e.clientY - box.top)] : x);
+    });
     ["pointerup", "pointercancel"].forEach(function (end) { g.addEventListener(end, function () { g.dragged = false; }); });
     g.addEventListener("keydown", function (e) {
-      var way = { ArrowLeft: -1, ArrowRight: 1 }[e.key];
-      if (way) { e.preventDefault(); move(at() + way * setting.length / (e.shiftKey ? 1000 : 100)); }
+      var way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, -1], ArrowUp: [0, 1] }[e.key], step = e.shiftKey ? 1000 : 100;
+      if (!way || (way[1] && !plate)) return;
+      e.preventDefault();
+      move([].concat(at()).map(function (v, d) { return v + way[d] * sides[d] / step; }));
     });
     put();
   }
@@ -196,11 +269,9 @@
   function displaced(k) { return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * answer.modal[r][k]; return w; }); }
   // the same impulse without control: each mode decays by itself
   function idle(k) {
-    var t = answer.time[k], s = design.struck_at / setting.length * (setting.x.length - 1), i = Math.min(setting.x.length - 2, Math.floor(s));
-    var q = setting.omega.map(function (w, r) {
-      var hit = setting.shapes[i][r] + (s - i) * (setting.shapes[i + 1][r] - setting.shapes[i][r]), z = setting.zeta[r];
-      var ring = w * Math.sqrt(Math.max(0, 1 - z * z));
-      return hit * Math.exp(-z * w * t) * (ring > 0 ? Math.sin(ring * t) / ring : t);
+    var t = answer.time[k], q = setting.omega.map(function (w, r) {
+      var z = setting.zeta[r], ring = w * Math.sqrt(Math.max(0, 1 - z * z));
+      return answer.struck[r] * Math.exp(-z * w * t) * (ring > 0 ? Math.sin(ring * t) / ring : t);
     });
     return setting.shapes.map(function (row) { var w = 0; for (var r = 0; r < row.length; r++) w += row[r] * q[r]; return w; });
   }
@@ -208,7 +279,8 @@
     if (!answer || !X) return;
     var k = Math.round(clock % 1 * (answer.time.length - 1)), size = (beamY - 40) / reach;
     [[line, displaced(k)], [still, idle(k)]].forEach(function (shape) {
-      shape[0].setAttribute("d", "M" + shape[1].map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
+      if (plate) shape[0].setAttribute("href", painted(shape[1]));
+      else shape[0].setAttribute("d", "M" + shape[1].map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
     });
     by("clock").textContent = "t = " + shown(answer.time[k]) + " s";
   }

@@ -1,0 +1,86 @@
+"""Modal filters on plates, by thin-plate splines: what they must see exactly, and how what they miss shrinks."""
+
+import numpy as np
+import pytest
+
+from workbench.design.estimation.controller import filtered
+from workbench.design.estimation.surface_filter import filter_on, surface_filter
+from workbench.design.laws.imsc import imsc
+from workbench.design.loop.closed_loop import close_loop, close_with
+from workbench.rig.actuators import Actuator
+from workbench.structure.member import Beam
+from workbench.structure.plate import Plate
+
+A, B = 1.2, 0.8
+RNG = np.random.default_rng(3)
+
+
+def plate(edges, **options):
+    given = {"length": (A, B), "mass_per_area": 8.0, "bending_stiffness": 175.0, "poisson_ratio": 0.3}
+    return Plate(edges=edges, **(given | options))
+
+
+def scattered(n):
+    """Places of a jittered grid of about n, none near another."""
+    nx = round(np.sqrt(n * A / B))
+    ny = -(-n // nx)
+    x, y = np.meshgrid((np.arange(nx) + 0.5) / nx * A, (np.arange(ny) + 0.5) / ny * B)
+    jitter = np.random.default_rng(0).uniform(-0.2, 0.2, (2, nx * ny))
+    return np.column_stack([x.ravel() + jitter[0] * A / nx, y.ravel() + jitter[1] * B / ny])
+
+
+def test_motions_of_a_rigid_plate_are_seen_exactly_from_any_sensors():
+    free = plate("free", mass_per_area=lambda x, y: 8.0 + 3.0 * x * y).modes(6)
+    assert (free.omega[:3] == 0).all()
+    found = surface_filter(free, scattered(10), lambda x, y: 8.0 + 3.0 * x * y).seen(free)
+    np.testing.assert_allclose(found[:, :3], np.eye(6, 3), atol=1e-6)
+
+
+@pytest.mark.parametrize("edges", ["simply supported", "clamped", {"left": "clamped"}])
+def test_more_sensors_see_the_modes_better(edges):
+    if isinstance(edges, dict):
+        edges = dict.fromkeys(("right", "bottom", "top"), "free") | edges
+    structure = plate(edges)
+    modes = structure.modes(6)
+    off = [np.abs(filter_on(structure, modes, scattered(n)).seen(modes) - np.eye(6)).max() for n in (12, 48, 192)]
+    assert off[1] < 0.35 * off[0] and off[2] < 0.35 * off[1] and off[2] < 0.02, off
+
+
+def test_a_law_through_a_filter_of_many_sensors_is_nearly_that_of_exact_modes():
+    structure = plate("simply supported")
+    modes = structure.modes(8)
+    law = imsc(modes, 2, [Actuator("F1", (0.3, 0.24)), Actuator("F2", (0.84, 0.52))], weight=0.01)
+    filter_ = filter_on(structure, modes.select(law.controlled), scattered(150))
+    loop, exact = close_with(modes, filtered(law, filter_)), close_loop(modes, law)
+    np.testing.assert_allclose(np.sort(loop.poles.real)[:4], np.sort(exact.poles.real)[:4], rtol=0.02)
+    np.testing.assert_allclose(loop.matrix, close_loop(modes, law, filter_).matrix, atol=1e-9)
+
+
+def test_a_filter_of_a_beam_takes_its_sensors_in_any_order():
+    beam = Beam(length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="hinged", right="hinged")
+    modes, places = beam.modes(3), [0.4, 1.6, 0.9, 1.3]
+    one, other = filter_on(beam, modes, places), filter_on(beam, modes, sorted(places))
+    np.testing.assert_array_equal(one.displacement, other.displacement)
+
+
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        ([(0.3, 0.2), (0.9, 0.6)], "at least 3 readings that are not on one line; got 2: add sensors"),
+        ([(0.3, 0.2), (0.6, 0.4), (0.9, 0.6)], "not on one line; got 3"),
+        ([(0.3, 0.2), (0.3, 0.2), (0.9, 0.6)], "two of the 3 sensors stand at one place"),
+        ([(0.3, 0.2), (1.3, 0.4), (0.9, 0.6)], r"\(1.3, 0.4\) lies outside the structure"),
+    ],
+)
+def test_too_few_readings_for_a_surface_are_refused(places, words):
+    with pytest.raises(ValueError, match=words):
+        surface_filter(plate("free").modes(3), places, 8.0)
+
+
+def test_a_mode_that_the_sensors_cannot_see_is_named():
+    structure = plate("simply supported")
+    modes = structure.modes(4)
+    law = imsc(modes, 2, [Actuator("F1", (0.3, 0.24)), Actuator("F2", (0.84, 0.52))], weight=0.01)
+    midline = filter_on(structure, modes.select(law.controlled), [(0.6, 0.2), (0.6, 0.4)])
+    with pytest.raises(ValueError, match=r"sensors at 0.6, 0.2; 0.6, 0.4 cannot see mode 2"):
+        close_loop(modes, law, midline)
