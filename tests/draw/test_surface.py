@@ -4,8 +4,16 @@ import numpy as np
 import pytest
 
 from workbench.design.loop.closed_loop import Response
+from workbench.design.placement.limits import Limits
+from workbench.design.placement.task import placement_task
 from workbench.draw.plot import plot
-from workbench.draw.surface import plot_point_modes, plot_surface_modes, plot_surface_motion
+from workbench.draw.surface import (
+    plot_point_modes,
+    plot_surface_modes,
+    plot_surface_motion,
+    plot_surface_placement,
+)
+from workbench.rig.actuators import piezo_patch
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Plate
@@ -31,6 +39,27 @@ def test_the_nodal_line_stands_where_the_plate_does_not_move():
     inside = lines[(np.abs(lines[:, 1] - B / 2) < 0.45 * B) & (np.abs(lines[:, 0] - A / 2) < 0.45 * A)]
     assert inside.shape[0] > 5
     np.testing.assert_allclose(inside[:, 0], A / 2, atol=1e-3 * A)
+
+
+@pytest.mark.parametrize("size", [None, (0.2, 0.1)], ids=["forces", "patches"])
+def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
+    actuator = None if size is None else piezo_patch("P", (0.6, 0.4), length=size)
+    task = placement_task(panel(), 2, impulse_at=(0.35, 0.3), weight=0.1, actuator=actuator)  # mode 3 is (1, 2)
+    placed = {"here": task.placed([(0.3, 0.2), (0.8, 0.5)], ""), "there": task.placed([(0.3, 0.5), (0.9, 0.3)], "")}
+    limits = Limits(effort=1.0, forbidden=(((0.5, 0.1), (0.7, 0.3)),))
+    figure = plot_surface_placement(task, placed, limits=limits, struck=(0.35, 0.3))
+    left, right = figure.axes
+    assert left.get_title("left").startswith("mode 3")
+    nodal = next(c for c in left.collections if c.get_linewidths()[0] == 1.4)
+    line = np.vstack([path.vertices for path in nodal.get_paths()])
+    np.testing.assert_allclose(line[:, 1], B / 2, atol=1e-3)
+    assert np.ptp(line[:, 0]) > 0.95 * A
+    for drawn, placement in zip(left.lines, placed.values()):
+        np.testing.assert_allclose(drawn.get_xydata(), placement.positions)
+    boxes = [np.ptp(polygon.get_xy(), axis=0) for polygon in left.patches]
+    np.testing.assert_allclose(boxes, [(0.2, 0.2), *([size] * 4 if size else [])])
+    heights = [[bar.get_height() for bar in bars] for bars in right.containers]
+    np.testing.assert_allclose(heights, [placement.by_mode for placement in placed.values()])
 
 
 def test_sensors_are_drawn_where_they_stand_and_coloured_as_they_read():

@@ -12,13 +12,15 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, PlacementTask
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.structure.domain import TRANSLATIONS, NamedPoints, Rectangle
+from workbench.structure.domain import TRANSLATIONS, NamedPoints, Patch, Rectangle
 from workbench.structure.modes import Modes
 
 PER_SIDE = 61  # of the longer one: points where a shape is drawn
 SHOWN_WORK = 1e-8  # of the largest work in one mode: what is less is not drawn
 LEVELS = 12  # of colour on each side of zero
 COLUMNS = 4
+HELD = 1e-6  # of a shape's largest value: less all along an edge is held
+CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, one after another
 SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 
@@ -39,7 +41,7 @@ def plot_surface_modes(
     for r, ax in enumerate(axes):
         limit = np.abs(fields[r]).max()
         _coloured(ax, x, y, fields[r], limit)
-        ax.contour(x, y, fields[r].T, levels=[0.0], colors="black", linewidths=1.2)
+        _nodal_lines(ax, x, y, fields[r], 1.2)
         if places is not None and values is not None:
             dots: Any = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "edgecolors": "black"}
             ax.scatter(places[:, 0], places[:, 1], s=46, c=values[:, r], linewidths=0.9, **dots)
@@ -97,6 +99,8 @@ def plot_surface_placement(
 ) -> Figure:
     """Actuators on a plate over mode n + 1, whose nodal lines are black, and the work in each residual mode beside.
 
+    Piezo patches are drawn in their size.
+
     Args:
         placements: by name, drawn in its colour.
         limits: of which the forbidden zones are hatched.
@@ -107,8 +111,7 @@ def plot_surface_placement(
     x, y, fields = _over(modes, np.eye(modes.n_modes)[:, n : n + 1])
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
     left.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
-    # supported edges are zero but for rounding, which a line would show
-    left.contour(x[1:-1], y[1:-1], fields[0, 1:-1, 1:-1].T, levels=[0.0], colors="black", linewidths=1.4)
+    _nodal_lines(left, x, y, fields[0], 1.4)
     for (x0, y0), (x1, y1) in limits.forbidden if limits is not None else ():  # type: ignore[misc, str-unpack]
         left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2)
     numbers = n + 1 + np.arange(modes.n_modes - n)
@@ -116,6 +119,10 @@ def plot_surface_placement(
     for i, (name, placement) in enumerate(placements.items()):
         label = f"{name}: W_R = {placement.residual_work:.2g}"
         left.plot(*placement.positions.T, "o", color=COLOURS[i], markersize=10, label=label, zorder=3)
+        if isinstance(task.actuator.at, Patch):
+            half = 0.5 * np.array(task.actuator.at[2:])
+            for middle in placement.positions:
+                left.fill(*(middle + half * CORNERS).T, facecolor=COLOURS[i], edgecolor=COLOURS[i], alpha=0.3, zorder=2)
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
     if struck is not None:
         left.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
@@ -161,6 +168,17 @@ def plot_point_modes(
         ax.set_aspect("equal")
         ax.axis("off")
     return figure
+
+
+def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, width: float) -> None:
+    """Where a field is zero; along edges that hold it, where it is so but for rounding, no line is drawn."""
+    nothing = HELD * np.abs(field).max()
+    within = [
+        slice(int(np.abs(first).max() < nothing), -1 if np.abs(last).max() < nothing else None)
+        for first, last in ((field[0], field[-1]), (field[:, 0], field[:, -1]))
+    ]
+    i, j = within
+    ax.contour(x[i], y[j], field[i, j].T, levels=[0.0], colors="black", linewidths=width)
 
 
 def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -338,3 +338,9 @@ def test_limits_as_keywords_still_work_with_a_warning(task):
     nodes = two.placed(nodes_of_mode(task.modes, 2), "nodes")
     with pytest.warns(DeprecationWarning, match="certify"):
         assert certify(two, nodes, effort_limit=1.5 * nodes.effort, spacing=0.5).better is not None
+
+
+def test_all_of_a_patch_keeps_out_of_a_forbidden_stretch():
+    limits = Limits(effort=1.0, forbidden=((2.0, 3.0), (9.5, 9.8)))
+    assert limits.allowed(10.0) == [(0.0, 2.0), (3.0, 9.5), (9.8, 10.0)]
+    assert limits.allowed(10.0, clear=0.25) == [(0.25, 1.75), (3.25, 9.25)]

@@ -70,11 +70,13 @@ def test_patches_are_placed_as_well_as_by_a_fine_grid_and_lie_on_the_plate(task)
     at = np.array([[0.31, 0.22], [0.85, 0.61]])
     work = float(symbolic_work(patches)(at.ravel())[0])
     assert work == pytest.approx(patches.placed(at, "").residual_work, rel=1e-6)
-    limits = Limits(effort=2.0 * patches.placed(at, "").effort, spacing=0.2)
+    limits = Limits(effort=2.0 * patches.placed(at, "").effort, spacing=0.2, forbidden=(ZONE,))
     best = place(patches, limits, starts=3)
     on_grid, _ = scan(patches, limits, n_places=12)
     assert best.residual_work <= on_grid.residual_work
     assert (best.positions >= (0.1, 0.08)).all() and (best.positions <= (1.1, 0.82)).all()
+    clear = np.abs(best.positions - np.mean(ZONE, axis=0)) - 0.5 * np.diff(ZONE, axis=0)
+    assert (clear >= np.array((0.1, 0.08)) - 1e-9).any(axis=1).all()  # no patch lies over the zone with any part
     assert {actuator.at[2:] for actuator in best.law.actuators} == {(0.2, 0.16)}
 
 

@@ -34,7 +34,7 @@ class Limits:
         spacing: least distance between neighbours, m.
         margin: least distance from the ends or edges, m.
         forbidden: zones where no actuator can stand, m: intervals (from, to), or on a rectangle boxes between two
-            corners ((x, y), (x, y)). The middle of a patch keeps out of them.
+            corners ((x, y), (x, y)). All of a patch keeps out of them.
         candidates: the only places there are; None where an actuator may stand anywhere else. Of named points all that
             are displacements (for moments, rotations), unless given.
     """
@@ -81,9 +81,9 @@ class Limits:
         margin = max(self.margin, clear)
         at, intervals = margin, []
         for low, high in sorted((position(low), position(high)) for low, high in self.forbidden):
-            if low > at:
-                intervals.append((at, min(low, length - margin)))
-            at = max(at, high)
+            if low - clear > at:
+                intervals.append((at, min(low - clear, length - margin)))
+            at = max(at, high + clear)
         intervals.append((at, length - margin))
         intervals = [(low, high) for low, high in intervals if low <= high]
         if not intervals:
@@ -106,10 +106,12 @@ class Limits:
             if self.spacing and domain.positions is None:
                 raise DesignError("the positions of the points are not known, so no spacing can be kept; give them")
             return []
+        half = reach(domain, task.actuator.at)[0]
         zones = tuple((np.atleast_1d(low), np.atleast_1d(high)) for low, high in self.forbidden)
         if any(part.shape != (2,) for zone in zones for part in zone):
             raise DesignError(f"a forbidden zone of a rectangle is ((x, y), (x, y)), m; got {self.forbidden}")
-        return free_boxes(domain, np.maximum(self.margin, reach(domain, task.actuator.at)[0]), zones)
+        zones = tuple((low - half, high + half) for low, high in zones)
+        return free_boxes(domain, np.maximum(self.margin, half), zones)
 
     def intervals(self, n: int, length: float, clear: float = 0.0) -> list[tuple[float, float]]:
         """The same, where n actuators find room at all.
