@@ -197,7 +197,7 @@ def test_points_go_through_a_file_unchanged(tmp_path):
 @pytest.mark.parametrize(
     ("case", "points", "words"),
     [
-        (PLATE.replace("[0.5, 0.4]", "[0.5, 1.4]"), POINTS, r"\(0.5, 1.4\) lies outside the structure"),
+        (PLATE.replace("[0.5, 0.4]", "[0.5, 1.4]"), POINTS, r"'a1': .* \(0.5, 1.4\) lies outside the structure"),
         (PLATE.replace("[0.5, 0.4]", "0.5"), POINTS, "at must be a list of 2 numbers; got 0.5"),
         (PLATE.replace("[0.3, 0.2]", "[0.3, 0.2]\npatch = 0.1"), POINTS, "'F1': patch must be a list of 2 numbers"),
         (PLATE.replace("[0.3, 0.2]", "[0.05, 0.2]\npatch = [0.2, 0.1]"), POINTS, "'F1': a patch of 0.2 m by 0.1 m at"),
@@ -207,7 +207,7 @@ def test_points_go_through_a_file_unchanged(tmp_path):
         (FRAME.replace('"a.x"', '"a.x"\npatch = [0.2, 0.1]'), POINTS, "no key 'patch'"),
         (PLATE.replace("bottom =", "botom ="), POINTS, "did you mean 'bottom'"),
         (PLATE.replace('left = "simply', 'left = "hardly'), POINTS, "hardly supported"),
-        (FRAME.replace('"b.y"', '"c.y"'), POINTS, "there is no point 'c.y'; the points are a.x, a.y, b.y"),
+        (FRAME.replace('"b.y"', '"c.y"'), POINTS, "'a1': there is no point 'c.y'; the points are a.x, a.y, b.y"),
         (FRAME.replace("points.csv", "../points.csv"), POINTS, "outside the case folder"),
         (FRAME.replace("points.csv", "others.csv"), POINTS, "there is no such file"),
         (FRAME, POINTS.replace("mode_2", "mode_3"), "column 'mode_2' is missing"),

@@ -10,6 +10,7 @@ from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.rig.statespace import input_matrix, output_matrix
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
+from workbench.structure.member import Beam
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
 from workbench.structure.supports import PointMass, PointSpring
@@ -45,6 +46,16 @@ def frame(positions=True):
         ("a", "b", "a"),
     )
     return Modes(np.sqrt(values), np.full(3, 0.01), lambda index, _: shapes[index], points)
+
+
+def along():
+    beam = Beam(length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="hinged", right="hinged")
+    return beam.modes(2)
+
+
+def of_rig(modes, actuator, sensor):
+    rig = Rig(modes, (Actuator("F", actuator),), (Sensor("w", sensor),))
+    return simulate(rig, np.ones((1, 20)), sample_time=0.1)
 
 
 STIFFNESS = np.array([[12.0, -7.0, 0.0], [-7.0, 7.0, 0.0], [0.0, 0.0, 11.0]])
@@ -126,6 +137,19 @@ def test_distances_separations_and_texts():
         (lambda: Interval(0.0), "must be positive"),
         (lambda: Rectangle((1.0, -2.0)), "must be positive"),
         (lambda: input_matrix(plate(), [Actuator("F", (0.0, 0.3))]), "stands on the support"),
+        (lambda: of_rig(plate(), (1.3, 0.2), (0.3, 0.2)), r"actuator F: \(x, y\) = \(1.3, 0.2\) lies outside"),
+        (
+            lambda: of_rig(plate(), (0.3, 0.2), (0.3, 1.2)),
+            r"sensor w: \(x, y\) = \(0.3, 1.2\) lies .* give a place on it",
+        ),
+        (lambda: of_rig(frame(), "cx", "ax"), "actuator F: there is no point 'cx'; .*: give one of these"),
+        (
+            lambda: of_rig(along(), (0.3, 0.2), 0.5),
+            r"actuator F: a place along an interval is a position x in m; got \(0.3",
+        ),
+        (lambda: of_rig(along(), 0.3, (0.3, 0.2)), "sensor w: a place along an interval is a position x"),
+        (lambda: along().phi_at((0.3, 0.2)), "a place along an interval is a position x"),
+        (lambda: input_matrix(along(), [Actuator("F", (0.3, 0.2))]), "actuator F: a place along an interval"),
         (lambda: Actuator("F", object()), "a place is a position x, a pair"),
         (lambda: PointSpring([1, 2, 3], 4.0), "a place is a position x, a pair"),
     ],

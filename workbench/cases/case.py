@@ -29,7 +29,7 @@ from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import NamedPoints, Place
+from workbench.structure.domain import Domain, NamedPoints, Place, PlaceError
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
@@ -191,9 +191,8 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     modes = structure.modes(count(table, "modes", MOST_MODES))
 
     def pair(entry: dict[str, Any], where: str) -> Place:
-        x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2)
-        modes.domain.locate((x, y))
-        return (float(x), float(y))
+        x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2).tolist()
+        return _known(modes.domain, (x, y), f"{where} {entry['name']!r}")
 
     actuators = tuple(_actuator(e, pair(e, "[[input]]"), modes) for e in inputs)
     return Rig(modes, actuators, tuple(_sensor(e, pair(e, "[[output]]")) for e in outputs), structure=structure)
@@ -241,10 +240,8 @@ def _rig_at_points(
     points, values = read_points(file, omega.size)
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
 
-    def point(entry: dict[str, Any], where: str) -> str:
-        name = text(entry, "point", f"{where} {entry['name']!r}")
-        points.locate(name)
-        return name
+    def point(entry: dict[str, Any], where: str) -> Place:
+        return _known(points, text(entry, "point", f"{where} {entry['name']!r}"), f"{where} {entry['name']!r}")
 
     actuators = tuple(_actuator(e, point(e, "[[input]]")) for e in inputs)
     return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]")) for e in outputs))
@@ -267,6 +264,14 @@ def _check_ports(
     for key, entries, keys in (("input", inputs, (*INPUT, *more)), ("output", outputs, OUTPUT)):
         for entry in entries:
             check_keys(entry, (*keys, *places), f"[[{key}]] {entry['name']!r}")
+
+
+def _known(domain: Domain, place: Place, where: str) -> Place:
+    try:
+        domain.locate(place)
+    except PlaceError as error:
+        raise CaseError(f"{where}: {error}") from None
+    return place
 
 
 def _place(entry: dict[str, Any], length: float, where: str) -> float:

@@ -3,13 +3,31 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import Element
-from workbench.rig.sensors import Sensor
+from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.domain import PlaceError
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.printed import Printed, counted, place_text
+
+
+def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
+    """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain.
+
+    Raises:
+        PlaceError: naming the actuator or sensor whose place or direction the structure does not have.
+    """
+    if isinstance(port, Actuator):
+        what, derivative = "actuator", int(port.kind == "moment")
+    else:
+        what, derivative = "sensor", MEASURED[port.quantity][0]
+    try:
+        return modes.phi_at(port.at, derivative, direction=port.direction)
+    except PlaceError as error:
+        raise PlaceError(f"{what} {port.name}: {error}") from None
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -31,7 +31,7 @@ from workbench.rig.elements import (
     UserLaw,
 )
 from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response, straight_response
-from workbench.rig.rig import Rig
+from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.stepping import (
     BOUC_WEN,
@@ -50,7 +50,7 @@ from workbench.rig.stepping import (
     ramped,
     step_record,
 )
-from workbench.structure.domain import Between, Patch
+from workbench.structure.domain import Between, Patch, PlaceError
 
 LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
     LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
@@ -243,10 +243,15 @@ def participation_of(rig: Rig) -> np.ndarray:
     for kind, direction, apart in set(kinds):
         group = [j for j, other in enumerate(kinds) if other == (kind, direction, apart)]
         at, derivative = [rig.actuators[j].at for j in group], 1 if kind == "moment" else 0
-        if apart:
-            shapes[:, group] = np.array([rig.modes.phi_at(where, derivative, direction=direction) for where in at]).T
-        else:
-            shapes[:, group] = rig.modes.phi(at, derivative, direction=direction).T
+        try:
+            if apart:
+                each = [rig.modes.phi_at(where, derivative, direction=direction) for where in at]
+                shapes[:, group] = np.array(each).T
+            else:
+                shapes[:, group] = rig.modes.phi(at, derivative, direction=direction).T
+        except PlaceError:
+            _ = [shape_of(rig.modes, rig.actuators[j]) for j in group]  # says which actuator it is
+            raise
     return shapes
 
 
@@ -337,7 +342,12 @@ def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
     measured = [(*MEASURED[sensor.quantity], sensor.direction) for sensor in rig.sensors]
     for derivative, order, direction in set(measured):
         here = [j for j, kind in enumerate(measured) if kind == (derivative, order, direction)]
-        yield order, here, rig.modes.phi([rig.sensors[j].at for j in here], derivative, direction=direction)
+        try:
+            shapes = rig.modes.phi([rig.sensors[j].at for j in here], derivative, direction=direction)
+        except PlaceError:
+            _ = [shape_of(rig.modes, rig.sensors[j]) for j in here]  # says which sensor it is
+            raise
+        yield order, here, shapes
 
 
 def _step(

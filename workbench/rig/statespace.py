@@ -7,8 +7,8 @@ import numpy as np
 
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
+from workbench.rig.rig import shape_of
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import PlaceError
 from workbench.structure.modes import Modes
 
 
@@ -20,13 +20,8 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
     """
     columns = []
     for actuator in actuators:
-        derivative = 1 if actuator.kind == "moment" else 0
-        try:
-            shape = modes.phi_at(actuator.at, derivative, direction=actuator.direction)
-            held = modes.is_held(actuator.at, derivative, direction=actuator.direction)
-        except PlaceError as error:
-            raise PlaceError(f"actuator {actuator.name}: {error}") from None
-        if held:
+        shape = shape_of(modes, actuator)
+        if modes.is_held(actuator.at, int(actuator.kind == "moment"), direction=actuator.direction):
             raise ValueError(
                 f"actuator {actuator.name} stands on the support at {modes.domain.text(actuator.at)}, where it moves"
                 " no mode; move it inside"
@@ -37,13 +32,7 @@ def input_matrix(modes: Modes, actuators: Sequence[Actuator]) -> np.ndarray:
 
 def output_matrix(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
     """Mode shapes (or their slopes) at the sensors, times gain: (n_sensors, n_modes)."""
-    rows = []
-    for sensor in sensors:
-        try:
-            shape = modes.phi_at(sensor.at, MEASURED[sensor.quantity][0], direction=sensor.direction)
-        except PlaceError as error:
-            raise PlaceError(f"sensor {sensor.name}: {error}") from None
-        rows.append(sensor.gain * shape)
+    rows = [sensor.gain * shape_of(modes, sensor) for sensor in sensors]
     return np.array(rows).reshape(len(rows), modes.n_modes)
 
 

@@ -93,7 +93,10 @@ class Interval:
         slack = SLACK * self.length
         outside = (x < -slack) | (x > self.length + slack) | ~np.isfinite(x)
         if outside.any():
-            raise PlaceError(f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}")
+            raise PlaceError(
+                f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}; give a place"
+                " on it"
+            )
         inside: Floats = np.clip(x, 0.0, self.length)
         return inside
 
@@ -174,7 +177,9 @@ class Rectangle:
         if outside.any():
             x, y = xy[outside][0]
             a, b = self.length
-            raise PlaceError(f"(x, y) = ({x:g}, {y:g}) lies outside the structure, 0 to {a:g} by 0 to {b:g}")
+            raise PlaceError(
+                f"(x, y) = ({x:g}, {y:g}) lies outside the structure, 0 to {a:g} by 0 to {b:g}; give a place on it"
+            )
         inside: Floats = np.clip(xy, 0.0, extent)
         return inside
 
@@ -350,7 +355,7 @@ class NamedPoints:
         found = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
         if -1 in found:
             name = names[found.index(-1)]
-            raise PlaceError(f"there is no point {name!r}; the points are {_some(self.names)}")
+            raise PlaceError(f"there is no point {name!r}; the points are {_some(self.names)}: give one of these")
         return np.array(found, int)
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
@@ -380,7 +385,7 @@ class NamedPoints:
         if direction not in alike:
             raise PlaceError(
                 f"point {name!r} has no direction {direction!r}; it has"
-                f" {', '.join(d or 'one without a name' for d in alike) or 'none'}"
+                f" {', '.join(d or 'one without a name' for d in alike) or 'none'}: give one of these, or another node"
             )
         return alike[direction]
 

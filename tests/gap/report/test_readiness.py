@@ -12,6 +12,10 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.readiness import RecordsError, check_modes, check_records, readiness
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import PeriodicForce
+from workbench.rig.rig import Rig
+from workbench.structure.member import Beam
+from workbench.structure.plate import Plate
+from workbench.structure.supports import PointMass
 
 NOISE = 1e-5
 
@@ -83,5 +87,28 @@ def test_modes_changed_behind_the_back_of_their_structure_are_refused(rig):
         check_modes(replace(rig, modes=sharper))
     with pytest.raises(ValueError, match=r"mode 1 .* damped"):
         check_modes(replace(rig, modes=replace(modes, damping=1.5 * modes.damping)))
+    louder = replace(modes, shapes=lambda x, derivative: modes.shapes(x, derivative) * np.r_[1.0, 3.0, np.ones(4)])
+    with pytest.raises(
+        ValueError, match=r"mode 2 of the rig is not mass-normalised: .* is 9, not 1; divide .* by 3; .*"
+    ):
+        check_modes(replace(rig, modes=louder))
     check_modes(replace(rig, modes=sharper, structure=None))
     check_modes(replace(rig, modes=modes.select(slice(3))))
+
+
+def test_modes_of_a_structure_with_masses_on_it_are_mass_normalised():
+    beam = Beam(
+        length=2.0, mass_per_length=([0, 0.7, 0.7, 2], [2, 2, 1, 1]), bending_stiffness=4.0, left="clamped",
+        right="free", attachments=[PointMass(1.4, 0.5, 0.02)],
+    )  # fmt: skip
+    plate = Plate(
+        length=(1.2, 0.8), mass_per_area=lambda x, y: 8.0 + 2.0 * x * y, bending_stiffness=175.0, poisson_ratio=0.3,
+        edges={"left": "clamped", "right": "free", "bottom": "free", "top": "free"},
+        attachments=[PointMass((0.9, 0.3), 1.0)],
+    )  # fmt: skip
+    for structure in (beam, plate):
+        modes = structure.modes(4)
+        check_modes(Rig(modes, (), (), structure=structure))
+        heavy = replace(modes, shapes=lambda at, derivative, shapes=modes.shapes: 1.1 * shapes(at, derivative))
+        with pytest.raises(ValueError, match=r"mode 1 .* is 1\.21, not 1; divide its shape by 1\.1;"):
+            check_modes(Rig(heavy, (), (), structure=structure))

@@ -15,7 +15,11 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
-from workbench.structure.domain import Between, Where, same_place
+from workbench.structure.domain import Between, NamedPoints, Where, same_place
+from workbench.structure.member import Structure
+from workbench.structure.modes import Modes
+from workbench.structure.plate import Membrane, Plate
+from workbench.structure.supports import PointMass
 
 ALIKE = 0.995
 SEEN = 25.0  # of chi-squared: five standard deviations
@@ -26,6 +30,7 @@ STUCK = 0.5
 THINNING = 3
 COARSELY = 2  # substeps of a sample: whether an effect shows needs no more
 STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
+MISSCALED, QUADRATURE = 0.02, 200  # of a modal mass; points along a member that it is integrated by
 DECADES = (1e2, 1e-2, 1e4, 1e-4)
 
 
@@ -147,7 +152,7 @@ def check_modes(rig: Rig) -> None:
     Effects of the structure are solved anew on it: what was changed on the modes alone would be lost in them.
 
     Raises:
-        ValueError: a natural frequency or a damping that the structure does not have.
+        ValueError: a natural frequency, a damping or a modal mass that the structure does not have.
     """
     if rig.structure is None:
         return
@@ -168,6 +173,33 @@ def check_modes(rig: Rig) -> None:
             f"mode {r + 1} of the rig is damped by {damping[r]:.4g} rad/s, that of its structure by"
             f" {expected[r]:.4g} rad/s{remedy}"
         )
+    masses = _modal_masses(modes, rig.structure)
+    off = np.abs(masses - 1.0) > MISSCALED
+    if off.any():
+        r = int(np.argmax(off))
+        raise ValueError(
+            f"mode {r + 1} of the rig is not mass-normalised: its modal mass ∫ m φ² is {masses[r]:.4g}, not 1; divide"
+            f" its shape by {np.sqrt(masses[r]):.4g}{remedy}"
+        )
+
+
+def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floats:
+    """∫ m φ_r² over the structure with the masses attached to it, (n_modes,)."""
+    if isinstance(modes.domain, NamedPoints):
+        raise ValueError("modes at named points are not those of a structure with a length; give structure=None")
+    places, weights = modes.domain.quadrature(QUADRATURE)
+    density = (
+        structure.mass_per_length(places)
+        if isinstance(structure, Structure)
+        else structure.mass_per_area(places[:, 0], places[:, 1])
+    )
+    masses: Floats = (weights * density) @ modes.phi(places) ** 2
+    for part in structure.attachments:
+        if isinstance(part, PointMass):
+            masses = masses + part.mass * modes.phi_at(part.at) ** 2
+            if part.rotary_inertia:
+                masses = masses + part.rotary_inertia * modes.phi_at(part.at, 1) ** 2
+    return masses
 
 
 def _check_not_stuck(rig: Rig, records: Sequence[Record]) -> None:
