@@ -108,6 +108,7 @@ class Kind:
         force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), where it is a law of that
             alone.
         numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
+        settled: effect -> the same with numbers that the records do not tell from none as good as none.
         second_channel, joined: of a kind that acts on two inputs or two outputs: what the verdict calls the other one,
             and the word between the two in its sentence.
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.
@@ -131,6 +132,7 @@ class Kind:
     remainder: str = ""
     force_laws: Mapping[str, Callable[[Mapping[str, Any], np.ndarray], np.ndarray]] = field(default_factory=dict)
     numbers: Callable[["Effect", Rig], dict[str, float]] | None = None
+    settled: Callable[["Effect"], "Effect"] = lambda effect: effect
     remark: Callable[["Effect", Rig], str] | None = None
     stands: Callable[["Effect", Rig], tuple[float, str]] | None = None
     second_channel: str = "with"

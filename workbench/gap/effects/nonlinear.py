@@ -29,6 +29,7 @@ from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.member import Structure
 
 LEAST, MOST = 1e-12, 1e12  # bounds of a strength, in units of the rig's own
+AT_ONCE = 0.1  # of a smoothing speed that the records do not tell from none: friction that turns at once
 
 
 def with_element(rig: Rig, element: Element) -> Rig:
@@ -226,11 +227,24 @@ def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
     return (Effect(POINT_DAMPER, None, {**place_values(friction.at), "coefficient": coefficient}),)
 
 
+def _is_sudden(friction: Effect) -> bool:
+    """Whether its smoothing speed is too small for the records to tell it from none."""
+    return friction.deviations.get("smoothing_speed", 0.0) > friction.values["smoothing_speed"]
+
+
 def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
-    """Its numbers, without a smoothing speed too small for the records to show."""
-    speed = friction.values["smoothing_speed"]
-    sudden = friction.deviations.get("smoothing_speed", 0.0) > speed
-    return {name: v for name, v in friction.numbers.items() if name != "smoothing_speed" or not sudden}
+    """Its numbers, without a smoothing speed that the records do not tell from none."""
+    told = friction.numbers
+    return {name: v for name, v in told.items() if name != "smoothing_speed" or not _is_sudden(friction)}
+
+
+def _sudden(friction: Effect) -> Effect:
+    """Friction that turns at once, where the records do not tell the speed over which it turns from none."""
+    if not _is_sudden(friction):
+        return friction
+    return replace(
+        friction, values={**friction.values, "smoothing_speed": AT_ONCE * friction.values["smoothing_speed"]}
+    )
 
 
 def _either_way(friction: Effect) -> tuple[Effect, ...]:
@@ -254,6 +268,7 @@ COULOMB_FRICTION = Kind(
     simpler=_viscous,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
     numbers=_without_sudden,
+    settled=_sudden,
     phrase="a friction force",
 )
 
@@ -379,6 +394,7 @@ TWO_WAY_FRICTION = Kind(
     simpler=_same_both_ways,
     force_laws={"velocity": _two_way_law},
     numbers=_without_sudden,
+    settled=_sudden,
     phrase="a friction force that differs between the two directions",
 )
 

@@ -206,6 +206,7 @@ def attribute(
         best = _beside_identified(search, best, beside, seen)
     if random is None:
         best = with_intervals(search.rig, best, search.data, workers, wide=beside is not None)
+        best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
         if outcome == "explained":
             standing = tuple(e for e in best.effects if e in seen or e.stands_out(search.rig))
             best = best.only(search.rig, standing)
