@@ -14,7 +14,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.elements import PeriodicForce
 from workbench.rig.rig import Rig
 from workbench.structure.member import Beam
-from workbench.structure.plate import Plate
+from workbench.structure.plate import Membrane, Plate
 from workbench.structure.supports import PointMass
 
 NOISE = 1e-5
@@ -106,7 +106,7 @@ def test_modes_of_a_structure_with_masses_on_it_are_mass_normalised():
         edges={"left": "clamped", "right": "free", "bottom": "free", "top": "free"},
         attachments=[PointMass((0.9, 0.3), 1.0)],
     )  # fmt: skip
-    for structure in (beam, plate):
+    for structure in (beam, plate, Membrane(length=(1.2, 0.8), mass_per_area=2.0, tension=90.0)):
         modes = structure.modes(4)
         check_modes(Rig(modes, (), (), structure=structure))
         heavy = replace(modes, shapes=lambda at, derivative, shapes=modes.shapes: 1.1 * shapes(at, derivative))

@@ -194,7 +194,7 @@ def _modal_masses(modes: Modes, structure: Structure | Plate | Membrane) -> Floa
         else structure.mass_per_area(places[:, 0], places[:, 1])
     )
     masses: Floats = (weights * density) @ modes.phi(places) ** 2
-    for part in structure.attachments:
+    for part in () if isinstance(structure, Membrane) else structure.attachments:
         if isinstance(part, PointMass):
             masses = masses + part.mass * modes.phi_at(part.at) ** 2
             if part.rotary_inertia:
