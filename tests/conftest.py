@@ -1,4 +1,4 @@
-"""The order of the tests, the beam that most of their rigs are built on, and a plate with repeated modes."""
+"""The order of the tests, the beam that most of their rigs are built on, the same by elements, and a square plate."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.structure.damping import ModalDamping
+from workbench.structure.damping import Damping, ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Plate
@@ -28,6 +30,40 @@ def hinged_beam() -> Beam:
         right="hinged",
         damping=ModalDamping(0.01),
     )
+
+
+@pytest.fixture(scope="session")
+def beam_elements() -> Callable[..., FiniteElements]:
+    """A uniform beam of 10 m, m = EI = 1, of n Hermite elements of scikit-fem: points w0, r0, w1, r1, ..."""
+    from skfem import Basis, BilinearForm, ElementLineHermite, MeshLine
+    from skfem.helpers import dd
+
+    @BilinearForm
+    def bending(u, v, _):
+        return dd(u)[0, 0] * dd(v)[0, 0]
+
+    @BilinearForm
+    def inertia(u, v, _):
+        return u * v
+
+    def make(n: int = 200, *, hinged: bool = True, damping: Damping | None = None) -> FiniteElements:
+        x = np.linspace(0.0, 10.0, n + 1)
+        basis = Basis(MeshLine(x), ElementLineHermite())
+        order = basis.nodal_dofs.T.ravel()
+        kept = np.setdiff1d(np.arange(order.size), [0, 2 * n]) if hinged else np.arange(order.size)
+        names = [kind + str(i) for i in range(n + 1) for kind in "wr"]
+        positions = np.column_stack([np.repeat(x, 2), np.zeros((order.size, 2))])
+        points = NamedPoints(
+            tuple(names[i] for i in kept),
+            positions[kept],
+            tuple(("y", "rz")[i % 2] for i in kept),
+            tuple(str(i // 2) for i in kept),
+        )
+        matrices = (form.assemble(basis).tocsc()[order][:, order] for form in (inertia, bending))
+        mass, stiffness = (matrix[kept][:, kept] for matrix in matrices)
+        return FiniteElements(mass, stiffness, nodes=points, damping=damping)
+
+    return make
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,6 @@ import pytest
 from scipy.linalg import eigh
 from scipy.sparse import csc_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import eigsh
-from skfem import Basis, BilinearForm, ElementLineHermite, MeshLine
-from skfem.helpers import dd
 
 from workbench.design.laws.imsc import imsc
 from workbench.design.spillover.spillover import spillover
@@ -24,32 +22,6 @@ from workbench.structure.supports import PointDamper, PointMass, PointSpring
 LENGTH = 10.0
 
 
-def beam_elements(n=200, *, hinged=True, damping=None):
-    """A uniform beam of n Hermite elements, m = EI = 1: points w0, r0, w1, r1, ..."""
-
-    @BilinearForm
-    def bending(u, v, _):
-        return dd(u)[0, 0] * dd(v)[0, 0]
-
-    @BilinearForm
-    def inertia(u, v, _):
-        return u * v
-
-    basis = Basis(MeshLine(np.linspace(0.0, LENGTH, n + 1)), ElementLineHermite())
-    order = basis.nodal_dofs.T.ravel()
-    kept = np.setdiff1d(np.arange(order.size), [0, 2 * n]) if hinged else np.arange(order.size)
-    names = [kind + str(i) for i in range(n + 1) for kind in "wr"]
-    positions = np.repeat(np.linspace(0.0, LENGTH, n + 1), 2)
-    points = NamedPoints(
-        tuple(names[i] for i in kept),
-        np.column_stack([positions, 0 * positions, 0 * positions])[kept],
-        tuple(("y", "rz")[i % 2] for i in kept),
-        tuple(str(i // 2) for i in kept),
-    )
-    mass, stiffness = (form.assemble(basis).tocsc()[order][:, order][kept][:, kept] for form in (inertia, bending))
-    return FiniteElements(mass, stiffness, nodes=points, damping=damping)
-
-
 def beam(*attachments, ends="hinged", damping=None):
     return Beam(
         length=LENGTH, mass_per_length=1.0, bending_stiffness=1.0, left=ends, right=ends, attachments=attachments,
@@ -57,7 +29,7 @@ def beam(*attachments, ends="hinged", damping=None):
     )  # fmt: skip
 
 
-def test_elements_of_a_beam_have_the_modes_of_the_beam():
+def test_elements_of_a_beam_have_the_modes_of_the_beam(beam_elements):
     found, exact = beam_elements(damping=ModalDamping(0.01)).modes(6), beam().modes(6)
     np.testing.assert_allclose(found.omega, exact.omega, rtol=1e-6)
     np.testing.assert_allclose(found.zeta, 0.01, rtol=1e-12)
@@ -68,13 +40,13 @@ def test_elements_of_a_beam_have_the_modes_of_the_beam():
     )
 
 
-def test_a_free_structure_has_its_rigid_modes_at_zero():
+def test_a_free_structure_has_its_rigid_modes_at_zero(beam_elements):
     found = beam_elements(hinged=False).modes(5)
     assert (found.omega[:2] == 0).all()
     np.testing.assert_allclose(found.omega[2:], beam(ends="free").modes(5).omega[2:], rtol=1e-6)
 
 
-def test_what_is_attached_stands_in_the_matrices():
+def test_what_is_attached_stands_in_the_matrices(beam_elements):
     parts = [PointMass(3.0, 2.0, 0.4), PointSpring(7.0, 5.0), PointSpring(5.0, 1.0, 2.0)]
     named = [
         PointMass("w60", 2.0),
@@ -104,7 +76,7 @@ def test_springs_and_dampers_between_two_points_act_on_their_difference():
     np.testing.assert_allclose(np.abs(found.damping), np.abs(damping[:2, :2]), rtol=1e-9)
 
 
-def test_attaching_to_the_modes_says_what_it_costs():
+def test_attaching_to_the_modes_says_what_it_costs(beam_elements):
     parts = (PointMass("w60", 3.0), PointSpring("w150", 4.0))
     model = beam_elements()
     exact = model.attached(parts).modes(10).omega
@@ -115,7 +87,7 @@ def test_attaching_to_the_modes_says_what_it_costs():
     assert np.isinf(truncation_error(modes, parts)[10:]).all()
 
 
-def test_a_beam_is_the_same_along_an_interval_at_named_points_and_as_elements():
+def test_a_beam_is_the_same_along_an_interval_at_named_points_and_as_elements(beam_elements):
     """Gains exactly, W_R to the error of 200 elements, which is below 1e-6 of the residual frequencies."""
     n, places = 8, (2.0, 4.0, 6.0, 8.0)
     along = beam().modes(n)

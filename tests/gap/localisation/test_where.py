@@ -115,6 +115,14 @@ def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch
     assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std
 
 
+def test_a_force_far_above_the_noise_has_all_of_its_lines(rig, measured):
+    record = measured(replace(rig, elements=(CubicSpring(0.7, 1e5),)), "loud", 3.0, 0)
+    found = evidence(rig, (record,))
+    (lines,) = lines_of(rig, found.model, found.residuals, DT)
+    share = replace(lines, left=1e9 * lines.left).force_share(rig.modes.phi_at(0.7))
+    assert share.max() == pytest.approx(1.0) and (share >= 0).all()
+
+
 def test_no_gap_tells_no_place(rig, measured):
     place = placed_by(rig, [measured(rig, str(seed), 0.3, seed) for seed in (2, 3)])
     assert place.holds is None and place.share == 0.0

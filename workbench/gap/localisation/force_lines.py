@@ -83,7 +83,8 @@ class Lines:
             chance = CHANCE * np.sqrt(_smooth((sure / power) ** 2))
             spectrum = np.maximum(_smooth(sure * read) - chance, 0.0) / _smooth(sure)
             share = spectrum * power / (1.0 + spectrum * power)
-            sure = (power * (1.0 - share)) ** 2
+            # a force far above the noise has all of a line, but for rounding
+            sure = (power * np.maximum(1.0 - share, np.finfo(float).eps)) ** 2
         return share
 
     def _end(self, u: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
