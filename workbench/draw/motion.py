@@ -22,13 +22,18 @@ SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 
 def response_motion(
-    responses: Mapping[str, Response], *, actuators: Sequence[Actuator] = (), sensors: Sequence[Sensor] = ()
+    responses: Mapping[str, Response],
+    *,
+    actuators: Sequence[Actuator] = (),
+    sensors: Sequence[Sensor] = (),
+    colours: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
     """Responses of one structure, moving on one picture.
 
     Args:
         responses: by the name under which each is shown; all over the same times and of the same modes' number.
         actuators, sensors: marked at their places.
+        colours: of responses by name; None for the first of several in grey.
 
     Raises:
         ValueError: responses over different times.
@@ -43,6 +48,7 @@ def response_motion(
             "label": name,
             "shapes": _numbers(response.modes.phi(x)),
             "modal": _numbers(response.modal[: response.modes.n_modes, ::step]),
+            "colour": (colours or {}).get(name),
         }
         for name, response in responses.items()
     ]

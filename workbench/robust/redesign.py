@@ -125,10 +125,10 @@ class Redesign:
     def _promise(self) -> str:
         """What can be promised where the gap is not explained."""
         share, margin = self.possible.unexplained, self.proof.margin
-        error = f"the model's readings are off by {100 * share:.2g} % that nothing explains"
+        error = f"the model's readings are off by {_percent(share)} that nothing explains"
         if np.isnan(margin):
             return f"No promise: {error}, and on-off control has no linear bound."
-        bears = f"the loop bears {100 * min(margin, 9.99):.2g} % of any phase"
+        bears = f"the loop bears {_percent(min(margin, 9.99))} of any phase"
         return (
             f"No effect explains the gap: {error}; {bears}, so stability is {'sure' if margin > share else 'not sure'}."
         )
@@ -392,6 +392,10 @@ def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
 
 def _of(part: int, whole: int) -> str:
     return f"{part:,} of {whole:,}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
 def _ratios(values: np.ndarray, lead: str = "") -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.draw.motion import response_motion
-from workbench.draw.robust import plot_redesign, plot_steps
+from workbench.draw.robust import NEW, OLD, plot_redesign, plot_steps
 from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
@@ -129,7 +129,8 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
     limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -1e3 * scale, 1e3 * scale))
     actuators = [a for a in found.possible.rig.actuators if a.name in found.redesigned.actuators]
     sensors = [s for s in found.possible.rig.sensors if s.name in found.redesigned.sensors]
-    motion = response_motion({"present": limited, "redesigned": new}, actuators=actuators, sensors=sensors)
+    both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
+    motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours)
     return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.")
 
 

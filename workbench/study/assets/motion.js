@@ -7,7 +7,7 @@ workbench.move = function (root, spec) {
   var legend = html("div", { class: "legend" }, root);
   var tracks = spec.tracks.map(function (track, i) {
     var entry = html("button", { type: "button", title: "hide or show" }, legend), t = { spec: track, on: true };
-    t.colour = spec.tracks.length > 1 && i === 0 && !modes ? "var(--soft)" : workbench.COLOURS[(i + (modes || spec.tracks.length === 1 ? 0 : -1)) % 6];
+    t.colour = track.colour || (spec.tracks.length > 1 && i === 0 && !modes ? "var(--soft)" : workbench.COLOURS[(i + (modes || spec.tracks.length === 1 ? 0 : -1)) % 6]);
     html("i", {}, entry).style.background = t.colour;
     entry.appendChild(document.createTextNode(track.label));
     entry.addEventListener("click", function () { t.on = !t.on; entry.classList.toggle("off", !t.on); show(); });
