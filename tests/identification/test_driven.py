@@ -6,6 +6,7 @@ import pytest
 from scipy.optimize import approx_fprime
 
 from workbench.identification.driven import identify_driven
+from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -237,3 +238,71 @@ def test_what_cannot_be_identified_is_refused():
     other = replace(record, input_channels=(Channel("u0"), Channel("w")))
     with pytest.raises(ValueError, match="the same inputs"):
         identify_driven([record, other])
+
+
+def measured_late(plant, u, delays, *, straight=False, fraction=0.0, fine=40):
+    """Answer of python-control in forty steps a sample, to inputs late by whole parts of a sample."""
+    rng, n = np.random.default_rng(8), u.shape[1]
+    if straight:
+        inputs = np.array([np.interp(np.arange(n * fine) / fine, np.arange(n), row) for row in u])
+    else:
+        inputs = np.repeat(u, fine, axis=1)
+    late = np.array([np.r_[np.zeros(round(d * fine)), row][: n * fine] for d, row in zip(delays, inputs)])
+    time = DT / fine * np.arange(n * fine)
+    if straight:
+        y = control.forced_response(plant, time, late).outputs
+    else:
+        y = control.forced_response(control.c2d(plant, DT / fine, "zoh"), time, late).outputs
+    # inputs that change just then, as a converter's do, count from the sample on
+    y = y.reshape(plant.noutputs, -1)[:, ::fine]
+    y = y + fraction * y.std(axis=1, keepdims=True) * rng.standard_normal(y.shape)
+    outputs = tuple(Channel(f"y{j}", "displacement") for j in range(plant.noutputs))
+    inputs_named = tuple(Channel(f"u{i}", "force") for i in range(plant.ninputs))
+    return Record(DT, y, outputs, u, inputs_named, input_hold="first" if straight else "zero")
+
+
+def real_system(feedthrough):
+    """Four normal modes: real shapes, residues along the imaginary axis."""
+    rng = np.random.default_rng(4)
+    shapes, participation = rng.standard_normal((3, 4)), -1j * rng.standard_normal((4, 2))
+    a, b = np.zeros((8, 8)), np.stack([participation.real, participation.imag], axis=1).reshape(8, 2)
+    for r, p in enumerate(POLES):
+        a[2 * r : 2 * r + 2, 2 * r : 2 * r + 2] = [[p.real, -p.imag], [p.imag, p.real]]
+    c = np.stack([2 * shapes, 0 * shapes], axis=2).reshape(3, 8)
+    return control.ss(a, b, c, feedthrough * rng.standard_normal((3, 2)))
+
+
+@pytest.mark.parametrize(
+    ("delays", "straight", "feedthrough", "close"),
+    [
+        ((2.35, 0.0), False, 0.0, 0.02),
+        ((1.0, 3.6), False, 0.1, 0.02),
+        ((0.4, 0.4), False, 0.1, 0.02),
+        ((1.75, 0.25), True, 0.1, 0.02),
+    ],
+)
+@pytest.mark.parametrize("at_rest", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_inputs_that_act_late(delays, straight, feedthrough, close, at_rest):
+    plant, fraction = real_system(feedthrough), 0.001
+    u, fresh = excitation("noise"), excitation("noise", seed=7)
+    found = identify_driven(measured_late(plant, u, delays, straight=straight, fraction=fraction), at_rest=at_rest)
+    assert found.modes.n_modes == 4
+    assert np.abs(found.delays / DT - delays).max() < close
+    assert "inputs act late, by u0" in " ".join(found.remarks)
+    with pytest.warns(UserWarning, match="no output stands where an input acts"):
+        assert [actuator.delay for actuator in rig_from(found).actuators] == list(found.delays)
+    assert np.abs((found.modes.omega - OMEGA) / found.omega_std).max() < 4
+    further = measured_late(plant, fresh, delays, straight=straight)
+    error = (found.response(fresh) - further.outputs).std(axis=1) / further.outputs.std(axis=1)
+    assert error.max() < 0.5 * fraction
+
+
+def test_inputs_that_act_in_time_are_not_said_to_act_late():
+    record = measured(system(), excitation("noise"), fraction=0.01)
+    found = identify_driven(record)
+    assert not found.delays.any()
+    assert not found.remarks
+    known = identify_driven(record, delays=[0.0, 0.0])
+    assert np.array_equal(known.modes.omega, found.modes.omega)
+    with pytest.raises(ValueError, match=r"delays must lie between 0 and 2\.5 s"):
+        identify_driven(record, delays=[-0.01, 0.0])

@@ -11,8 +11,10 @@ from typing import Any
 
 import control
 import numpy as np
+from numpy.typing import ArrayLike
 
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
+from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.mode_clusters import overlap_remarks
@@ -31,11 +33,13 @@ from workbench.threads import one_blas_thread
 STRONGEST, LEARNT = 8, 4
 # Times the limit up to which a mode may be noise; nepers over a record above which a pole grows.
 DOUBTED, MOST_GROWTH = 4.0, 0.5
+# Steps of a fit that only decides whether inputs act late.
+STEPS = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Driven(ModalEstimates):
-    """Modes with their participation factors: H(s) = D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate].
+    """Modes with their participation factors: H(s) = {D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate]} diag(e^{-sτ_i}).
 
     Attributes:
         modes: shapes of displacement, largest entry 1.
@@ -46,6 +50,9 @@ class Driven(ModalEstimates):
             k = 0, 1, 2 for displacement, velocity, acceleration.
         feedthrough: (n_outputs, n_inputs) D: of accelerations, and of the modes above those identified.
         feedthrough_std: (n_outputs, n_inputs).
+        delays: (n_inputs,) s, τ by which each input acts late.
+        straight: whether inputs run straight from sample to sample.
+        sample_time: s, of the records.
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
         evidence: (n_modes,) χ² of each mode in the noise.
@@ -61,6 +68,9 @@ class Driven(ModalEstimates):
     participation: np.ndarray
     feedthrough: np.ndarray
     feedthrough_std: np.ndarray
+    delays: np.ndarray
+    straight: bool
+    sample_time: float
     initial: tuple[np.ndarray, ...]
     noise: np.ndarray
     evidence: np.ndarray
@@ -101,7 +111,7 @@ class Driven(ModalEstimates):
 
     @property
     def state_space(self) -> control.StateSpace:
-        """The model from inputs to outputs in real modal form, two states a mode, with the names of the record.
+        """The model from inputs late by `delays` to outputs in real modal form, two states a mode, named as the record.
 
         z = re + i im of each mode: A has blocks [[Re λ, -Im λ], [Im λ, Re λ]], and y = Re Σ 2 c z + D u.
         """
@@ -124,6 +134,30 @@ class Driven(ModalEstimates):
             name="identified",
         )
 
+    def response(self, inputs: ArrayLike, *, record: int | None = None) -> np.ndarray:
+        """Outputs (n_outputs, n_samples) to inputs sampled as the records were, delays included; no constants.
+
+        Args:
+            inputs: (n_inputs, n_samples), zero before the first.
+            record: that begins as this one did; from rest unless given.
+        """
+        u = np.atleast_2d(np.asarray(inputs, float))
+        if u.ndim != 2 or len(u) != len(self.input_channels):
+            raise ValueError(f"inputs must have shape ({len(self.input_channels)}, n_samples); got {np.shape(inputs)}")
+        silent = np.zeros((len(self.output_channels), u.shape[1]))
+        driven = Record(self.sample_time, silent, self.output_channels, u, self.input_channels)
+        delays = _checked_delays([driven], self.delays)
+        data = KnownInputs([driven], at_rest=True, straight=self.straight, feedthrough=True, delays=delays)
+        y = self.feedthrough @ data.direct(u)
+        time = self.sample_time * np.arange(u.shape[1])
+        for r, pole in enumerate(self.modes.poles):
+            real, imaginary = data.responses(pole)
+            z = (real + 1j * imaginary) @ self.participation[r]
+            if record is not None:
+                z += self.initial[record][r] * np.exp(pole * time)
+            y += 2.0 * np.real(np.outer(self._measured_shapes[:, r], z))
+        return np.asarray(y)
+
     def initial_state(self, record: int = 0) -> np.ndarray:
         """States of `state_space` at the first sample of a record, (2 n_modes,)."""
         z = self.initial[record]
@@ -137,6 +171,7 @@ def identify_driven(
     at_rest: bool = False,
     straight: bool | None = None,
     feedthrough: bool = True,
+    delays: ArrayLike | None = None,
     most_modes: int = 40,
     false_alarm: float = FALSE_ALARM,
     seconds: float | None = SECONDS,
@@ -154,6 +189,9 @@ def identify_driven(
             otherwise they are held over each sample interval, as a converter gives them. As the records say
             (`input_hold`) unless given.
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
+        delays: (n_inputs,) s, by which each input acts late; estimated unless given, up to 60 samples. Of inputs held
+            between samples, with a direct term, the fraction of a sample is the one that makes the modes most nearly
+            real, for their response is the same whatever it is.
         most_modes: where to stop at the latest.
         false_alarm: chance that noise alone is taken for a mode.
         seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
@@ -170,14 +208,17 @@ def identify_driven(
     check_same_sensors(records)
     _check_inputs(records)
     straight = records[0].input_hold == "first" if straight is None else straight
-    data = KnownInputs(records, at_rest=at_rest, straight=straight, feedthrough=feedthrough)
+    data = KnownInputs(
+        records, at_rest=at_rest, straight=straight, feedthrough=feedthrough, delays=_checked_delays(records, delays)
+    )
     rows, columns = data.fixed.shape
     if rows < columns + 4 * (data.n_excitations + 2):
         raise ValueError(
             f"record {records[0].name!r}: {rows} samples are too few for {records[0].n_inputs} inputs; measure longer"
         )
     most = min(most_modes, (rows - columns) // 6)
-    data, selected = _selected(data, budget, most_modes=most, false_alarm=false_alarm)
+    how = {"most_modes": most, "false_alarm": false_alarm}
+    data, selected = _selected(data, budget, **how) if delays is not None else _with_delays(data, budget, **how)
     if selected.fit.poles.size == 0:
         raise ValueError(
             f"record {records[0].name!r}: no mode between inputs {', '.join(records[0].input_names)} and outputs"
@@ -185,8 +226,66 @@ def identify_driven(
             " inputs and outputs belong together"
         )
     selected, remarks = _without_artefacts(data, selected, budget)
+    if delays is None:
+        remarks = (*_late_remarks(data), *remarks)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     return _report(records, data, selected, (*remarks, *overlap, *budget.remarks))
+
+
+def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
+    """The modes, and how late each input acts.
+
+    Lateness by a fraction of a sample is searched where the first response of an input is later than without delay, or
+    where the modes leave what the inputs a sample earlier explain.
+    """
+    first = first_lags(data.records)
+    whole = np.maximum(first - (0 if data.straight else 1), 0)
+    in_time: tuple[KnownInputs, Selected] | None = None
+    if not whole.any():
+        in_time = data, selected = _selected(data, budget, **how)
+        if selected.fit.poles.size == 0 or (not data.straight and not first.any()):
+            return in_time
+        other = data.delayed_by(whole, any_fraction=True)
+        trial = settled(other, projected(other, selected.fit.poles, selected.fit.participation), STEPS, budget)
+        if not act_later(other, trial).any():
+            return in_time
+    if budget.spent("search for delays of the inputs") and in_time is not None:
+        return in_time
+    data, selected = _selected(data.delayed_by(whole, any_fraction=True).weighted_by(None), budget, **how)
+    fit = selected.fit
+    if fit.poles.size == 0:
+        return in_time if in_time is not None else (data.delayed_by(0.0 * whole), selected)
+    derivative = time_derivatives(data.records[0].output_channels)[:, None]
+    fraction = np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
+    if in_time is not None and not fraction.any():
+        return in_time
+    turned = fit.participation.copy()
+    turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, fraction) * data.dt)
+    late = data.delayed_by(whole + fraction)
+    fit = projected(late, fit.poles, turned)
+    fit = settled(late, fit, budget=budget)
+    evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
+    return late, replace(selected, fit=fit, evidence=evidence)
+
+
+def _late_remarks(data: KnownInputs) -> tuple[str, ...]:
+    names = data.records[0].input_names
+    late = [f"{names[i]} {d:.2f} samples ({d * data.dt:.3g} s)" for i, d in enumerate(data.delays) if d > 0]
+    return (f"inputs act late, by {', '.join(late)}: the model holds for inputs so delayed",) if late else ()
+
+
+def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.ndarray | None:
+    """Samples by which each input acts late."""
+    if delays is None:
+        return None
+    dt, given = records[0].sample_time, np.broadcast_to(np.asarray(delays, float), (records[0].n_inputs,))
+    longest = 0.25 * min(record.n_samples for record in records) * dt
+    if not ((given >= 0) & (given <= longest)).all():
+        raise ValueError(
+            f"delays must lie between 0 and {longest:.3g} s, a quarter of the record, one an input; got {delays!s}"
+        )
+    near = np.round(given / dt)
+    return np.where(np.abs(given / dt - near) < 1e-6, near, given / dt)
 
 
 def _selected(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
@@ -311,6 +410,9 @@ def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, re
         participation=frozen(participation[:, :n_inputs], complex),
         feedthrough=frozen(direct),
         feedthrough_std=frozen(direct_std),
+        delays=frozen(data.delays * data.dt),
+        straight=data.straight,
+        sample_time=data.dt,
         initial=tuple(
             frozen(np.zeros(n) if data.at_rest else participation[:, n_inputs + k], complex)
             for k in range(len(records))

@@ -69,7 +69,11 @@ def rig_from(
     if isinstance(identified, Driven | TransferModes):
         into = _channels(identified, "input_channels", inputs, identified.participation.shape[1])
         shapes = _of_residues(identified, out, into, driving_point, modal_masses)
-        actuators = tuple(Actuator(c.name, c.name, kind="moment" if c.quantity == "moment" else "force") for c in into)
+        delays = identified.delays if isinstance(identified, Driven) else np.zeros(len(into))
+        actuators = tuple(
+            Actuator(c.name, c.name, kind="moment" if c.quantity == "moment" else "force", delay=float(delay))
+            for c, delay in zip(into, delays, strict=True)
+        )
     else:
         shapes = _of_shapes(identified, out, modal_masses)
         names = [channel if isinstance(channel, str) else channel.name for channel in inputs or ()]

@@ -141,6 +141,7 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     content = {
         **_content(records[0].output_channels, found),
         "inputs": found.state_space.input_labels,
+        "delays": found.delays,
         "state_space": {"A": a, "B": b, "C": c, "D": d},
         "noise_std": found.noise_std,
         "converged": found.converged,

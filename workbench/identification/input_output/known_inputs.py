@@ -7,7 +7,13 @@ to the next, so that z is exact at the samples:
     held: c_0 = Δt φ_1, c_1 = 0;    straight: c_0 = Δt (φ_1 - φ_2), c_1 = Δt φ_2
 
 with φ_1(x) = (e^x - 1)/x, φ_2(x) = (e^x - 1 - x)/x² at x = λΔt. The state at the first sample is one more excitation,
-an impulse before it. Noise that is not white is weighted line by line of the cosine transform of all columns.
+an impulse before it. An input that acts late by d whole samples is shifted by d; by the fraction f of a sample more,
+the response is that of the step before carried on by h = (1 - f)Δt,
+
+    z_k(f) = e^{λh} z_k-1 + c_0(h) u_k-1 + c_1(h) (f u_k-1 + (1 - f) u_k),
+
+which is e^{-λfΔt} z_k and a sum of u_k and u_k-1: whatever the fraction, modes with these two columns beside them are
+exact. Noise that is not white is weighted line by line of the cosine transform of all columns.
 """
 
 from collections.abc import Sequence
@@ -38,7 +44,10 @@ class KnownInputs:
     Args:
         records: with the same inputs and outputs at one rate.
         at_rest, straight, feedthrough: as in `identify_driven`.
-        line_std: relative noise of each line, one (n_samples, n_outputs) a record, of unit rms over all.
+        delays: (n_inputs,) samples by which each input acts late; none unless given.
+        any_fraction: whether each input acts later than that by any fraction of a sample, which stays unknown: then
+            each has two columns of its own, that of its delay and that a sample later.
+        line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
     """
 
     def __init__(
@@ -48,26 +57,35 @@ class KnownInputs:
         at_rest: bool,
         straight: bool,
         feedthrough: bool,
+        delays: np.ndarray | None = None,
+        any_fraction: bool = False,
         line_std: Sequence[np.ndarray] | None = None,
     ) -> None:
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
-        lengths = [record.n_samples for record in records]
+        self.delays = np.zeros(records[0].n_inputs) if delays is None else np.asarray(delays, float)
+        self.any_fraction = any_fraction
+        self.whole = np.floor(self.delays).astype(int)
+        self.fraction = self.delays - self.whole
+        # Inputs before the record are unknown but at rest: what they move at once is left out.
+        late = bool(any_fraction or self.fraction.any())
+        self.first = 0 if at_rest else int(self.whole.max()) + late
+        lengths = [record.n_samples - self.first for record in records]
         ends = np.cumsum([0, *lengths])
         self.rows = [slice(a, b) for a, b in zip(ends, ends[1:])]
         self.line_std = line_std
         self.by_line = line_std is not None and any(np.ptp(size, axis=0).any() for size in line_std)
         self.weights = None if line_std is None else 1.0 / np.vstack(line_std)
-        self.values = self._rows(np.vstack([record.outputs.T for record in records]))
+        self.values = self._rows(np.vstack(self._measured()))
         if self.weights is not None:
             self.values = self.values * self.weights
         constant = np.zeros((ends[-1], len(records)))
         for k, rows in enumerate(self.rows):
             constant[rows, k] = 1.0
-        direct = np.vstack([record.inputs.T for record in records])
-        self.n_inputs = direct.shape[1]
+        direct = np.vstack([self.direct(record.inputs).T[self.first :] for record in records])
+        self.n_inputs = records[0].n_inputs
         self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
-        self.feedthrough = feedthrough and not _flat(direct)
+        self.feedthrough = (feedthrough or any_fraction) and not _flat(direct)
         self.fixed = self._rows(np.hstack([direct, constant]) if self.feedthrough else constant)
         self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
         self.highest = np.pi / self.dt
@@ -79,8 +97,27 @@ class KnownInputs:
 
     def weighted_by(self, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
         """The same records with lines weighted by their noise; with None, samples of equal weight."""
-        how = {"at_rest": self.at_rest, "straight": self.straight, "feedthrough": self.may_feel}
-        return KnownInputs(self.records, **how, line_std=line_std)
+        return self._with(self.delays, self.any_fraction, line_std)
+
+    def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
+        """The same records with inputs that act late by these delays, samples; lines weighted as before."""
+        found = self._with(delays, any_fraction, None)
+        if self.line_std is None:
+            return found
+        # Fewer or more rows: each line has the noise of the one at its frequency.
+        lengths = [rows.stop - rows.start for rows in found.rows]
+        return found.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
+
+    def _with(self, delays: np.ndarray, any_fraction: bool, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
+        return KnownInputs(
+            self.records,
+            at_rest=self.at_rest,
+            straight=self.straight,
+            feedthrough=self.may_feel,
+            delays=delays,
+            any_fraction=any_fraction,
+            line_std=line_std,
+        )
 
     def noise(self, fit: Fit) -> np.ndarray:
         """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
@@ -95,9 +132,7 @@ class KnownInputs:
         left = [self._samples(raw[rows]) for rows in self.rows]
         taken = self._taken(fit)
         shares = [taken[rows] for rows in self.rows]
-        return noise_spectrum(
-            left, [record.outputs.T for record in self.records], shares, fit.poles.size, self._free(fit)
-        )
+        return noise_spectrum(left, self._measured(), shares, fit.poles.size, self._free(fit))
 
     def _taken(self, fit: Fit) -> np.ndarray:
         """Leverage of each line, the share of its noise that the fit took, (n_rows, n_outputs)."""
@@ -152,6 +187,26 @@ class KnownInputs:
         lost = fit.coefficients.shape[0] + free_parameters(fit).size / self.values.shape[1]
         return np.asarray(np.maximum(length * (1.0 - lost / length.sum()), 1.0))
 
+    def _measured(self) -> list[np.ndarray]:
+        return [record.outputs.T[self.first :] for record in self.records]
+
+    def direct(self, u: np.ndarray) -> np.ndarray:
+        """What outputs feel at once of the inputs, (n_columns, n_samples)."""
+        before = np.hstack([np.zeros((len(u), 1)), u[:, :-1]])
+        if self.any_fraction:
+            return np.vstack([self._shifted(u), self._shifted(before)])
+        f = self.fraction[:, None]
+        late = (1.0 - f) * u + f * before if self.straight else before
+        late[:, 0] = 0.0
+        return self._shifted(np.where(f > 0.0, late, u))
+
+    def _shifted(self, of_inputs: np.ndarray) -> np.ndarray:
+        """What belongs to each input, (n_inputs, n_samples), later by its whole samples, zero before."""
+        if not self.whole.any():
+            return of_inputs
+        n = of_inputs.shape[1]
+        return np.array([np.r_[np.zeros(d), row[: n - d]] for row, d in zip(of_inputs, self.whole, strict=True)])
+
     def _rows(self, samples: np.ndarray) -> np.ndarray:
         """Columns of samples as the fit sees them."""
         return np.vstack([lines_of(samples[rows]) for rows in self.rows]) if self.by_line else samples
@@ -163,32 +218,57 @@ class KnownInputs:
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         x = np.zeros((self.values.shape[0], self.n_excitations), complex)
         for k, (record, rows) in enumerate(zip(self.records, self.rows)):
-            x[rows, : self.n_inputs] = self._driven(record, pole)[0].T
+            u = record.inputs
+            z = self._late_driven(u, pole, self._driven(u, pole)[0])
+            x[rows, : self.n_inputs] = self._shifted(z).T[self.first :]
             if not self.at_rest:
-                x[rows, self.n_inputs + k] = np.exp(pole * self.dt * np.arange(record.n_samples))
+                x[rows, self.n_inputs + k] = np.exp(pole * self.dt * np.arange(self.first, u.shape[1]))
         return self._rows(x.real), self._rows(x.imag)
 
     def slopes(self, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         found = np.zeros(self.values.shape[0], complex)
-        mu = np.exp(pole * self.dt)
+        mu, l_r = np.exp(pole * self.dt), participation[: self.n_inputs]
         for k, (record, rows) in enumerate(zip(self.records, self.rows)):
-            x, by_coefficients = self._driven(record, pole)
-            l_r = participation[: self.n_inputs]
-            later = self.dt * mu * (l_r @ x)[:-1] + (l_r @ by_coefficients)[1:]
-            found[rows] = lfilter([1.0], [1.0, -mu], np.r_[0.0, later])
+            u = record.inputs
+            x, by_coefficients = self._driven(u, pole)
+            by_coefficients[:, 0] = 0.0  # nothing drives the first sample
+            if self.fraction.any():
+                driving = self.dt * mu * x[:, :-1] + by_coefficients[:, 1:]
+                slope = lfilter([1.0], [1.0, -mu], np.hstack([np.zeros((len(u), 1)), driving]), axis=1)
+                all_samples = l_r @ self._shifted(self._late_driven(u, pole, x, slope))
+            else:
+                later = self.dt * mu * (l_r @ self._shifted(x))[:-1] + (l_r @ self._shifted(by_coefficients))[1:]
+                all_samples = lfilter([1.0], [1.0, -mu], np.r_[0.0, later])
+            found[rows] = all_samples[self.first :]
             if not self.at_rest:
-                time = self.dt * np.arange(record.n_samples)
+                time = self.dt * np.arange(self.first, u.shape[1])
                 found[rows] += participation[self.n_inputs + k] * time * np.exp(pole * time)
         return self._rows(found.real[:, None])[:, 0], self._rows(found.imag[:, None])[:, 0]
 
-    def _driven(self, record: Record, pole: complex) -> tuple[np.ndarray, np.ndarray]:
+    def _driven(self, inputs: np.ndarray, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         """z of each input from rest, and the derivative of its sources by λ, (n_inputs, n_samples) each."""
-        (now, after), (now_slope, after_slope) = _sources(pole, self.dt, self.straight)
-        u = record.inputs.astype(complex)
+        (now, after), (now_slope, after_slope) = sources(pole, self.dt, self.straight)
+        u = inputs.astype(complex)
         rest = -after * u[:, :1]
         x = lfilter([after, now], [1.0, -np.exp(pole * self.dt)], u, axis=1, zi=rest)[0]
         before = np.hstack([np.zeros((u.shape[0], 1)), u[:, :-1]])
         return x, now_slope * before + after_slope * u
+
+    def _late_driven(
+        self, inputs: np.ndarray, pole: complex, z: np.ndarray, slope: np.ndarray | None = None
+    ) -> np.ndarray:
+        """z of each input, or with its slope by λ that of the result, at inputs late by the fraction of a sample."""
+        found = (z if slope is None else slope).copy()
+        for i in np.flatnonzero(self.fraction):
+            f = self.fraction[i]
+            h = (1.0 - f) * self.dt
+            of_values, of_slopes = sources(pole, h, self.straight)
+            c_0, c_1 = of_values if slope is None else of_slopes
+            u, carried = inputs[i], np.exp(pole * h)
+            on = carried * (z[i] if slope is None else h * z[i] + slope[i])
+            found[i, 0] = 0.0
+            found[i, 1:] = on[:-1] + c_0 * u[:-1] + c_1 * (f * u[:-1] + (1.0 - f) * u[1:])
+        return found
 
     def candidates(self, residual: np.ndarray) -> np.ndarray:
         """Poles whose response to the inputs agrees best with the residual.
@@ -204,7 +284,8 @@ class KnownInputs:
             y = np.fft.rfft(self._samples(weights * residual[rows]).T, size)
             lines = np.pi / self.dt * np.arange(len(weights)) / len(weights)
             counted = np.array([np.interp(omega, lines, weight**2) for weight in weights.T])
-            excitations = [*record.inputs] if self.at_rest else [*record.inputs, np.eye(1, record.n_samples)[0]]
+            seen = self._shifted(record.inputs)[:, self.first :]
+            excitations = [*seen] if self.at_rest else [*seen, np.eye(1, seen.shape[1])[0]]
             for u in filter(np.any, excitations):
                 spectrum = np.fft.rfft(u, size)
                 crossed.append(np.fft.irfft(y * spectrum.conj(), size)[:, : size // 2])
@@ -236,12 +317,20 @@ class KnownInputs:
         return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0
 
 
+def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:
+    """Noise of the lines of a record of another length, (n_rows, n_outputs)."""
+    if len(line_std) == n_rows:
+        return line_std
+    at, lines = np.linspace(0.0, 1.0, n_rows), np.linspace(0.0, 1.0, len(line_std))
+    return np.column_stack([np.interp(at, lines, column) for column in line_std.T])
+
+
 def _flat(inputs: np.ndarray) -> bool:
     """Whether an input is a constant, which the offset of each output holds already."""
     return bool((np.ptp(inputs, axis=0) == 0).any())
 
 
-def _sources(pole: complex, dt: float, straight: bool) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
+def sources(pole: complex, dt: float, straight: bool) -> tuple[tuple[complex, complex], tuple[complex, complex]]:
     """c_0, c_1 and their derivatives by λ."""
     x = pole * dt
     powers = x ** np.arange(TERMS)

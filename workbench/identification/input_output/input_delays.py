@@ -1,0 +1,133 @@
+"""How late each input acts: whole samples from an ARX model, the fraction of a sample from the modes.
+
+In the one-step prediction of y from its own past and from inputs, y_k = Σ_m A_m y_k-m + Σ_m B_m u_k-m, the
+coefficients B_m of an input are zero up to its delay, whatever the modes (Ljung, System Identification, 2nd ed.,
+section 10.3). The fraction f of a sample more turns each participation factor by e^{-λfΔt} and leaves two columns, u_k
+and u_k-1, beside the modes (`known_inputs`): the columns fitted say what f was. Inputs held between samples, with a
+direct term, leave nothing to tell the fraction by; it is then the one that makes the modes most nearly real.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.stats import chi2
+
+from workbench.identification.input_output.fit_errors import fixed_std
+from workbench.identification.input_output.known_inputs import KnownInputs, sources
+from workbench.identification.input_output.modal_fit import Fit
+from workbench.identification.input_output.model_order import evidence_of
+from workbench.identification.signal.order_selection import FALSE_ALARM
+from workbench.records.record import Record
+
+# Lags of the ARX model at most, and rows for each of its coefficients at least; rows of one part of its sums.
+MOST_LAGS, ROWS_EACH, PART = 60, 8, 4096
+# Of each output, taken for noise in any case: -100 dB; of its ratio to an input, taken for round-off.
+FLOOR, ROUND_OFF = 1e-5, 1e-8
+# Share of its peak from which on an input moves.
+MOVES = 0.01
+# Fractions of a sample tried; weight of real modes beside what the columns say, χ² of a mode from which it has half.
+TRIED, REAL_MODES, KNOWN = np.linspace(0.0, 1.0, 401), 1.0, 100.0
+
+
+def first_lags(records: Sequence[Record]) -> np.ndarray:
+    """Lag in samples from which on the outputs respond to each input, (n_inputs,); 0 where too few samples tell it.
+
+    Args:
+        records: of the same inputs and outputs at one rate.
+    """
+    m, q = records[0].n_outputs, records[0].n_inputs
+    rows = sum(record.n_samples for record in records)
+    sizes = np.abs(np.hstack([record.inputs for record in records]))
+    moved = int(
+        (sizes > MOVES * sizes.max(axis=1, keepdims=True)).sum(axis=1).min()
+    )  # blows are too short to tell lags by
+    shortest = min(record.n_samples for record in records)
+    lags = min(MOST_LAGS, rows // (ROWS_EACH * (m + q)), moved // ROWS_EACH, shortest // 4)
+    if lags < 3:
+        return np.zeros(q, int)
+    gram, moment, squares = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2))
+    for record in records:
+        y = record.outputs - record.outputs.mean(axis=1, keepdims=True)
+        for first in range(lags, record.n_samples, PART):
+            at = np.arange(first, min(first + PART, record.n_samples))
+            past = [y[:, at - k] for k in range(1, lags + 1)] + [record.inputs[:, at - k] for k in range(lags + 1)]
+            x, now = np.vstack(past), y[:, at]
+            if gram.shape == (2, 2):
+                gram, moment, squares = np.zeros((len(x), len(x))), np.zeros((len(x), m)), np.zeros((m, m))
+            gram += x @ x.T
+            moment += x @ now.T
+            squares += now @ now.T
+    gram[np.diag_indices_from(gram)] += FLOOR**2 * np.diag(gram) + 1e-300
+    scale = 1.0 / np.sqrt(np.diag(gram))
+    factor = cho_factor(gram * np.outer(scale, scale))
+    found = scale[:, None] * cho_solve(factor, scale[:, None] * moment)
+    left = squares - found.T @ moment + FLOOR**2 * np.diag(np.diag(squares))
+    spread = np.diag(cho_solve(factor, np.eye(len(gram)))) * scale**2
+    b, free = found[lags * m :], max(rows - lags * len(records) - len(gram), 1)
+    evidence = np.einsum("kj,kj->k", b, np.linalg.solve(left / free, b.T).T) / spread[lags * m :]
+    acts = evidence.reshape(lags + 1, q) > chi2.isf(FALSE_ALARM / (lags * q), m)
+    return np.where(acts.any(axis=0), np.argmax(acts, axis=0), 0)
+
+
+def act_later(data: KnownInputs, fit: Fit) -> np.ndarray:
+    """Whether each input acts later than `data` says, (n_inputs,): its column a sample later is not noise.
+
+    Args:
+        data: with `any_fraction`.
+        fit: to it.
+    """
+    columns, noise = _columns(data, fit)
+    limit = chi2.isf(FALSE_ALARM / data.n_inputs, columns.shape[2])
+    return np.asarray(((columns[1] / noise[1]) ** 2).sum(axis=1) > limit)
+
+
+def _columns(data: KnownInputs, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients of u_k and u_k-1, and their standard errors, (2, n_inputs, n_outputs)."""
+    n, shape = 2 * fit.poles.size, (2, data.n_inputs, -1)
+    noise = fixed_std(fit, *data.noise_ratios(fit))[: 2 * data.n_inputs]
+    outputs, inputs = np.sqrt((data.values**2).mean(axis=0)), np.sqrt((data.fixed**2).mean(axis=0))
+    least = ROUND_OFF * outputs / np.maximum(inputs[: 2 * data.n_inputs, None], 1e-300)
+    return fit.coefficients[n : n + 2 * data.n_inputs].reshape(shape), np.maximum(noise, least).reshape(shape)
+
+
+def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray:
+    """Fraction of a sample by which each input acts later than `data` says, (n_inputs,), in [0, 1].
+
+    Args:
+        data: with `any_fraction`.
+        fit: to it.
+        derivative: (n_outputs, 1) of displacement, that each output measures.
+    """
+    n, q = fit.poles.size, data.n_inputs
+    columns, noise = _columns(data, fit)
+    seen = fit.amplitudes / fit.poles**derivative
+    turn = np.exp(-0.5j * np.angle((seen**2).sum(axis=0)))
+    phase = np.angle(1j * fit.participation[:, :q] / turn[:, None])
+    evidence = np.array([evidence_of(fit, r) for r in range(n)])
+    size = np.abs(fit.participation[:, :q]) ** 2
+    known = (evidence / (evidence + KNOWN))[:, None] * size / size.sum(axis=1, keepdims=True)
+    cost = np.zeros((TRIED.size, q))
+    for k, f in enumerate(TRIED):
+        now, before = np.array([_columns_left(pole, data.dt, f, data.straight) for pole in fit.poles]).T
+        l_r = fit.participation[:, :q] * np.exp(fit.poles * f * data.dt)[:, None]
+        wanted = [np.real((l_r * of[:, None]).T @ fit.amplitudes.T) for of in (now, before)]
+        weight = (1.0 - f, f) if data.straight else (0.0, 1.0)
+        left = columns - wanted
+        if data.may_feel:  # the direct term takes what goes along its own columns
+            across = weight[1] * left[0] - weight[0] * left[1]
+            cost[k] = (across**2 / ((weight[1] * noise[0]) ** 2 + (weight[0] * noise[1]) ** 2)).sum(axis=1)
+        else:
+            cost[k] = ((left / noise) ** 2).sum(axis=(0, 1))
+        turned = 2.0 * (phase + fit.poles.imag[:, None] * f * data.dt)
+        cost[k] -= REAL_MODES * (known * np.cos(turned)).sum(axis=0)
+    return np.asarray(TRIED[np.argmin(cost, axis=0)])
+
+
+def _columns_left(pole: complex, dt: float, fraction: float, straight: bool) -> tuple[complex, complex]:
+    """Of u_k and of u_k-1, what the response late by a fraction has beside e^{-λfΔt} times the one in time."""
+    h, f = (1.0 - fraction) * dt, fraction
+    (c_0, c_1), _ = sources(pole, dt, straight)
+    (of_0, of_1), _ = sources(pole, h, straight)
+    turned = np.exp(-pole * f * dt)
+    return of_1 * (1.0 - f) - turned * c_1, of_0 + of_1 * f - turned * c_0
