@@ -254,12 +254,12 @@ def study(outcome, data: Path | None = None) -> None:
             outcome.check(f"{what} modes, less those of SSI-cov", ours - peers, -1)
         for level, table in tables.items():
             ratio, of_found = (table[OURS][what] / table[SSI][what] for what in ("median", "median_of_found"))
-            outcome.say(f"{level} dB: median worst mode over SSI-cov's {ratio:.2f}; {of_found:.2f} of those found alone")
+            outcome.say(f"{level} dB: median worst mode over SSI-cov's {ratio:.2f}; {of_found:.2f} of those found")
             outcome.check(f"{level} dB: median worst mode over SSI-cov's", ratio, 0.8)
             outcome.check(f"{level} dB: time over SSI-cov's", 1.0 / table[SSI]["time_over_ours"], 1.0)
     outcome.figure(
         "errors",
         peers_errors(every, efficient),
-        f"Worst mode of each of {STRUCTURES} structures under unknown forces, in standard errors of a mode alone without"
-        " noise; hollow where modes are missed.",
+        f"Worst mode of each of {STRUCTURES} structures under unknown forces, in standard errors of a mode alone"
+        " without noise; hollow where modes are missed.",
     )
