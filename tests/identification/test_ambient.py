@@ -42,6 +42,11 @@ def test_modes_and_shapes_within_their_errors():
     assert np.diag(mac(found.modes.shapes, SHAPES)).min() > 0.995
 
 
+def test_an_order_without_poles_in_a_part_of_the_record_is_no_error():
+    """Without one of its blocks, this record has no pole that oscillates at a low order."""
+    assert identify_ambient(driven(111)).modes.n_modes == N
+
+
 def test_correlations_are_those_of_the_closed_form():
     """R(τ) = C e^{A^T τ} with A C + C A^T + B B^T = 0; white noise of the sensors is in lag 0 alone."""
     covariance = solve_continuous_lyapunov(A, -np.diag(np.r_[np.zeros(N), np.ones(N)]))

@@ -135,7 +135,7 @@ class Subspace:
             every = {n: model.poles(n)[0] / dt for n in {n for r in here for n in modes[r].orders}}
             for r in here:
                 near = zip(modes[r].orders, modes[r].poles, strict=True)
-                found[r] = np.array([every[n][np.argmin(np.abs(every[n] - pole))] for n, pole in near])
+                found[r] = np.array([_nearest(every[n], pole) for n, pole in near])
         return found
 
     def _at_one_rate(self, slower: int) -> list[StablePole]:
@@ -160,6 +160,11 @@ class Subspace:
                 else:
                     groups.append([mode])
         return [_median(group, orders) for group in groups if _stays(group, orders)]
+
+
+def _nearest(poles: np.ndarray, pole: complex) -> complex:
+    """The one of `poles` nearest to a pole; 0, a large error, where a low order has none that oscillates."""
+    return complex(poles[np.argmin(np.abs(poles - pole))]) if poles.size else 0j
 
 
 def _stays(group: Sequence[StablePole], orders: range) -> bool:
