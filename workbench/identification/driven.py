@@ -242,23 +242,24 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
     whole = np.maximum(first - (0 if data.straight else 1), 0)
     in_time: tuple[KnownInputs, Selected] | None = None
     if not whole.any():
-        in_time = data, selected = _selected(data, budget, **how)
-        if selected.fit.poles.size == 0 or (not data.straight and not first.any()):
-            return in_time
-        other = data.delayed_by(whole, any_fraction=True)
-        trial = settled(other, projected(other, selected.fit.poles, selected.fit.participation), STEPS, budget)
-        if not act_later(other, trial).any():
-            return in_time
+        punctual = data
+        strongest = select_modes(data, budget=budget, **_few(how))
+        if strongest.fit.poles.size == 0 or (not data.straight and not first.any()):
+            return _selected(data, budget, strongest, **how)
+        if not _late(data, strongest, budget):
+            in_time = data, selected = _selected(data, budget, strongest, **how)
+            if not _late(data, selected, budget):
+                return in_time
     if budget.spent("search for delays of the inputs") and in_time is not None:
         return in_time
     data, selected = _selected(data.delayed_by(whole, any_fraction=True).weighted_by(None), budget, **how)
     fit = selected.fit
     if fit.poles.size == 0:
-        return in_time if in_time is not None else (data.delayed_by(0.0 * whole), selected)
+        return in_time if in_time is not None else (data.delayed_by(whole), selected)
     derivative = time_derivatives(data.records[0].output_channels)[:, None]
     fraction = np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
-    if in_time is not None and not fraction.any():
-        return in_time
+    if not whole.any() and not fraction.any() and not budget.spent("search for delays of the inputs"):
+        return in_time if in_time is not None else _selected(punctual, budget, strongest, **how)
     turned = fit.participation.copy()
     turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, fraction) * data.dt)
     late = data.delayed_by(whole + fraction)
@@ -266,6 +267,17 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
     fit = settled(late, fit, budget=budget)
     evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
     return late, replace(selected, fit=fit, evidence=evidence)
+
+
+def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
+    """Whether these modes leave what the inputs a sample earlier explain."""
+    other = data.delayed_by(data.delays, any_fraction=True)
+    trial = settled(other, projected(other, selected.fit.poles, selected.fit.participation), STEPS, budget)
+    return bool(act_later(other, trial).any())
+
+
+def _few(how: dict[str, Any]) -> dict[str, Any]:
+    return {**how, "most_modes": min(STRONGEST, how["most_modes"])}
 
 
 def _late_remarks(data: KnownInputs) -> tuple[str, ...]:
@@ -288,15 +300,18 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.n
     return np.where(np.abs(given / dt - near) < 1e-6, near, given / dt)
 
 
-def _selected(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:
+def _selected(
+    data: KnownInputs, budget: Budget, strongest: Selected | None = None, **how: Any
+) -> tuple[KnownInputs, Selected]:
     """The modes, in noise of their residual's spectrum; the strongest first, for coloured noise passes for modes.
 
     A false mode explains its lines, so that their noise is underestimated and the mode seems true. The noise is thus
     estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
     """
     how["budget"] = budget
-    few = {**how, "most_modes": min(STRONGEST, how["most_modes"])}
-    data, selected = _with_noise(data, select_modes(data, **few), few, how, budget)
+    few = _few(how)
+    strongest = select_modes(data, **few) if strongest is None else strongest
+    data, selected = _with_noise(data, strongest, few, how, budget)
     doubtful = (selected.evidence < DOUBTED * selected.limit) | ~_oscillate(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
         return data, selected
