@@ -56,24 +56,13 @@ def inverse_of(matrix: Floats, inverse: Floats, least: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _taken(spread: Floats, transforms: Floats) -> Floats:
-    """Y (n_residual, n_columns) of Σ_j φ_r f_j (n_residual, n)."""
-    y = np.zeros((transforms.shape[0], transforms.shape[2]))
-    for r in range(transforms.shape[0]):
-        for k in range(transforms.shape[1]):
-            for q in range(transforms.shape[2]):
-                y[r, q] += spread[r, k] * transforms[r, k, q]
-    return y
-
-
-@njit(cache=True, nogil=True)
-def _weights(v: Floats, transforms: Floats) -> Floats:
-    """Of each residual mode in g, (n_residual, n)."""
-    found = np.zeros((transforms.shape[0], transforms.shape[1]))
-    for r in range(transforms.shape[0]):
-        for k in range(transforms.shape[1]):
-            for q in range(transforms.shape[2]):
-                found[r, k] += v[r, q] * transforms[r, k, q]
+def _of_each(matrices: Floats, vectors: Floats) -> Floats:
+    """Each matrix (n_residual, n, m) by its vector (n_residual, m), (n_residual, n)."""
+    found = np.zeros(matrices.shape[:2])
+    for r in range(matrices.shape[0]):
+        for i in range(matrices.shape[1]):
+            for j in range(matrices.shape[2]):
+                found[r, i] += matrices[r, i, j] * vectors[r, j]
     return found
 
 
@@ -151,14 +140,15 @@ def dual_bound(
             return np.inf
     left = np.sqrt(max(limit**2 - t, BARELY * limit**2))
     forces, other = c @ d, root.T @ root
-    y = _taken(residual.T @ forces, transforms)
+    of_forces = transforms.transpose(0, 2, 1)
+    y = _of_each(of_forces, residual.T @ forces)
     size, outside = 0.0, 0.0
     multiplier, weights = np.zeros((n, n)), np.zeros((n_modes - n, n))
     for step in range(STEPS + 1):
         size = np.sqrt((y**2).sum())
         if size == 0.0:
             return -np.inf
-        weights = _weights(y / size, transforms)
+        weights = _of_each(transforms, y / size)
         g = residual @ weights
         multiplier = d @ (c.T @ g)
         rest = g - c @ multiplier
@@ -166,7 +156,7 @@ def dual_bound(
         outside = np.sqrt((rest * weighted).sum())
         if step == STEPS or outside <= ROUND_OFF * np.sqrt(((g @ other) * g).sum()):
             break
-        change = _taken(residual.T @ (forces - left / outside * weighted), transforms) - y
+        change = _of_each(of_forces, residual.T @ (forces - left / outside * weighted)) - y
         a = (change**2).sum()
         if a == 0.0:
             break
