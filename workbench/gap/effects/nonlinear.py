@@ -229,7 +229,7 @@ def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
 
 def _is_sudden(friction: Effect) -> bool:
     """Whether its smoothing speed is too small for the records to tell it from none."""
-    return friction.deviations.get("smoothing_speed", 0.0) > friction.values["smoothing_speed"]
+    return bool(friction.deviations.get("smoothing_speed", 0.0) > friction.values["smoothing_speed"])
 
 
 def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
