@@ -170,3 +170,10 @@ def test_a_header_of_the_wrong_type_is_refused(tmp_path, header):
     np.savez(path, t=np.arange(7.0), record_channel_0=np.ones(7), record_header=np.array(header))
     with pytest.raises(RecordFileError):
         read_measured(path)
+
+
+def test_places_of_transfer_functions_that_are_no_numbers_are_refused(tmp_path):
+    path = tmp_path / "x.npz"
+    np.savez(path, f=np.arange(7.0), h=1j * np.ones((1, 7)), at=np.array(["at the tip"]))
+    with pytest.raises(RecordFileError, match="no numbers, 'at the tip'"):
+        read_measured(path)
