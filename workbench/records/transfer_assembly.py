@@ -136,7 +136,8 @@ def _points(
     if at and at[0].shape != (len(names),):
         raise RecordFileError(f"{path} gives {at[0].size} places of {len(names)} points; give each its own")
     if at and at[0].dtype.kind not in "fiu":
-        raise RecordFileError(f"{path} gives places that are no numbers, {str(at[0][0])[:40]!r} among them; give metres")
+        text = str(at[0][0])[:40]
+        raise RecordFileError(f"{path} gives places that are no numbers, {text!r} among them; give metres")
     places = [float(x) for x in at[0]] if at else [None] * len(names)
     channels = tuple(Channel(legible(path, name), at=x) for name, x in zip(names, places, strict=True))
     return channels, tuple(f"input {i + 1}" for i in range(n_references))
