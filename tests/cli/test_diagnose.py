@@ -27,6 +27,7 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_pa
     assert stopped.exit_code == 2 and "The inputs F1 and F2 are exchanged: swap them in case.toml." in stopped.output
     assert "--mend" in stopped.output and not (tmp_path / "p.html").exists()
     seen = []
+    real, _ = make_trial(2)
 
     def search(rig, records, *, validation, **options):
         seen.extend([*records, *validation])
@@ -36,7 +37,6 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_pa
     for option, order in (("--mend", [0, 1]), ("--as-wired", [1, 0])):
         seen.clear()
         assert "the search has begun" in run("diagnose", tmp_path / "crossed", option).output
-        real, _ = make_trial(2)
         for record, exact in zip(seen, (*real.fit[:2], *real.validation[:1]), strict=True):
             np.testing.assert_array_equal(record.inputs[:2], exact.inputs[order])
 

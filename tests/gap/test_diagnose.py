@@ -147,22 +147,22 @@ def test_standard_deviations_are_true():
     assert (spread > 0.6).all() and (spread < 1.5).all()
 
 
-def test_validation_records_never_reach_the_search():
+def test_validation_records_never_reach_the_search(hinged_rig, record_of):
     """Spoilt validation records change the shrinkage and nothing else."""
-    from dataclasses import replace
-
-    case, _ = make_trial(11, kinds=("actuator_gain",))
-    spoilt = tuple(replace(r, outputs=r.outputs * 3.0) for r in case.validation)
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    real = kind_named("actuator_gain").apply(rig, rig.actuators[0].name, {"gain": 1.2})
+    commands = [level * np.repeat(rng.normal(size=40), 10)[None] for level in (0.3, 1.0)]
+    fitted, kept = (record_of(real, command, rng, name=f"r{i}") for i, command in enumerate(commands))
     catalogue = tuple(kind_named(n) for n in ("actuator_gain", "modal_damping"))
-    honest = diagnose(case.rig, case.fit, validation=case.validation, catalogue=catalogue)
-    other = diagnose(case.rig, case.fit, validation=spoilt, catalogue=catalogue)
+    honest, other = (
+        diagnose(rig, (fitted,), validation=(record,), catalogue=catalogue)
+        for record in (kept, replace(kept, outputs=3.0 * kept.outputs))
+    )
     assert honest.effects[0].values == other.effects[0].values
     assert honest.shrinkage.overall > other.shrinkage.overall
 
 
 def test_records_that_cannot_be_of_the_rig_are_refused():
-    from dataclasses import replace
-
     case, _ = make_trial(12)
     turned = [replace(r, outputs=r.outputs * np.r_[-1.0, np.ones(r.n_outputs - 1)][:, None]) for r in case.fit]
     with pytest.raises(RecordsError, match="wrong sign"):

@@ -188,6 +188,7 @@ def test_what_is_no_transfer_function_is_refused():
         identify_transfer(h, F, channels=channels, noise_std=np.zeros(h.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not RULER.is_file(), reason=f"the measured ruler is not at {RULER}")
 def test_the_measured_ruler():
     """Frequencies seen by eye; points measured one after another disagree, and no mode more is told for it."""

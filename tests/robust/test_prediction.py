@@ -69,6 +69,7 @@ def test_bands_hold_what_they_say_on_plants_drawn_from_what_is_possible(plain, s
     assert 0.90 < np.mean(shares) < 0.99
 
 
+@pytest.mark.slow  # `closing_the_loop` holds a hundred such plants
 def test_bands_of_a_controlled_test_hold_plants_of_another_numerical_route(plain):
     """The gain of the actuator is in the loop: the feedback itself is uncertain."""
     rng = np.random.default_rng(7)

@@ -227,6 +227,7 @@ def test_reliability_of_claims_that_are_right_as_often_as_they_say():
     assert not reliability([{"claims": []}])
 
 
+@pytest.mark.slow
 def test_a_strong_effect_alters_the_readings_by_more_than_a_diagnosis_leaves_alone():
     """The first draw of this seed hides a lag as large as what the dirt does, and below a hundredth of the signal."""
     case, label = make_trial(620445, kinds=["actuator_lag"], dirt="shape", size=0.5)

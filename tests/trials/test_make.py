@@ -24,8 +24,6 @@ from workbench.trials.scoring import score, tally
 
 QUICK = (
     ("clearance",),
-    ("coulomb_friction",),
-    ("truncated_modes",),
     ("stiffness_drift", "sensor_gain"),
     (),
 )
@@ -77,6 +75,7 @@ def test_two_numerical_routes_agree_of_every_kind(kind, seed):
     _check_against_predictor((kind,), seed)
 
 
+@pytest.mark.slow
 def test_a_random_disturbance_is_another_one_in_every_record():
     case, label = make_trial(5, kinds=("random_disturbance",))
     for figures in label["records"].values():

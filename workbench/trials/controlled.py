@@ -86,6 +86,7 @@ def control_plant(
     sums = (np.zeros(m), np.zeros(m), np.zeros(n), np.zeros(m))
     z, followed = np.zeros(controller.a.shape[0]), np.zeros(len(commanded))
     energy, outputs = np.zeros(n_samples), np.zeros((len(controller.sensors), n_samples))
+    most = np.ascontiguousarray(drive[1][:, 3])
     for k in range(n_samples):
         energy[k] = 0.5 * float(y[n : 2 * n] @ y[n : 2 * n] + omega2 @ y[:n] ** 2)
         if not energy[k] < RUN_AWAY * given:
@@ -97,9 +98,7 @@ def control_plant(
         commands[commanded] = command
         motion.aim(commands, drive, earlier, hysteresis, now)
         aims[:, k] = now
-        motion.interval(
-            k, y, system, drive[1][:, 3], aims, headed_for, held[k], dt, edges, steps, work, pieces[k], sums
-        )
+        motion.interval(k, y, system, most, aims, headed_for, held[k], dt, edges, steps, work, pieces[k], sums)
     return Controlled(energy, sums[2], float(sums[1].sum()), float(sums[3].max()), True, dt, outputs)
 
 

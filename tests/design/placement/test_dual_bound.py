@@ -26,7 +26,7 @@ def bound_of(task, table, cell, half, effort):
     )
     root = np.ascontiguousarray((vectors / np.sqrt(values)).T)
     transforms = np.ascontiguousarray(task.roots)
-    square = np.ascontiguousarray(task.force_gramian)
+    square = np.array(task.force_gramian)  # of the type that a search hands on, so nothing is compiled twice
     return dual_bound(half, shapes, transforms, square, root, np.sqrt(effort), SINGULAR, np.empty(cell.size))
 
 

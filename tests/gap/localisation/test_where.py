@@ -83,12 +83,11 @@ def test_a_force_is_placed_without_the_sensor_that_is_at_fault(rig, measured):
 @pytest.mark.parametrize(
     "law",
     [
-        CoulombFriction(1.37, 0.02, 0.005),
-        CubicSpring(1.37, 300.0),
-        Clearance(1.37, 1.0, 0.01),
-        LinearDamper(1.37, 0.02),
+        pytest.param(CoulombFriction(1.37, 0.02, 0.005), id="friction", marks=pytest.mark.slow),
+        pytest.param(CubicSpring(1.37, 300.0), id="cubic spring"),
+        pytest.param(Clearance(1.37, 1.0, 0.01), id="clearance", marks=pytest.mark.slow),
+        pytest.param(LinearDamper(1.37, 0.02), id="damper", marks=pytest.mark.slow),
     ],
-    ids=lambda law: type(law).__name__,
 )
 def test_the_deviation_of_a_place_is_true(rig, measured, law):
     real = replace(rig, elements=(law,))

@@ -35,6 +35,7 @@ def test_without_noise_the_parameters_are_found():
     assert found.converged and list(found.paired) == [0, 1, 2, 3] and found.mac.min() > 0.999999
 
 
+@pytest.mark.slow
 def test_standard_errors_are_those_of_repeated_measurements():
     runs = [update_model(row_of_masses, [80.0, 30.0], **measured(seed, 2e-3)) for seed in range(30)]
     spread = np.std([run.parameters for run in runs], axis=0)
