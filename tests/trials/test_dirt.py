@@ -172,22 +172,22 @@ TOLD = {
 
 def test_an_effect_is_named_where_its_place_is_within_three_percent():
     verdict = {"effects": [TOLD], "budget": {"unexplained": 0.03}}
-    found = score_dirty(verdict, LABEL, length=10.0)
+    found = score_dirty(verdict, LABEL, domain=10.0)
     assert found["named"] and not found["wrong"] and not found["false_alarm"]
     assert found["covered"] == (2, 3), "the place is four deviations off"
     assert found["budget_error"] == pytest.approx(0.02)
-    assert not score_dirty(verdict, LABEL, length=5.0)["named"]
-    both = score_dirty({"effects": [TOLD, {"kind": "sensor_bias", "output": "d1"}]}, LABEL, length=10.0)
+    assert not score_dirty(verdict, LABEL, domain=5.0)["named"]
+    both = score_dirty({"effects": [TOLD, {"kind": "sensor_bias", "output": "d1"}]}, LABEL, domain=10.0)
     assert both["wrong"] and not both["named"] and both["budget_error"] is None
-    unknown = score_dirty({"effects": [{"kind": "unknown"}]}, LABEL, length=10.0)
+    unknown = score_dirty({"effects": [{"kind": "unknown"}]}, LABEL, domain=10.0)
     assert not unknown["wrong"] and not unknown["named"]
 
 
 def test_whatever_is_named_where_nothing_hides_is_a_false_alarm():
     none = {**LABEL, "effects": [{"kind": "none"}]}
-    assert score_dirty({"effects": [TOLD]}, none, length=10.0)["false_alarm"]
-    assert not score_dirty({"effects": []}, none, length=10.0)["false_alarm"]
-    assert not score_dirty({"effects": [{"kind": "unknown"}]}, none, length=10.0)["false_alarm"]
+    assert score_dirty({"effects": [TOLD]}, none, domain=10.0)["false_alarm"]
+    assert not score_dirty({"effects": []}, none, domain=10.0)["false_alarm"]
+    assert not score_dirty({"effects": [{"kind": "unknown"}]}, none, domain=10.0)["false_alarm"]
 
 
 def test_two_of_three_count_where_the_budget_says_that_something_is_left():
@@ -195,12 +195,12 @@ def test_two_of_three_count_where_the_budget_says_that_something_is_left():
     two = [TOLD, {"kind": "sensor_gain", "output": "d2", "parameters": {}}]
     for left, named in ((0.2, True), (0.01, False)):
         verdict = {"effects": two, "budget": {"unexplained": left}}
-        assert score_dirty(verdict, three, length=10.0, outputs=("d1", "d2"))["named"] is named
+        assert score_dirty(verdict, three, domain=10.0, outputs=("d1", "d2"))["named"] is named
 
 
 def test_shares_are_of_what_there_is_to_count():
-    right = score_dirty({"effects": [TOLD], "budget": {"unexplained": 0.2}}, LABEL, length=10.0)
-    silent = score_dirty({"effects": []}, LABEL, length=10.0)
+    right = score_dirty({"effects": [TOLD], "budget": {"unexplained": 0.2}}, LABEL, domain=10.0)
+    silent = score_dirty({"effects": []}, LABEL, domain=10.0)
     counted = tally_dirty([right, silent])
     assert counted["named"] == 0.5 and counted["wrong"] == 0.0 and counted["false_alarms"] == 0
     assert counted["covered"] == pytest.approx(2 / 3) and counted["honest"] == 0.0 and counted["placed"] == 1.0
@@ -212,12 +212,12 @@ def test_claims_are_those_of_the_verdict_and_its_alternatives():
         "effects": [TOLD],
         "alternatives": [{"kind": "one_sided_stop", "probability": 0.2}, {"kind": "clearance", "probability": 0.1}],
     }
-    right = score_dirty(verdict, LABEL, length=10.0)["claims"]
+    right = score_dirty(verdict, LABEL, domain=10.0)["claims"]
     np.testing.assert_allclose(right, [(0.7, 1), (0.2, 0), (0.1, 1)])
     pair = {**LABEL, "effects": [*LABEL["effects"], {"kind": "sensor_gain", "output": "d1", "gain": 1.1}]}
     verdict["alternatives"] = [{"kind": "sensor_gain[d1] + clearance", "probability": 0.4}]
-    np.testing.assert_allclose(score_dirty(verdict, pair, length=10.0)["claims"], [(0.6, 0), (0.4, 1)])
-    assert not score_dirty({**verdict, "outcome": "part"}, pair, length=10.0)["claims"]
+    np.testing.assert_allclose(score_dirty(verdict, pair, domain=10.0)["claims"], [(0.6, 0), (0.4, 1)])
+    assert not score_dirty({**verdict, "outcome": "part"}, pair, domain=10.0)["claims"]
 
 
 def test_reliability_of_claims_that_are_right_as_often_as_they_say():

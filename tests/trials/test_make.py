@@ -186,19 +186,19 @@ def test_scores_count_kinds_channels_and_places():
         "effects": [{"kind": "sensor_gain", "output": "d2", "parameters": {}}, {"kind": "point_mass", "at": 3.15}],
         "shrinkage": {"validate": 0.99, "ci95": [0.9, 1.0]},
     }
-    found = score(verdict, label, length=10.0, outputs=("d1", "d2"))
+    found = score(verdict, label, domain=10.0, outputs=("d1", "d2"))
     assert found["family"] == "pair" and found["kinds"] and found["channels"] and found["positions"]
     assert found["position_errors"] == [pytest.approx(0.015)] and found["shrinkage"] == {"validate": 0.99}
-    assert not score(verdict, label, length=10.0, outputs=("d2", "d1"))["channels"]
-    assert not score(verdict, label, length=5.0, outputs=("d1", "d2"))["positions"]
-    wrong = score({"effects": verdict["effects"][:1]}, label, length=10.0)
+    assert not score(verdict, label, domain=10.0, outputs=("d2", "d1"))["channels"]
+    assert not score(verdict, label, domain=5.0, outputs=("d1", "d2"))["positions"]
+    wrong = score({"effects": verdict["effects"][:1]}, label, domain=10.0)
     assert not wrong["kinds"] and wrong["channels"] is None and wrong["positions"] is None
 
 
 def test_two_of_a_kind_are_matched_by_their_places():
     label = {"effects": [{"kind": "point_mass", "at": 2.0}, {"kind": "point_mass", "at": 8.0}]}
     verdict = {"effects": [{"kind": "point_mass", "at": 8.1}, {"kind": "point_mass", "at": 2.0}]}
-    assert sorted(score(verdict, label, length=10.0)["position_errors"]) == [0.0, pytest.approx(0.01)]
+    assert sorted(score(verdict, label, domain=10.0)["position_errors"]) == [0.0, pytest.approx(0.01)]
 
 
 def test_silence_is_right_only_where_nothing_hides():
@@ -206,7 +206,7 @@ def test_silence_is_right_only_where_nothing_hides():
     unknown = {"effects": [{"kind": "unknown", "outside": "magnet"}]}
     silent, baffled = {"effects": []}, {"effects": [{"kind": "unknown"}]}
     cases = [(silent, none), (silent, bias), (baffled, unknown), (baffled, bias), (silent, unknown)]
-    scores = [score(verdict, label, length=1.0) for verdict, label in cases]
+    scores = [score(verdict, label, domain=1.0) for verdict, label in cases]
     assert [s["kinds"] for s in scores] == [True, False, True, False, False]
     counted = tally(scores)
     assert counted.shares == {"single": (0, 2), "none": (1, 1), "unknown": (1, 2)}

@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.cases.case import Case
-from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
-from workbench.structure.damping import ModalDamping
-from workbench.structure.member import Bar, Beam, Structure
+from workbench.structure.finite_elements import FiniteElements
+from workbench.structure.member import Structure
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant, coloured_noise
+from workbench.trials.rigs import MEMBERS, draw_rig
 
 SAMPLES = 2000
 LEVELS = {"low": 0.25, "high": 1.0, "mid": 0.625}
@@ -28,6 +27,7 @@ class Bench:
         level: rms of the high level, N.
         snr_db: of each sensor in the low record of the nominal structure; None where the noise was given.
         feedback: of the closed loop, N s/m; None for no such record.
+        frame: the matrices behind modes at named points; None where there are none.
     """
 
     rig: Rig
@@ -36,24 +36,23 @@ class Bench:
     level: float
     snr_db: float | None
     feedback: float | None
+    frame: FiniteElements | None = None
+
+    def plant(self) -> Plant:
+        """The real structure that is just what the rig takes it for."""
+        return Plant.of(self.rig, self.frame)
 
 
-def draw_bench(rng: np.random.Generator) -> Bench:
-    """A beam or a rod at random, with its actuators, a hammer, sensors, levels and noise."""
-    draw = (_long_beam, _tapered_beam, _ruler, _tapered_rod)[rng.integers(4)]
-    structure, sensors = draw(rng)
-    length = structure.length
-    n_actuators = int(rng.integers(2, 5))
-    places = (np.arange(1, n_actuators + 1) + rng.uniform(-0.3, 0.3, n_actuators)) * length / (n_actuators + 1)
-    places = np.round(places, 3)
-    strike = round(float(rng.uniform(0.35, 0.9)) * length, 3)
-    while np.abs(places - strike).min() < 0.03 * length:
-        strike = round(float(rng.uniform(0.35, 0.9)) * length, 3)
-    actuators = [Actuator(f"F{i + 1}", float(x)) for i, x in enumerate(places)]
-    actuators.append(Actuator("hammer", strike, direct=True))
-    modes = structure.modes(int(rng.integers(12, 17)), tolerance=1e-9)
-    rig = Rig(modes, tuple(actuators), sensors, structure=structure)
-    return _suited(rig, rng)
+def draw_bench(rng: np.random.Generator, structure: str = MEMBERS) -> Bench:
+    """A structure at random, with its actuators, a hammer, sensors, levels and noise.
+
+    Args:
+        structure: "members" for a beam or a rod, "plates", or "frames", whose rig knows modes at named points alone.
+
+    Raises:
+        ValueError: another word.
+    """
+    return _suited(*draw_rig(rng, structure), rng)
 
 
 def bench_of(case: Case) -> Bench:
@@ -77,22 +76,23 @@ def bench_of(case: Case) -> Bench:
     return Bench(case.rig, loudest.sample_time, band, float(level[loudest]), None, None)
 
 
-def _suited(rig: Rig, rng: np.random.Generator) -> Bench:
-    """A bench with sample time, band, level and noise that suit a rig."""
+def _suited(rig: Rig, frame: FiniteElements | None, rng: np.random.Generator) -> Bench:
+    """A bench with sample time, band, level and noise that suit a rig; a member may be tested in closed loop too."""
     top = min(int(rng.integers(3, 6)), rig.modes.n_modes) - 1
     band = 1.1 * float(rig.modes.omega[top]) / (2.0 * np.pi)
     snr_db = float(rng.choice([30.0, 40.0, 50.0]))
-    bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, snr_db, None)
-    plant = Plant.of(rig).solved()
+    bench = Bench(rig, float(f"{0.095 / band:.2g}"), band, 1.0, snr_db, None, frame)
+    plant = bench.plant().solved()
     commands = multisine(bench, rng)
     moved, _ = plant.move(commands, bench.sample_time)
     widest = np.sqrt(np.mean((plant.at_actuators @ moved[0].T) ** 2, axis=1)).max()
-    level = float(f"{rig.modes.length * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
+    level = float(f"{rig.modes.domain.size * np.exp(rng.uniform(np.log(0.001), np.log(0.02))) / widest:.2g}")
     fastest = np.sqrt(np.mean((plant.at_actuators @ moved[1].T) ** 2, axis=1)).max()
     low = plant.readings(moved, bench.sample_time).std(axis=1) * level * LEVELS["low"]
     noise = [float(f"{10 ** (-snr_db / 20) * value:.6g}") for value in low]
     sensors = tuple(replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True))
-    feedback = float(rng.uniform(0.2, 0.6)) / fastest if rng.random() < 0.6 else None
+    closed = isinstance(rig.structure, Structure) and rng.random() < 0.6
+    feedback = float(rng.uniform(0.2, 0.6)) / fastest if closed else None
     return replace(bench, rig=replace(rig, sensors=sensors), level=level, feedback=feedback)
 
 
@@ -144,74 +144,3 @@ def tested(
     """The motion of a plant in one of the experiments, and the commands that were sent."""
     feedback = (bench.feedback or 0.0) if name == "closed_loop" else 0.0
     return plant.move(commands, bench.sample_time, feedback=feedback, rng=rng)
-
-
-# --- families of rigs
-
-
-def _sensors(rng: np.random.Generator, places: np.ndarray, quantities: str) -> tuple[Sensor, ...]:
-    """d1, d2, ..., v1, ...: a letter of `quantities` a place."""
-    words = {"d": "displacement", "v": "velocity", "a": "acceleration"}
-    return tuple(
-        Sensor(f"{q}{quantities[: i + 1].count(q)}", round(float(x), 4), words[q])
-        for i, (x, q) in enumerate(zip(places, quantities, strict=True))
-    )
-
-
-def _around(value: float, rng: np.random.Generator) -> float:
-    return round(value * float(rng.uniform(0.7, 1.3)), 2)
-
-
-def _damping(rng: np.random.Generator) -> ModalDamping:
-    return ModalDamping(round(float(rng.uniform(0.003, 0.01)), 4))
-
-
-def _long_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
-    n = int(rng.integers(4, 7))
-    places = np.tile(np.arange(1, n + 1) * 10.0 / (n + 1), 2)
-    beam = Beam(
-        length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged", damping=_damping(rng)
-    )
-    return beam, _sensors(rng, places, "d" * n + "v" * n)
-
-
-def _tapered_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
-    n = int(rng.integers(5, 9))
-    ends = (["clamped", "hinged"], ["clamped", "clamped"], ["hinged", "clamped"])[rng.integers(3)]
-    beam = Beam(
-        length=10.0,
-        mass_per_length=([0.0, 10.0], [_around(1.5, rng), _around(0.75, rng)]),
-        bending_stiffness=([0.0, 10.0], [_around(2.0, rng), _around(0.75, rng)]),
-        left=ends[0],
-        right=ends[1],
-        damping=_damping(rng),
-    )
-    return beam, _sensors(rng, np.arange(1, n + 1) * 10.0 / (n + 1), "d" * (n // 2) + "v" * (n - n // 2))
-
-
-def _ruler(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
-    n = int(rng.integers(4, 7))
-    beam = Beam(
-        length=0.8,
-        mass_per_length=round(float(rng.uniform(0.2, 0.6)), 3),
-        bending_stiffness=round(float(rng.uniform(5.0, 20.0)), 2),
-        left="clamped",
-        right="free",
-        damping=_damping(rng),
-    )
-    places = np.r_[np.arange(1, n + 1) * 0.8 / n, 0.8]
-    return beam, _sensors(rng, places, "a" * n + "v")
-
-
-def _tapered_rod(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
-    n = int(rng.integers(5, 8))
-    end = round(float(rng.choice([0.0, 0.5, 1.0])), 1)
-    rod = Bar(
-        length=1.0,
-        mass_per_length=([0.0, 1.0], [2.0, end]),
-        axial_stiffness=([0.0, 1.0], [2.0, end]),
-        left="fixed",
-        right="free",
-        damping=_damping(rng),
-    )
-    return rod, _sensors(rng, np.arange(1, n + 1) / n, "d" * n)

@@ -6,7 +6,6 @@ import numpy as np
 
 from workbench.trials.draws import DRAWS
 from workbench.trials.hidden import hide
-from workbench.trials.plant import Plant
 from workbench.trials.scene import Scene, Unsuitable
 
 SMALLEST, LARGEST = 0.02, 1.5
@@ -44,7 +43,7 @@ def draw_effect(kind: str, scene: Scene, rng: np.random.Generator) -> dict[str, 
 
 def _gap(effect: dict[str, Any], scene: Scene, rng: np.random.Generator) -> float:
     try:
-        return scene.gap(hide(Plant.of(scene.bench.rig), [effect]), rng)
+        return scene.gap(hide(scene.bench.plant(), [effect]), rng)
     except Unsuitable:
         return 1e3
     except ValueError as error:

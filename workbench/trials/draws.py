@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.structure.domain import NamedPoints, position
+from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle, Where, middle
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.supports import HELD
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
@@ -37,19 +37,26 @@ def _stiff(scene: Scene) -> float:
     modes = scene.bench.rig.modes
     first = int(np.argmax(modes.omega > 0))
     domain = modes.domain
-    places = domain.grid() if isinstance(domain, NamedPoints) else np.linspace(0.0, 1.0, 41) * domain.size
+    places = np.linspace(0.0, 1.0, 41) * domain.size if isinstance(domain, Interval) else domain.grid(24)
     shape = modes.phi(places)[:, first]
     return float(modes.omega[first] ** 2 / np.max(shape**2))
 
 
+def _told(where: Where) -> Numbers:
+    """A place in the words of the case format."""
+    if isinstance(where, Between):
+        return {"between": list(where)}
+    return {"at": list(where) if isinstance(where, tuple) else where}
+
+
 def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> Draw:
-    """Draws of an effect at a point, from what is typical there."""
+    """Draws of an effect at a point, or between two, from what is typical there."""
 
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
-        at = scene.place(rng)
-        w, v = (float(np.sqrt(np.mean(motion**2))) for motion in scene.motion_at(at))
+        where = scene.place(rng, between=True)
+        w, v = (float(np.sqrt(np.mean(motion**2))) for motion in scene.motion_at(where))
         law = make(PointSizes(_stiff(scene), w, v, scene.bench.level), rng)
-        return lambda s: {"at": at, **law(s)}
+        return lambda s: {**_told(where), **law(s)}
 
     return draw
 
@@ -114,17 +121,17 @@ def _drag(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _damper(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    at = scene.place(rng)
+    where = scene.place(rng, between=True)
     modes = scene.bench.rig.modes
-    shape = float(np.abs(modes.phi(at)[0]).max())
+    shape = float(np.abs(modes.phi_at(where)).max())
     damping = float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
-    return lambda s: {"at": at, "coefficient": s * damping / shape**2}
+    return lambda s: {**_told(where), "coefficient": s * damping / shape**2}
 
 
 def _mass(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     shape = float(np.abs(scene.bench.rig.modes.phi(at)[0]).max())
-    return lambda s: {"at": at, "mass": 0.01 * s / shape**2}
+    return lambda s: {**_told(at), "mass": 0.01 * s / shape**2}
 
 
 def _drive(name: str, make: Callable[[Scene, np.random.Generator], Number], every: float = 0.6) -> Draw:
@@ -210,14 +217,28 @@ def _moved_sensor(scene: Scene, rng: np.random.Generator) -> Numbers:
 def _moved_port(scene: Scene, rng: np.random.Generator, side: str, ports: Sequence[Actuator | Sensor]) -> Numbers:
     port, domain = ports[int(rng.integers(len(ports)))], scene.bench.rig.modes.domain
     if isinstance(domain, NamedPoints):
-        return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
-    length = domain.size
-    step = _sign(rng) * float(rng.uniform(0.03, 0.25)) * length
-    stands = position(port.at)
-    at = stands + step if 0.02 * length < stands + step < length else stands - step
-    if not 0.02 * length < at < length:
+        if domain.positions is None:
+            return {side: port.name, "at": str(rng.choice([name for name in domain.names if name != port.at]))}
+        at = scene.place(rng)
+        if at == port.at:
+            raise Unsuitable("the port would stay where it is")
+        return {side: port.name, "at": at}
+    lengths, stands = np.atleast_1d(domain.length), np.atleast_1d(np.asarray(middle(port.at), float))
+    if isinstance(domain, Rectangle):
+        angle = float(rng.uniform(0.0, 2.0 * np.pi))
+        step = np.array([np.cos(angle), np.sin(angle)])
+    else:
+        step = np.array([_sign(rng)])
+    step = step * float(rng.uniform(0.03, 0.25)) * domain.size
+
+    def inside(place: np.ndarray) -> bool:
+        return bool(((0.02 * lengths < place) & (place < lengths)).all())
+
+    moved = stands + step if inside(stands + step) else stands - step
+    if not inside(moved):
         raise Unsuitable("the port would leave the structure")
-    return {side: port.name, "at": round(at, 4)}
+    told = np.round(moved, 4).tolist()
+    return {side: port.name, "at": told if isinstance(domain, Rectangle) else told[0]}
 
 
 def _reading(name: str, make: Callable[[Scene, int, np.random.Generator], Number]) -> Draw:
@@ -258,12 +279,12 @@ def _sensor_lag(scene: Scene, rng: np.random.Generator) -> OfStrength:
 def _tone(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     frequency, phase = float(rng.uniform(0.1, 1.0)) * scene.bench.band_hz, float(rng.uniform(-np.pi, np.pi))
-    return lambda s: {"at": at, "frequency": frequency, "amplitude": 0.05 * s * scene.bench.level, "phase": phase}
+    return lambda s: {**_told(at), "frequency": frequency, "amplitude": 0.05 * s * scene.bench.level, "phase": phase}
 
 
 def _noise(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at, corner = scene.place(rng), float(rng.uniform(0.6, 2.0)) * scene.bench.band_hz
-    return lambda s: {"at": at, "rms": 0.1 * s * scene.bench.level, "corner": corner}
+    return lambda s: {**_told(at), "rms": 0.1 * s * scene.bench.level, "corner": corner}
 
 
 def _drift(scene: Scene, rng: np.random.Generator) -> OfStrength:

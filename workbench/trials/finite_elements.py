@@ -1,4 +1,6 @@
-"""Modes of a member by Hermite and quadratic finite elements of scikit-fem, sharing nothing with `Structure.modes`."""
+"""Modes of an altered member by Hermite and quadratic finite elements of scikit-fem, sharing nothing with
+`Structure.modes`; of altered matrices; of altered modal data.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +14,8 @@ from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functi
 from skfem.helpers import d, dd
 
 from workbench.arrays import Floats
-from workbench.structure.domain import position
+from workbench.structure.domain import Between, Domain, NamedPoints, Where, position
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.supports import HELD
@@ -22,13 +25,13 @@ ELEMENTS = 240
 
 @dataclass(frozen=True)
 class Alterations:
-    """What a real member has that the nominal one has not.
+    """What a real structure has that the nominal one has not.
 
     Attributes:
-        stiffness_factor: of EI or EA, everywhere.
+        stiffness_factor: of EI, EA, D or the whole stiffness matrix, everywhere.
         losses: (at, width, loss) of the stiffness, several allowed.
-        masses: (at, mass) in m, kg.
-        springs: (at, stiffness) to ground, in m, N/m.
+        masses: (at, mass), kg.
+        springs: (at, stiffness) to ground, or between two named points, N/m.
         rotational_stiffness: (left, right) in N m/rad, in place of the nominal one; None leaves it.
         tension: N, added to the nominal one.
         stiffness_waves, mass_waves: (c_1, c_2, ...) of a smooth variation, 1 + Σ c_k cos(k π x / L) times nominal.
@@ -36,8 +39,8 @@ class Alterations:
 
     stiffness_factor: float = 1.0
     losses: tuple[tuple[float, float, float], ...] = ()
-    masses: tuple[tuple[float, float], ...] = ()
-    springs: tuple[tuple[float, float], ...] = ()
+    masses: tuple[tuple[Any, float], ...] = ()
+    springs: tuple[tuple[Any, float], ...] = ()
     rotational_stiffness: tuple[float | None, float | None] = (None, None)
     tension: float = 0.0
     stiffness_waves: tuple[float, ...] = ()
@@ -114,24 +117,68 @@ def element_modes(
     return ElementModes(np.sqrt(omega2), at_places, full.T @ (slopes @ full))
 
 
-def modal_modes(nominal: Modes, places: Sequence[Any], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
-    """The modes of plain modal data once altered: the nominal ones as a basis, without a member behind them.
+def matrix_modes(
+    frame: FiniteElements, places: Sequence[Where], n_modes: int, *, altered: Alterations = AS_NOMINAL
+) -> ElementModes:
+    """The lowest modes of altered matrices, K v = ω² M v, all degrees of freedom at once.
 
-    (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v.
+    Args:
+        places: names of points, or two that something is between.
 
     Raises:
         ValueError: alterations that only a member can have.
     """
+    _check_no_member(altered)
+    points = frame.nodes
+    mass, stiffness = frame.mass.toarray(), altered.stiffness_factor * frame.stiffness.toarray()
+    rows = np.eye(len(points.names))
+
+    def row(where: Where) -> Floats:
+        first, *second = points.locate(list(where) if isinstance(where, Between) else where)
+        shape: Floats = rows[first] - rows[second].sum(axis=0)
+        return shape
+
+    _add(stiffness, [(row(at), value) for at, value in altered.springs])
+    _add(mass, [(row(name), value) for at, value in altered.masses for name in points.translations(at)])
+    values, vectors = eigh(stiffness, mass, subset_by_index=(0, n_modes - 1))
+    shapes = np.array([row(at) for at in places]).reshape(-1, len(rows)) @ vectors
+    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros((n_modes, n_modes)))
+
+
+def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations = AS_NOMINAL) -> ElementModes:
+    """The modes of plain modal data once altered: the nominal ones as a basis, without a member behind them.
+
+    (Ω² f + Σ k φ φᵀ) v = ω² (I + Σ m φ φᵀ) v; a mass moves in every direction of its node.
+
+    Raises:
+        ValueError: alterations that only a member can have.
+    """
+    _check_no_member(altered)
+    points = nominal.domain
+    moving = [(name, value) for at, value in altered.masses for name in _moving(points, at)]
+    stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
+    _add(stiffness, [(nominal.phi_at(at), value) for at, value in altered.springs])
+    _add(mass, [(nominal.phi_at(at), value) for at, value in moving])
+    values, vectors = eigh(stiffness, mass)
+    shapes = np.array([nominal.phi_at(at) for at in places]).reshape(-1, nominal.n_modes) @ vectors
+    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros_like(mass))
+
+
+def _moving(domain: Domain, at: Any) -> tuple[Any, ...]:
+    """Where a mass at a place moves: at a named point in every direction of its node."""
+    return domain.translations(at) if isinstance(domain, NamedPoints) else (at,)
+
+
+def _check_no_member(altered: Alterations) -> None:
     of_a_member = (altered.losses, altered.tension, altered.stiffness_waves, altered.mass_waves)
     if any(of_a_member) or altered.rotational_stiffness != (None, None):
-        raise ValueError("plain modal data know no local stiffness, tension or rotation; describe a beam or a rod")
-    stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
-    for matrix, parts in ((stiffness, altered.springs), (mass, altered.masses)):
-        for at, value in parts:
-            matrix += value * np.outer(nominal.phi(at)[0], nominal.phi(at)[0])
-    values, vectors = eigh(stiffness, mass)
-    shapes = nominal.phi(places) @ vectors if len(places) else np.zeros((0, nominal.n_modes))
-    return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros_like(mass))
+        raise ValueError("named points know no local stiffness, tension or rotation; describe a beam or a rod")
+
+
+def _add(matrix: Floats, parts: list[tuple[Floats, float]]) -> None:
+    """Add Σ value r rᵀ to a matrix, in place."""
+    for row, value in parts:
+        matrix += value * np.outer(row, row)
 
 
 def _nodes(special: np.ndarray, length: float, elements: int) -> np.ndarray:

@@ -6,10 +6,19 @@ from typing import Any
 
 import numpy as np
 
+from workbench.structure.domain import Between, centred_at
 from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant, with_ports
 
 Hide = Callable[[Plant, dict[str, Any]], Plant]
+
+
+def stands(effect: dict[str, Any]) -> Any:
+    """Where an effect stands, of a label: `Between` two points, a place, or None."""
+    if "between" in effect:
+        return Between(*effect["between"])
+    at = effect.get("at")
+    return tuple(at) if isinstance(at, list) else at
 
 
 def _altered(plant: Plant, **changes: Any) -> Plant:
@@ -18,7 +27,7 @@ def _altered(plant: Plant, **changes: Any) -> Plant:
 
 def _law(law: PointLaw) -> Hide:
     def hide(plant: Plant, e: dict[str, Any]) -> Plant:
-        return replace(plant, laws=(*plant.laws, (law.code, e["at"], tuple(e[name] for name in law.parameters))))
+        return replace(plant, laws=(*plant.laws, (law.code, stands(e), tuple(e[name] for name in law.parameters))))
 
     return hide
 
@@ -35,6 +44,16 @@ def _support(plant: Plant, e: dict[str, Any]) -> Plant:
     left, right = plant.altered.rotational_stiffness
     ends = (e["rotational_stiffness"], right) if e["at"] == 0 else (left, e["rotational_stiffness"])
     return _altered(plant, rotational_stiffness=ends)
+
+
+def _moved(side: str, key: str) -> Hide:
+    """One actuator or sensor elsewhere; a patch keeps its size."""
+
+    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
+        (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
+        return with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
+
+    return hide
 
 
 def _swapped(side: str, key: str) -> Hide:
@@ -105,11 +124,11 @@ def _spikes(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> N
 
 HIDE: dict[str, Hide] = {
     "modulus_error": lambda p, e: _altered(p, stiffness_factor=p.altered.stiffness_factor * e["factor"]),
-    "point_mass": lambda p, e: _altered(p, masses=(*p.altered.masses, (e["at"], e["mass"]))),
+    "point_mass": lambda p, e: _altered(p, masses=(*p.altered.masses, (stands(e), e["mass"]))),
     "local_stiffness_loss": lambda p, e: _altered(p, losses=(*p.altered.losses, (e["at"], e["width"], e["loss"]))),
     "support_rotation": _support,
     "axial_load": lambda p, e: _altered(p, tension=e["tension"]),
-    "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (e["at"], e["stiffness"]))),
+    "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (stands(e), e["stiffness"]))),
     "truncated_modes": lambda p, e: replace(p, n_modes=e["needed"]),
     "modal_damping": lambda p, e: replace(p, damping_factor=p.damping_factor * e["factor"]),
     **{name: _law(law) for name, law in POINT_LAWS.items() if not law.outside},
@@ -120,7 +139,7 @@ HIDE: dict[str, Hide] = {
     "actuator_delay": _actuator(delay="delay"),
     "actuator_saturation": _actuator(limit="limit"),
     "actuator_dead_zone": _actuator(dead_zone="width"),
-    "actuator_misplacement": _actuator(at="at"),
+    "actuator_misplacement": _moved("actuators", "input"),
     "actuator_hysteresis": _actuator(hysteresis_share="share", hysteresis_width="width"),
     "actuator_bias": _actuator(bias="force"),
     "actuator_rate_limit": _actuator(rate_limit="rate"),
@@ -129,16 +148,16 @@ HIDE: dict[str, Hide] = {
     "sensor_bias": _sensor(bias="bias"),
     "sensor_drift": _sensor(drift="drift_over_record"),
     "sensor_lag": _sensor(time_constant="time_constant"),
-    "sensor_misplacement": _sensor(at="at"),
+    "sensor_misplacement": _moved("sensors", "output"),
     "sensor_delay": _sensor(delay="delay"),
     "sensor_crosstalk": _crosstalk,
     "swapped_outputs": _swapped("sensors", "output"),
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),
     "periodic_disturbance": lambda p, e: replace(
-        p, tones=(*p.tones, (e["at"], e["amplitude"], e["frequency"], e["phase"]))
+        p, tones=(*p.tones, (stands(e), e["amplitude"], e["frequency"], e["phase"]))
     ),
-    "random_disturbance": lambda p, e: replace(p, noises=(*p.noises, (e["at"], e["rms"], e["corner"]))),
+    "random_disturbance": lambda p, e: replace(p, noises=(*p.noises, (stands(e), e["rms"], e["corner"]))),
     "stiffness_drift": lambda p, e: replace(p, stiffness_rate=e["rate"]),
 }
 

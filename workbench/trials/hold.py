@@ -12,7 +12,7 @@ from joblib import Parallel, delayed
 from workbench.cases.case import Case, read_case
 from workbench.gap.diagnose import diagnose
 from workbench.trials.make import write_trials
-from workbench.trials.scene import extent
+from workbench.trials.rigs import MEMBERS
 from workbench.trials.scoring import Tally, score, score_dirty, tally
 
 
@@ -40,6 +40,7 @@ def hold_trials(
     seed: int,
     *,
     like: Case | None = None,
+    structure: str = MEMBERS,
     kinds: Sequence[Sequence[str]] | None = None,
     dirt: str | None = None,
     size: float | None = None,
@@ -54,6 +55,7 @@ def hold_trials(
 
     Args:
         like: the user's own case, whose nominal rig, levels, band and noise are taken; None draws benches.
+        structure: of benches that are drawn: "members" (beams and rods), "plates" or "frames".
         kinds: what the cases hide, one entry a case; None draws them.
         dirt: class of the small errors beside it, or "all"; see `write_trials`.
         size: of these errors; None for each of three in turn.
@@ -69,6 +71,7 @@ def hold_trials(
             n,
             seed,
             like=like,
+            structure=structure,
             kinds=kinds,
             dirt=dirt,
             size=size,
@@ -83,11 +86,11 @@ def hold_trials(
             verdicts[folder.name] = verdict
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
-            length = extent(read_case(folder).rig.modes.domain)
+            domain = read_case(folder).rig.modes.domain
             verdict, label = verdicts[folder.name], labels[folder.name]
-            scores[folder.name] = score(verdict, label, length=length)
+            scores[folder.name] = score(verdict, label, domain=domain)
             if dirt is not None:
-                dirty[folder.name] = score_dirty(verdict, label, length=length)
+                dirty[folder.name] = score_dirty(verdict, label, domain=domain)
     return Trials(verdicts, labels, scores, dirty, tally(scores.values()))
 
 

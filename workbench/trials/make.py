@@ -17,7 +17,8 @@ from workbench.trials.chance import draw_effect
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
 from workbench.trials.draws import DRAWS
 from workbench.trials.hidden import HIDE, OUTSIDE, hide
-from workbench.trials.plant import Plant, SolvedPlant
+from workbench.trials.plant import SolvedPlant
+from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
 from workbench.trials.scene import Scene, Unsuitable, extent
 
 NONE, UNKNOWN = "none", "unknown"
@@ -27,6 +28,10 @@ MOST_BENCHES, MOST_DRAWS = 40, 8
 VISIBLE = 0.02
 SEEN = 0.03  # each effect of several must alter the response by this much beside the others
 STRONG = 0.7  # of the gap that dirt makes: what an effect beside it must make at least
+
+# Kinds that a structure cannot show.
+OF_MEMBERS = frozenset({"local_stiffness_loss", "support_rotation", "axial_load", "air_drag", "midplane_stretching"})
+NOT_ON = {MEMBERS: frozenset(), PLATES: OF_MEMBERS, FRAMES: OF_MEMBERS | {"truncated_modes"}}
 
 # Pairs that do the same thing: no records of a case can hold them apart.
 TWINS = (
@@ -53,6 +58,7 @@ def make_trial(
     *,
     kinds: Sequence[str] = (),
     like: Case | None = None,
+    structure: str = MEMBERS,
     name: str = "case",
     dirt: str = CLEAN,
     size: float = 1.0,
@@ -63,6 +69,7 @@ def make_trial(
         seed: the same seed makes the same case.
         kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
         like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
+        structure: of a bench that is drawn: "members" (beams and rods), "plates" or "frames".
         name: of the case.
         dirt: class of the small errors beside them, of `DIRT_CLASSES`.
         size: of these errors, 1 for those of a careful laboratory.
@@ -75,7 +82,10 @@ def make_trial(
     Raises:
         ValueError: an unknown kind or class, or kinds that the bench cannot show.
     """
-    return make_trial_with_plant(seed, kinds=kinds, like=like, name=name, dirt=dirt, size=size)[:2]
+    case, label, _ = make_trial_with_plant(
+        seed, kinds=kinds, like=like, structure=structure, name=name, dirt=dirt, size=size
+    )
+    return case, label
 
 
 def make_trial_with_plant(
@@ -83,6 +93,7 @@ def make_trial_with_plant(
     *,
     kinds: Sequence[str] = (),
     like: Case | None = None,
+    structure: str = MEMBERS,
     name: str = "case",
     dirt: str = CLEAN,
     size: float = 1.0,
@@ -97,7 +108,7 @@ def make_trial_with_plant(
     reason = ""
     for _ in range(MOST_BENCHES if like is None else MOST_DRAWS):
         try:
-            bench = draw_bench(rng) if like is None else bench_of(like)
+            bench = draw_bench(rng, structure) if like is None else bench_of(like)
             tests = experiments(bench, rng)
             bench, effects = _draw_effects(bench, tests["mid"], kinds, rng)
             errors = draw_dirt(dirt, size, bench, rng) if dirt not in (CLEAN, TRIPLE) else Dirt()
@@ -134,7 +145,7 @@ def _truncate(bench: Bench, rng: np.random.Generator) -> tuple[Bench, dict[str, 
 
 
 def _check_each_seen(scene: Scene, effects: list[dict[str, Any]], rng: np.random.Generator) -> None:
-    nominal = Plant.of(scene.bench.rig)
+    nominal = scene.bench.plant()
     for one in effects:
         if one["kind"] == "sensor_quantisation":
             continue
@@ -154,8 +165,8 @@ def _case(
     rng: np.random.Generator,
     name: str,
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    dirty = dirt.on(Plant.of(bench.rig), bench.sample_time)
-    nominal = Plant.of(bench.rig).solved()
+    dirty = dirt.on(bench.plant(), bench.sample_time)
+    nominal = bench.plant().solved()
     real = hide(dirty, effects).solved()
     if dirt != Dirt() and effects:
         _check_strong(bench, tests, effects, nominal, dirty.solved(), real, rng)
@@ -271,10 +282,11 @@ def _record(bench: Bench, name: str, inputs: np.ndarray, outputs: np.ndarray) ->
     )
 
 
-def draw_kinds(n: int, seed: int, *, like: Case | None = None) -> list[tuple[str, ...]]:
+def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = MEMBERS) -> list[tuple[str, ...]]:
     """Kinds for n trials: of every 60, 40 of one effect, 10 pairs, 5 of none and 5 from outside the vocabulary."""
     rng = np.random.default_rng(seed)
-    pool = list(KINDS) if like is None else [k for k in KINDS if k != "truncated_modes"]
+    missing = NOT_ON[structure] if like is None else {"truncated_modes"}
+    pool = [kind for kind in KINDS if kind not in missing]
     singles = [(str(kind),) for _ in range(n // len(pool) + 1) for kind in rng.permutation(pool)]
     drawn: list[tuple[str, ...]] = []
     for i in range(n):
@@ -335,6 +347,7 @@ def write_trials(
     seed: int,
     *,
     like: Case | None = None,
+    structure: str = MEMBERS,
     kinds: Sequence[Sequence[str]] | None = None,
     dirt: str | None = None,
     size: float | None = None,
@@ -345,6 +358,7 @@ def write_trials(
     Args:
         like: a case whose rig and records all are like; None draws a bench a case. Kinds that a bench cannot show
             give way to others.
+        structure: of benches that are drawn: "members" (beams and rods), "plates" or "frames".
         kinds: what each case hides; None draws them, see `draw_kinds` and `draw_dirty_kinds`.
         dirt: class of the small errors beside what hides, of `DIRT_CLASSES`, or "all" for each in turn; None for none.
         size: of these errors; None for each of `SIZES` in turn.
@@ -357,7 +371,7 @@ def write_trials(
     if labels.resolve().is_relative_to(folder.resolve()):
         raise ValueError(f"labels {labels} would lie among the cases in {folder}; seal them elsewhere")
     if dirt is None:
-        draws = [DirtyDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like)]
+        draws = [DirtyDraw(CLEAN, 1.0, k) for k in draw_kinds(n, seed, like=like, structure=structure)]
     else:
         draws = draw_dirty_kinds(n, seed, dirt=dirt, size=size)
     if kinds is not None:
@@ -365,21 +379,25 @@ def write_trials(
     told = {}
     for i, draw in enumerate(draws):
         name = f"case-{i + 1:03d}"
-        case, told[name] = _first_possible(seed, i, draw, like, name)
+        case, told[name] = _first_possible(seed, i, draw, like, structure, name)
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
     labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _first_possible(seed: int, i: int, draw: DirtyDraw, like: Case | None, name: str) -> tuple[Case, dict[str, Any]]:
+def _first_possible(
+    seed: int, i: int, draw: DirtyDraw, like: Case | None, structure: str, name: str
+) -> tuple[Case, dict[str, Any]]:
     """The trial, or with kinds that this rig cannot show, one of kinds that it can."""
     rng, kinds = np.random.default_rng([seed, i]), draw.kinds
-    pool = [k for k in KINDS if k != "truncated_modes" and k not in MIMICS[draw.dirt]]
+    pool = [k for k in KINDS if k not in MIMICS[draw.dirt] | NOT_ON[structure] | {"truncated_modes"}]
     for _ in range(100):
         case_seed = int(rng.integers(2**31))
         try:
-            return make_trial(case_seed, kinds=kinds, like=like, name=name, dirt=draw.dirt, size=draw.size)
+            return make_trial(
+                case_seed, kinds=kinds, like=like, structure=structure, name=name, dirt=draw.dirt, size=draw.size
+            )
         except ValueError:
             kinds = tuple(str(k) for k in rng.choice(pool, len(kinds), replace=False))
     raise ValueError("this bench shows none of the effects; are its sensors and levels right?")

@@ -11,9 +11,13 @@ from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.structure.domain import Where
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Structure
+from workbench.structure.plate import Plate
 from workbench.trials import motion
-from workbench.trials.finite_elements import Alterations, ElementModes, element_modes, modal_modes
+from workbench.trials.finite_elements import Alterations, ElementModes, element_modes, matrix_modes, modal_modes
+from workbench.trials.plate_elements import plate_modes
 
 FINEST = 0.05  # radians of the highest mode in one step
 DRAG_POINTS = 48
@@ -27,7 +31,8 @@ class Plant:
         nominal: the rig it is taken for.
         actuators, sensors: as they really are, in the nominal order.
         n_modes: how many modes it shows.
-        altered: what its member has that the nominal one has not.
+        frame: the matrices behind nominal modes at named points; None where those are all there is.
+        altered: what its structure has that the nominal one has not.
         damping_factor: of every damping ratio.
         damping_factors: of each mode's damping ratio, in their order; a mode beyond them takes 1.
         laws: (code, at, parameters) of forces at points, codes of `motion`.
@@ -45,15 +50,16 @@ class Plant:
     actuators: tuple[Actuator, ...]
     sensors: tuple[Sensor, ...]
     n_modes: int
+    frame: FiniteElements | None = None
     altered: Alterations = field(default_factory=Alterations)
     damping_factor: float = 1.0
     damping_factors: tuple[float, ...] = ()
-    laws: tuple[tuple[int, float, tuple[float, ...]], ...] = ()
+    laws: tuple[tuple[int, Where, tuple[float, ...]], ...] = ()
     drag: float = 0.0
     stretching: float = 0.0
     stiffness_rate: float = 0.0
-    tones: tuple[tuple[float, float, float, float], ...] = ()
-    noises: tuple[tuple[float, float, float], ...] = ()
+    tones: tuple[tuple[Where, float, float, float], ...] = ()
+    noises: tuple[tuple[Where, float, float], ...] = ()
     mix: np.ndarray | None = None
     curvature: np.ndarray | None = None
     reading_laws: tuple[Callable[[np.ndarray, float], np.ndarray], ...] = ()
@@ -61,9 +67,9 @@ class Plant:
     logging_noise: float = 0.0
 
     @classmethod
-    def of(cls, nominal: Rig) -> "Plant":
+    def of(cls, nominal: Rig, frame: FiniteElements | None = None) -> "Plant":
         """The real structure that is just what it is taken for."""
-        return cls(nominal, nominal.actuators, nominal.sensors, nominal.modes.n_modes)
+        return cls(nominal, nominal.actuators, nominal.sensors, nominal.modes.n_modes, frame)
 
     def solved(self) -> "SolvedPlant":
         """The plant with its modes solved."""
@@ -79,15 +85,21 @@ class Plant:
             field_places,
         ]
         places = [x for group in groups for x in group]
-        if self.nominal.structure is None:
-            modes = modal_modes(self.nominal.modes, places, altered=self.altered)
-        else:
-            assert isinstance(self.nominal.structure, Structure), "trials are made on bars, beams and named points"
-            modes = element_modes(self.nominal.structure, np.array(places, float), self.n_modes, altered=self.altered)
+        modes = self._modes(places)
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
         inputs, sensors, laws, tones, noises, field = shapes
         drag = np.c_[field, 0.5 * length * weights[: len(field_places)]]
         return SolvedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
+
+    def _modes(self, places: list[Any]) -> ElementModes:
+        structure = self.nominal.structure
+        if isinstance(structure, Structure):
+            return element_modes(structure, np.array(places, float), self.n_modes, altered=self.altered)
+        if isinstance(structure, Plate):
+            return plate_modes(structure, places, self.n_modes, altered=self.altered)
+        if self.frame is not None:
+            return matrix_modes(self.frame, places, self.n_modes, altered=self.altered)
+        return modal_modes(self.nominal.modes, places, altered=self.altered)
 
 
 class ModalMotion(NamedTuple):

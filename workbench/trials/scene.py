@@ -1,13 +1,15 @@
 """A scene: a bench with its nominal motion, by which hidden effects are drawn."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from workbench.structure.domain import Domain, NamedPoints, Place, Rectangle
+from workbench.structure.domain import Domain, NamedPoints, Rectangle, Where
 from workbench.trials.benches import Bench
 from workbench.trials.plant import ModalMotion, Plant, SolvedPlant
 
+DISTINCT = 0.1  # sine of the angle between what forces at two named points do to the modes
 COARSE = 0.2  # radians of the highest mode in one step: enough to draw a strength by
 
 
@@ -38,7 +40,7 @@ class Scene:
 
     @classmethod
     def of(cls, bench: Bench, commands: np.ndarray) -> "Scene":
-        nominal = Plant.of(bench.rig).solved()
+        nominal = bench.plant().solved()
         moved, _ = nominal.move(commands, bench.sample_time, finest=COARSE)
         return cls(bench, nominal, commands, moved, nominal.readings(moved, bench.sample_time))
 
@@ -46,27 +48,59 @@ class Scene:
     def acting(self) -> list[str]:
         return [a.name for a in self.bench.rig.actuators if not a.direct]
 
-    def motion_at(self, x: Place) -> tuple[np.ndarray, np.ndarray]:
-        """Nominal displacement and velocity at a place, (n_samples,) each."""
-        shape = self.bench.rig.modes.phi(x)[0]
+    def motion_at(self, where: Where) -> tuple[np.ndarray, np.ndarray]:
+        """Nominal displacement and velocity at a place, or between two, (n_samples,) each."""
+        shape = self.bench.rig.modes.phi_at(where)
         return self.moved[0] @ shape, self.moved[1] @ shape
 
-    def place(self, rng: np.random.Generator) -> float | str:
-        """A place that moves: at least a third of what the liveliest does."""
+    def place(self, rng: np.random.Generator, *, between: bool = False) -> Where:
+        """A place that moves: at least a third of what the liveliest does.
+
+        Args:
+            between: whether it may be between two points, as it then is in every other draw.
+        """
         domain = self.bench.rig.modes.domain
-        if isinstance(domain, Rectangle):
-            raise Unsuitable("trials are made on bars, beams and named points")
         if isinstance(domain, NamedPoints):
-            grid = np.array(domain.names)
+            if domain.positions is not None:
+                return self._distinct(rng, between and rng.random() < 0.5)
+            grid: Any = np.array(domain.names)
         else:
-            grid = np.linspace(0.05, 1.0, 96) * domain.size
+            grid = domain.grid(24) if isinstance(domain, Rectangle) else np.linspace(0.05, 1.0, 96) * domain.size
         rms = np.sqrt(np.mean((self.bench.rig.modes.phi(grid) @ self.moved[0].T) ** 2, axis=1))
-        at = rng.choice(grid[rms > rms.max() / 3])
-        return (
-            str(at)
-            if isinstance(domain, NamedPoints)
-            else round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
-        )
+        at = rng.choice(np.asarray(grid)[rms > rms.max() / 3])
+        if isinstance(domain, NamedPoints):
+            return str(at)
+        if isinstance(domain, Rectangle):
+            moved = at + rng.uniform(-0.02, 0.02, 2) * domain.length
+            x, y = np.clip(moved, 0.0, domain.length)
+            return round(float(x), 4), round(float(y), 4)
+        return round(float(at) - float(rng.uniform(0.0, 0.01)) * domain.size, 4)
+
+    def _distinct(self, rng: np.random.Generator, between: bool) -> Where:
+        """A named point, or two that something is between, where a force acts on the modes as nowhere else.
+
+        What a force does to the modes is told by its direction among them, weighted by how they move: a weaker one of
+        the same direction is an equally good answer, so that what stands there has no one right place.
+        """
+        modes = self.bench.rig.modes
+        points = modes.domain
+        assert isinstance(points, NamedPoints)
+        alone, pairs = list(points.grid()), list(points.pairs())
+        index = {name: i for i, name in enumerate(alone)}
+        at_points = modes.phi(alone) * np.sqrt(np.mean(self.moved[1] ** 2, axis=0))
+        ends = np.array([[index[str(pair.first)], index[str(pair.second)]] for pair in pairs]).reshape(-1, 2)
+        felt = np.vstack([at_points, at_points[ends[:, 0]] - at_points[ends[:, 1]]])
+        size = np.linalg.norm(felt, axis=1)
+        places: list[Where] = [*alone, *pairs]
+        wanted = np.arange(size.size) >= len(alone) if between else np.arange(size.size) < len(alone)
+        lively = np.flatnonzero(wanted & (size > size[wanted].max() / 3))
+        unit = felt / np.maximum(size, 1e-300)[:, None]
+        for i in map(int, rng.permutation(lively)):
+            cosine = np.abs(unit @ unit[i])
+            cosine[i] = 0.0
+            if np.sqrt(np.maximum(1.0 - cosine.max() ** 2, 0.0)) > DISTINCT:
+                return places[i]
+        raise Unsuitable("every lively place moves the modes as another one does")
 
     def gap(self, plant: Plant, rng: np.random.Generator, reference: Plant | None = None) -> float:
         """Noise-free gap between a plant and the nominal one, or another, at the middle level."""

@@ -8,6 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from workbench.structure.domain import Domain, NamedPoints, as_domain
+from workbench.trials.hidden import stands
+
 NONE, UNKNOWN = "none", "unknown"
 NEAR = 0.02  # of the length: how far off a place may be
 NEAR_IN_DIRT = 0.03  # likewise beside the small errors of a real test
@@ -45,27 +48,28 @@ def score(
     verdict: dict[str, Any],
     label: dict[str, Any],
     *,
-    length: float,
+    domain: Domain | float,
     inputs: Sequence[str] = (),
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """How a verdict (as JSON) agrees with a label.
 
     Args:
-        length: of the structure; places count as right within 2 % of it.
+        domain: of the structure, or its length; places count as right within 2 % of that or of the diagonal, and by
+            their names.
         inputs, outputs: names in order, needed where a label counts them from zero.
 
     Returns:
         {"hidden", "told": sets of kinds in words; "family": single, pair, none or unknown; "kinds": right;
-        "channels": inputs and outputs right, None without any; "position_errors": shares of the length;
-        "positions": right, None without any; "shrinkage": by validation record}.
+        "channels": inputs and outputs right, None without any; "position_errors": shares of the length or the
+        diagonal, 1 for another name; "positions": right, None without any; "shrinkage": by validation record}.
     """
     hidden = [e for e in label["effects"] if e["kind"] != NONE]
     told = verdict["effects"]
     kinds = sorted(e["kind"] for e in hidden) == sorted(e["kind"] for e in told)
-    pairs = _matched(hidden, told, length) if kinds else []
+    pairs = _matched(hidden, told, domain) if kinds else []
     channels = [_same_channel(h, t, inputs, outputs) for h, t in pairs if "input" in h or "output" in h]
-    errors = [abs(h["at"] - t["at"]) / length for h, t in pairs if "at" in h and t.get("at") is not None]
+    errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     return {
         "hidden": _words(hidden),
         "told": _words(told),
@@ -82,14 +86,15 @@ def score_dirty(
     verdict: dict[str, Any],
     label: dict[str, Any],
     *,
-    length: float,
+    domain: Domain | float,
     inputs: Sequence[str] = (),
     outputs: Sequence[str] = (),
 ) -> dict[str, Any]:
     """How a verdict (as JSON) agrees with the label of a trial that has small errors beside its effects.
 
     Args:
-        length: of the structure; places count as right within 3 % of it.
+        domain: of the structure, or its length; places count as right within 3 % of that or of the diagonal, and by
+            their names.
         inputs, outputs: names in order, needed where a label counts them from zero.
 
     Returns:
@@ -105,8 +110,8 @@ def score_dirty(
     """
     hidden = [e for e in label["effects"] if e["kind"] not in (NONE, UNKNOWN)]
     told = [e for e in verdict["effects"] if e["kind"] != UNKNOWN]
-    pairs = _found(hidden, told, length, inputs, outputs)
-    errors = [abs(h["at"] - t["at"]) / length for h, t in pairs if "at" in h and t.get("at") is not None]
+    pairs = _found(hidden, told, domain, inputs, outputs)
+    errors = [_off(h, t, domain) for h, t in pairs if stands(h) is not None and stands(t) is not None]
     covered = [inside for h, t in pairs for inside in _inside(h, t)]
     budget = verdict.get("budget", {}).get("unexplained")
     complete = len(pairs) == len(hidden) == len(told)
@@ -182,13 +187,13 @@ def _share(flags: Sequence[bool]) -> float:
 def _found(
     hidden: list[dict[str, Any]],
     told: list[dict[str, Any]],
-    length: float,
+    domain: Domain | float,
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """Hidden effects beside those told of the same kind and channel, each once, the nearest first."""
     alike = [
-        (_distance(h, t) / length, i, j)
+        (_off(h, t, domain), i, j)
         for i, h in enumerate(hidden)
         for j, t in enumerate(told)
         if h["kind"] == t["kind"] and _same_channel(h, t, inputs, outputs)
@@ -200,8 +205,18 @@ def _found(
     return [(hidden[i], told[j]) for i, j in pairs]
 
 
-def _distance(hidden: dict[str, Any], told: dict[str, Any]) -> float:
-    return float(abs(hidden["at"] - told["at"])) if "at" in hidden and told.get("at") is not None else 0.0
+def _off(hidden: dict[str, Any], told: dict[str, Any], domain: Domain | float) -> float:
+    """How far an effect is told off its place, over the length or the diagonal; 1 where a named point is another one.
+
+    A mass moves with its node, whichever direction of it is named.
+    """
+    places = as_domain(domain)
+    one, other = stands(hidden), stands(told)
+    if one is None or other is None:
+        return 0.0
+    if isinstance(places, NamedPoints) and hidden["kind"] == "point_mass":
+        return float(not set(places.translations(one)) & set(places.translations(other)))
+    return places.separation(one, other)
 
 
 def _inside(hidden: dict[str, Any], told: dict[str, Any]) -> Iterable[bool]:
@@ -210,10 +225,10 @@ def _inside(hidden: dict[str, Any], told: dict[str, Any]) -> Iterable[bool]:
     values = {**told.get("parameters", {}), "at": told.get("at")}
     for name, deviation in deviations.items():
         if deviation and name in hidden and values.get(name) is not None:
-            off = values[name] - hidden[name]
+            off = np.atleast_1d(values[name]) - np.atleast_1d(hidden[name])
             if name == "phase":
                 off = (off + np.pi) % (2.0 * np.pi) - np.pi
-            yield bool(abs(off) <= NORMAL_95 * deviation)
+            yield from map(bool, np.abs(off) <= NORMAL_95 * np.atleast_1d(deviation))
 
 
 def tally(scores: Iterable[dict[str, Any]]) -> Tally:
@@ -245,7 +260,7 @@ def _words(effects: list[dict[str, Any]]) -> str:
 
 
 def _matched(
-    hidden: list[dict[str, Any]], told: list[dict[str, Any]], length: float
+    hidden: list[dict[str, Any]], told: list[dict[str, Any]], domain: Domain | float
 ) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     """Hidden and told effects of one kind side by side, two of a kind by their places."""
 
@@ -253,9 +268,7 @@ def _matched(
         pairs = list(zip(hidden, order, strict=True))
         if any(h["kind"] != t["kind"] for h, t in pairs):
             return float("inf")
-        return sum(
-            abs(float(h["at"]) - float(t["at"])) / length for h, t in pairs if "at" in h and t.get("at") is not None
-        )
+        return sum(_off(h, t, domain) for h, t in pairs)
 
     return list(zip(hidden, min(permutations(told), key=cost), strict=True)) if hidden else []
 

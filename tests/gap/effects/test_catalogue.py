@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from workbench.gap.effects.beyond import POWER_DAMPER, POWER_SPRING, in_catalogue
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter
 from workbench.gap.effects.environment import _is_distortion
@@ -228,3 +229,22 @@ def test_the_law_that_is_drawn_is_the_law_that_acts(kind):
         paths = [(x, 0.0) if motion == "displacement" else (0.0, x) for x in grid]
         acting = [element_force(code, row, 0, w, v, 0.0, 0.0)[0] for w, v in paths]
         np.testing.assert_allclose(law(values, grid), acting, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("law", "exponent", "name"),
+    [
+        (POWER_SPRING, 3.02, "cubic_spring"),
+        (POWER_SPRING, 1.0, "ground_spring"),
+        (POWER_DAMPER, 1.98, "quadratic_damper"),
+    ],
+)
+def test_a_law_of_a_power_of_the_catalogue_is_that_kind(law, exponent, name):
+    values = {"x": 0.3, "y": 0.4, "force_at_rms": 2.0, "exponent": exponent, "rms": 0.1}
+    known = in_catalogue(Effect(law, None, values))
+    assert known.kind.name == name and known.at == (0.3, 0.4)
+    grid = np.linspace(-0.2, 0.2, 9)
+    for motion, force in law.force_laws.items():
+        same = force({**values, "exponent": round(exponent)}, grid)
+        np.testing.assert_allclose(known.kind.force_laws[motion](known.values, grid), same, atol=1e-12)
+    assert in_catalogue(Effect(law, None, {**values, "exponent": 2.5})) is None

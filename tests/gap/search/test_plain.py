@@ -69,4 +69,4 @@ def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, di
     """Plants by another numerical route: an effect that a support, a damper or a load hides among errors of modes."""
     case, label = make_trial(seed, kinds=kinds, dirt=dirt, size=size)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1)
-    assert score_dirty(verdict.to_json(), label, length=case.rig.modes.length)["named"]
+    assert score_dirty(verdict.to_json(), label, domain=case.rig.modes.domain)["named"]

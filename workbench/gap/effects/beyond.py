@@ -8,10 +8,12 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.evidence import Evidence
-from workbench.gap.effects.nonlinear import strength_along, with_element
+from workbench.gap.effects.nonlinear import CUBIC_SPRING, QUADRATIC_DAMPER, strength_along, with_element
+from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
 EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # to start from
+SAME_POWER = 0.05  # nearer to that of a kind of the catalogue, an exponent tells of small errors and of no other law
 
 
 def _of_power(v: Mapping[str, Any], motion: Floats) -> Floats:
@@ -52,6 +54,23 @@ EVEN_SPRING = _power_law(
 )
 POWER_DAMPER = _power_law(PowerDamper, "power_damper", "velocity", "a damper of another power of the velocity")
 BEYOND = (POWER_SPRING, EVEN_SPRING, POWER_DAMPER)
+
+OF_POWER = {
+    (POWER_SPRING, 1): (GROUND_SPRING, "stiffness"),
+    (POWER_SPRING, 3): (CUBIC_SPRING, "stiffness"),
+    (POWER_DAMPER, 1): (POINT_DAMPER, "coefficient"),
+    (POWER_DAMPER, 2): (QUADRATIC_DAMPER, "coefficient"),
+}
+
+
+def in_catalogue(law: Effect) -> Effect | None:
+    """The effect of the catalogue that a law is, by its power; None where it is none of them."""
+    v = law.values
+    power = round(v["exponent"])
+    if (law.kind, power) not in OF_POWER or abs(v["exponent"] - power) > SAME_POWER:
+        return None
+    kind, number = OF_POWER[law.kind, power]
+    return Effect(kind, None, {**place_values(law.at), number: v["force_at_rms"] / v["rms"] ** power})
 
 
 def any_beyond(effects: Iterable[Effect]) -> bool:

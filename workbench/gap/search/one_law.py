@@ -2,10 +2,10 @@
 
 from dataclasses import replace
 
-from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.beyond import BEYOND, any_beyond, in_catalogue
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.search.finish import ranked
-from workbench.gap.search.fit import Fit, cost_of
+from workbench.gap.search.finish import finished, ranked
+from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
 from workbench.gap.search.search import RIVAL, Search
@@ -14,7 +14,7 @@ TRIED = 2
 
 
 def one_law(search: Search, evidence: Evidence) -> Fit | None:
-    """The force that explains the records alone, or None.
+    """The force that explains the records alone, of another law or by its power of the catalogue, or None.
 
     Two effects side by side bend to many a law between them, so it is sought before any two are believed.
     """
@@ -22,7 +22,13 @@ def one_law(search: Search, evidence: Evidence) -> Fit | None:
     beyond = replace(search, catalogue=BEYOND)
     hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < HOPEFUL]
     fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
-    return next((f for f in fits if search.explains(f)), None)
+    return next((f for f in (_named(search, f) for f in fits) if search.explains(f)), None)
+
+
+def _named(search: Search, law: Fit) -> Fit:
+    """A force of another law; where its power is that of a kind of the catalogue, that kind fitted from there."""
+    known = in_catalogue(law.effects[0])
+    return law if known is None else finished(search, fit(search.rig, (known,), search.data))
 
 
 def unless_another(search: Search, decision: Decision, evidence: Evidence) -> Decision:
@@ -42,7 +48,8 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
     as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
     hopeful = [f for f in one_more(beyond, (), there) if f.cost < as_near]
     fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
-    sure = (f for f in fits if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
+    other = [f for f in fits if in_catalogue(f.effects[0]) is None]
+    sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)
     return decision if law is None else weighed_against(law, search, decision)
 
@@ -51,4 +58,4 @@ def weighed_against(law: Fit, search: Search, decision: Decision) -> Decision:
     """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
     told = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
     best, rivals = ranked(search, [law, *told])
-    return Decision("unknown" if best is law else "explained", best, rivals=rivals)
+    return Decision("unknown" if any_beyond(best.effects) else "explained", best, rivals=rivals)
