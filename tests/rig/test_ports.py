@@ -118,6 +118,22 @@ def test_a_rate_limit_lets_the_force_ramp():
     )
 
 
+def test_few_substeps_follow_ramps_that_end_within_one():
+    """Ramps of whole tenths of a sample are exact where forces run straight from tenth to tenth."""
+    rng, fine = np.random.default_rng(4), 10
+    command = np.round(rng.uniform(-2.0, 2.0, (1, 120)), 1)
+    force, now = np.zeros(120 * fine + 1), 0.0
+    for k in range(120 * fine):
+        now += np.clip(command[0, k // fine] - now, -0.1, 0.1)
+        force[k + 1] = now
+    peer = simulate(rig(Actuator("F1", 2.0)), force[None], sample_time=DT / fine, input_hold="first").outputs
+    peer = peer[:2, :-1:fine]  # an acceleration jumps with the command
+    limited = rig(Actuator("F1", 2.0, rate_limit=1.0 / DT))
+    for substeps, within in ((4, 2e-4), (8, 4e-5)):
+        found = simulate(limited, command, sample_time=DT, substeps=substeps).outputs[:2]
+        assert (np.abs(found - peer).max(axis=1) < within * np.abs(peer).max(axis=1)).all()
+
+
 def test_a_command_passes_its_hysteresis_as_an_adaptive_integrator_has_it():
     command = np.cumsum(drive(60, 1)[0])
     z, before, expected = 0.0, 0.0, []
