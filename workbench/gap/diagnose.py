@@ -119,6 +119,7 @@ def diagnose(
             readiness=ready(),
             budget=budget,
             experiment=_next(rig, attribution, sharing),
+            tolerance=tolerance,
             notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome, budget)),
         )
 

@@ -16,6 +16,7 @@ from workbench.gap.prediction.residuals import FitData
 MODE_SHARE = 0.05
 ONE_SENSOR = 0.97  # of the gap
 OCTAVES = 8
+CLEAR = 0.1  # of the noise: a gap that is larger by less is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,7 @@ class Where:
         sensor_shares: (n_outputs,).
         time_shares: (n_records, 8) of each record's gap, by eighths of its length.
         record_gaps: (n_records,) gap as the case format defines it.
+        record_floors: (n_records,) the same of the noise alone.
         input_levels: (n_records,) root mean square of the inputs.
         linear_share: of the gap's power, what one linear reply to the inputs explains.
         place: of an unmodelled force at a point, whatever its law: `at` and `at_std`, m; and whether it is one force.
@@ -49,6 +51,7 @@ class Where:
     time_shares: np.ndarray
     record_names: tuple[str, ...]
     record_gaps: np.ndarray
+    record_floors: np.ndarray
     input_levels: np.ndarray
     linear_share: float
     place: ForceLocation
@@ -60,6 +63,13 @@ class Where:
     @property
     def at_std(self) -> float:
         return self.place.at_std
+
+    @property
+    def beyond_noise(self) -> float:
+        """The largest gap of a record that is clearly above its noise, less that noise, as a share of the signal."""
+        clear = self.record_gaps > (1.0 + CLEAR) * self.record_floors
+        power = np.where(clear, self.record_gaps**2 - self.record_floors**2, 0.0)
+        return float(np.sqrt(power.max()))
 
 
 def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) -> Where:
@@ -95,6 +105,7 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
         time_shares=np.array([_by_eighths(s) for s in scaled]),
         record_names=tuple(record.name for record in data.counted),
         record_gaps=gaps,
+        record_floors=np.array([np.sqrt(floor.mean()) for floor in floors]),
         input_levels=levels,
         linear_share=linear_share(evidence.rig, data, evidence.residuals, mode_shares),
         place=place,

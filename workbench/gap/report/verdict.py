@@ -28,7 +28,7 @@ class Verdict:
 
     Attributes:
         case: its name.
-        outcome: "none" (no gap beyond noise), "explained", "part" (explained in part) or "unknown".
+        outcome: "none" (no gap beyond noise or a tolerance), "explained", "part" (explained in part) or "unknown".
         effects: the set that explains the gap; empty for "none"; the nearest set for "part" and "unknown"; errors of
             the nominal model among it, where they were fitted beside.
         budget: of the gap: shares of each effect, of errors of the nominal model, of noise and of what is unexplained.
@@ -40,6 +40,7 @@ class Verdict:
         attribution: the whole search.
         readiness: what the records could show before anything was fitted.
         experiment: what to measure next, where rivals remain.
+        tolerance: of the signal's rms, below which a gap beyond the noise was not explained.
         notes: what else a reader should know.
     """
 
@@ -55,6 +56,7 @@ class Verdict:
     readiness: Readiness
     budget: Budget
     experiment: Experiment | None = None
+    tolerance: float = 0.0
     notes: tuple[str, ...] = ()
 
     @property
@@ -94,8 +96,11 @@ class Verdict:
         named = [_described(effect, self.nominal) for effect in self._told]
         words = " and ".join(named)
         if self.outcome == "none":
-            if self.nominal_errors is None:
+            if self.nominal_errors is None and self.where.beyond_noise == 0:
                 return "There is no gap beyond the noise of the sensors."
+            if self.nominal_errors is None:
+                below = f", below the tolerance of {100.0 * self.tolerance:g} %" if self.tolerance else ""
+                return f"The gap beyond the noise is {_percent(self.where.beyond_noise)} of the signal{below}."
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if any(effect.kind.remainder for effect in self.effects):
