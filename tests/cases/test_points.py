@@ -12,7 +12,7 @@ from workbench.cases.writing import write_case
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.elements import LinearSpring
-from workbench.rig.rig import Rig
+from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
 from workbench.structure.damping import ModalDamping
@@ -83,6 +83,67 @@ def test_a_patch_is_read_with_its_sides_and_its_axis(tmp_path):
     rig = read_case(written(tmp_path, PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\npatch = [0.2, 0.1]\naxis = "y"'))).rig
     (patch,) = rig.actuators
     assert patch == piezo_patch("F1", (0.3, 0.2), length=(0.2, 0.1), direction="y")
+
+
+def test_moments_and_slopes_of_a_plate_have_an_axis(tmp_path):
+    table = PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\nquantity = "moment"\naxis = "y"')
+    table = table.replace('"acceleration"', '"slope"').replace("[0.5, 0.4]", '[0.5, 0.4]\naxis = "x"')
+    rig = read_case(written(tmp_path, table)).rig
+    assert rig.actuators[0] == Actuator("F1", (0.3, 0.2), "moment", direction="y")
+    assert rig.sensors[0].direction == "x"
+    # the first mode is a multiple of sin(π x / 1.2) sin(π y / 0.9): -∂w/∂x about y, ∂w/∂y about x
+    kx, ky = np.pi / 1.2, np.pi / 0.9
+    first = rig.modes.phi((0.3, 0.2))[0, 0] / (np.sin(0.3 * kx) * np.sin(0.2 * ky))
+    into, out = (shape_of(rig.modes, port)[0] for port in (*rig.actuators, *rig.sensors))
+    assert into == pytest.approx(-first * kx * np.cos(0.3 * kx) * np.sin(0.2 * ky))
+    assert out == pytest.approx(first * ky * np.sin(0.5 * kx) * np.cos(0.4 * ky))
+
+
+def test_points_are_named_by_their_node_and_a_direction_or_an_axis(tmp_path):
+    table = FRAME.replace('"a.x"', '"1"\ndirection = "y"').replace('"b.y"', '"a.x"\naxis = "z"')
+    points = POINTS + "a.rz,1,0,0,0,rz,2.0,3.0\n"
+    rig = read_case(written(tmp_path, table.replace('"acceleration"', '"angular velocity"'), points)).rig
+    np.testing.assert_array_equal(shape_of(rig.modes, rig.actuators[0]), [-0.5, 0.75])
+    np.testing.assert_array_equal(shape_of(rig.modes, rig.sensors[0]), [2.0, 3.0])
+    turned = FRAME.replace('"a.x"', '"a.rz"\nquantity = "moment"')
+    rig = read_case(written(tmp_path, turned, points)).rig
+    np.testing.assert_array_equal(shape_of(rig.modes, rig.actuators[0]), [2.0, 3.0])
+
+
+def test_moments_slopes_and_directions_are_written_as_they_were(tmp_path):
+    plate = Plate(
+        length=(0.6, 0.4),
+        mass_per_area=8.1,
+        bending_stiffness=170.0,
+        poisson_ratio=0.31,
+        edges="clamped",
+        damping=ModalDamping(0.01),
+    )
+    rig = Rig(
+        plate.modes(3),
+        (Actuator("M", (0.2, 0.1), "moment", direction="x"), Actuator("F", (0.3, 0.1), direction="z")),
+        (Sensor("s", (0.3, 0.2), "slope", noise_std=0.01, direction="y"),),
+        structure=plate,
+    )
+    read = again(rig, tmp_path / "plate")
+    np.testing.assert_allclose(input_matrix(read.modes, read.actuators), input_matrix(rig.modes, rig.actuators))
+    assert read.sensors == rig.sensors and read.actuators[0] == rig.actuators[0]
+
+    points = NamedPoints(("p", "q"), np.eye(3)[:2], ("x", "rz"), ("n", "n"))
+    modes = Modes([20.0, 31.0], [0.01, 0.01], PointShapes([[1.0, 2.0], [3.0, 4.0]]), points)
+    ports = (Actuator("M", "p", "moment", direction="z"), Actuator("F", "q", direction="x"))
+    frame = Rig(modes, ports, (Sensor("s", "q", "slope", noise_std=0.01),))
+    read = again(frame, tmp_path / "frame")
+    assert read.actuators == frame.actuators and read.sensors == frame.sensors
+
+    beam = Beam(
+        length=2.0, mass_per_length=1.0, bending_stiffness=4.0, left="clamped", right="free",
+        damping=ModalDamping(0.01),
+    )  # fmt: skip
+    bent = Rig(
+        beam.modes(3), (Actuator("M", 1.2, "moment"),), (Sensor("s", 1.7, "slope", noise_std=0.01),), structure=beam
+    )
+    assert again(bent, tmp_path / "beam").actuators == bent.actuators
 
 
 def test_named_points_are_read_with_their_shapes(tmp_path):
@@ -202,7 +263,15 @@ def test_points_go_through_a_file_unchanged(tmp_path):
         (PLATE.replace("[0.3, 0.2]", "[0.3, 0.2]\npatch = 0.1"), POINTS, "'F1': patch must be a list of 2 numbers"),
         (PLATE.replace("[0.3, 0.2]", "[0.05, 0.2]\npatch = [0.2, 0.1]"), POINTS, "'F1': a patch of 0.2 m by 0.1 m at"),
         (PLATE.replace("[0.3, 0.2]", "[0.3, 0.2]\npatch = [0.2, 0.1]\naxis = 1"), POINTS, "axis is x or y"),
-        (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\naxis = "x"'), POINTS, "give patch, its two sides"),
+        (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\naxis = "x"'), POINTS, "'F1': a force .* has no axis; give direction"),
+        (PLATE.replace('"acceleration"', '"slope"'), POINTS, "'a1': a slope or moment on a plate is about an axis"),
+        (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\nquantity = "moment"\naxis = "z"'), POINTS, "direction 'x' or 'y'"),
+        (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\nquantity = "torque"'), POINTS, "quantity is force or moment"),
+        (PLATE.replace("[0.3, 0.2]", '[0.3, 0.2]\ndirection = "z"'), POINTS, "no key 'direction'"),
+        (PLATE.replace('"actuator"\nat', '"hammer"\nquantity = "moment"\nat'), POINTS, "a hammer gives a force"),
+        (FRAME.replace('"a.x"', '"a.x"\ndirection = "z"'), POINTS, "point 'a.x' has no direction 'z'; it has x, y"),
+        (FRAME.replace('"b.y"', '"b.y"\naxis = "z"'), POINTS, "'a1': a force or displacement.* has no axis"),
+        (FRAME.replace('"acceleration"', '"slope"'), POINTS, "'b.y' is no rotation: give a point of direction rx"),
         (PLATE.replace('"actuator"\nat', '"hammer"\npatch = [0.2, 0.1]\nat'), POINTS, "a patch is no hammer"),
         (FRAME.replace('"a.x"', '"a.x"\npatch = [0.2, 0.1]'), POINTS, "no key 'patch'"),
         (PLATE.replace("bottom =", "botom ="), POINTS, "did you mean 'bottom'"),

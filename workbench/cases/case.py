@@ -29,7 +29,7 @@ from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import Domain, NamedPoints, Place, PlaceError
+from workbench.structure.domain import NamedPoints, Place, PlaceError
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
@@ -56,7 +56,15 @@ PLATE = (
 EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
-PATCH = ("patch", "axis")  # of an input along a beam or on a plate
+# What an input and an output may have beside, where there are moments, patches, or more than one direction.
+MORE: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "beam": (("quantity", "patch"), ()),
+    "rod": ((), ()),
+    "plate": (("quantity", "patch", "axis"), ("axis",)),
+    "points": (("quantity", "axis", "direction"), ("axis", "direction")),
+    "modal": ((), ()),
+}
+ACTING = ("force", "moment")  # what an input may be, the first where nothing is said
 RECORD = ("name", "file", "sample_time", "use", "input_hold")
 
 
@@ -149,7 +157,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
-    _check_ports(inputs, outputs, "at", more=PATCH[:1] if kind == "beam" else ())
+    _check_ports(inputs, outputs, "at", MORE[kind])
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
@@ -168,13 +176,13 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
         structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
     actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]"), modes) for e in inputs)
-    sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]")) for e in outputs)
+    sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]"), modes) for e in outputs)
     return Rig(modes, actuators, sensors, structure=structure)
 
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     check_keys(table, PLATE, "[structure]")
-    _check_ports(inputs, outputs, "at", more=PATCH)
+    _check_ports(inputs, outputs, "at", MORE["plate"])
     edges = table.get("edges")
     if not isinstance(edges, dict):
         raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
@@ -192,17 +200,18 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
 
     def pair(entry: dict[str, Any], where: str) -> Place:
         x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2).tolist()
-        return _known(modes.domain, (x, y), f"{where} {entry['name']!r}")
+        return x, y
 
     actuators = tuple(_actuator(e, pair(e, "[[input]]"), modes) for e in inputs)
-    return Rig(modes, actuators, tuple(_sensor(e, pair(e, "[[output]]")) for e in outputs), structure=structure)
+    sensors = tuple(_sensor(e, pair(e, "[[output]]"), modes) for e in outputs)
+    return Rig(modes, actuators, sensors, structure=structure)
 
 
 def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
     single = "mass" in table
     check_keys(table, SINGLE if single else MODAL, "[structure]")
-    _check_ports(inputs, outputs, "shape")
+    _check_ports(inputs, outputs, "shape", MORE["modal"])
     if single:
         mass = number(table, "mass", "[structure]", low=1e-300)
         stiffness = number(table, "stiffness", "[structure]", low=0.0)
@@ -225,7 +234,8 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         )
     points = NamedPoints(tuple(e["name"] for e in (*inputs, *outputs)))
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
-    return Rig(modes, tuple(_actuator(e, e["name"]) for e in inputs), tuple(_sensor(e, e["name"]) for e in outputs))
+    actuators = tuple(_actuator(e, e["name"], modes) for e in inputs)
+    return Rig(modes, actuators, tuple(_sensor(e, e["name"], modes) for e in outputs))
 
 
 def _rig_at_points(
@@ -233,7 +243,7 @@ def _rig_at_points(
 ) -> Rig:
     """Modal data at named points, which a table beside the case file lists."""
     check_keys(table, MODAL, "[structure]")
-    _check_ports(inputs, outputs, "point")
+    _check_ports(inputs, outputs, "point", MORE["points"])
     omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
     damping = _modal_damping(table, omega)
     file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
@@ -241,10 +251,10 @@ def _rig_at_points(
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
 
     def point(entry: dict[str, Any], where: str) -> Place:
-        return _known(points, text(entry, "point", f"{where} {entry['name']!r}"), f"{where} {entry['name']!r}")
+        return text(entry, "point", f"{where} {entry['name']!r}")
 
-    actuators = tuple(_actuator(e, point(e, "[[input]]")) for e in inputs)
-    return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]")) for e in outputs))
+    actuators = tuple(_actuator(e, point(e, "[[input]]"), modes) for e in inputs)
+    return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]"), modes) for e in outputs))
 
 
 def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
@@ -259,19 +269,32 @@ def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
 
 
 def _check_ports(
-    inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], *places: str, more: tuple[str, ...] = ()
+    inputs: list[dict[str, Any]],
+    outputs: list[dict[str, Any]],
+    place: str,
+    more: tuple[tuple[str, ...], tuple[str, ...]],
 ) -> None:
-    for key, entries, keys in (("input", inputs, (*INPUT, *more)), ("output", outputs, OUTPUT)):
+    for key, entries, keys in (("input", inputs, (*INPUT, *more[0])), ("output", outputs, (*OUTPUT, *more[1]))):
         for entry in entries:
-            check_keys(entry, (*keys, *places), f"[[{key}]] {entry['name']!r}")
+            check_keys(entry, (*keys, place), f"[[{key}]] {entry['name']!r}")
 
 
-def _known(domain: Domain, place: Place, where: str) -> Place:
+def _check_stands(port: Actuator | Sensor, modes: Modes, where: str) -> None:
+    """Refuse a place that the structure does not have, or a direction or an axis that it does not have there."""
+    turning = port.kind == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
     try:
-        domain.locate(place)
+        modes.phi_at(port.at, int(turning), direction=port.direction)
     except PlaceError as error:
         raise CaseError(f"{where}: {error}") from None
-    return place
+
+
+def _direction(entry: dict[str, Any], turning: bool, where: str) -> str | None:
+    """The direction of a force or a motion, or the axis of a moment or a rotation; None where none is given."""
+    key, other = ("axis", "direction") if turning else ("direction", "axis")
+    if other in entry:
+        what = "moment, slope or angular velocity" if turning else "force or displacement, velocity or acceleration"
+        raise CaseError(f"{where}: a {what} has no {other}; give {key}")
+    return text(entry, key, where) if key in entry else None
 
 
 def _place(entry: dict[str, Any], length: float, where: str) -> float:
@@ -281,19 +304,31 @@ def _place(entry: dict[str, Any], length: float, where: str) -> float:
     return at
 
 
-def _actuator(entry: dict[str, Any], at: Place, modes: Modes | None = None) -> Actuator:
-    """An input; on a beam or a plate, whose modes are given, it may be a piezo patch."""
+def _actuator(entry: dict[str, Any], at: Place, modes: Modes) -> Actuator:
+    """An input: a force, a moment, or a piezo patch."""
     kind, where = entry.get("kind"), f"[[input]] {entry['name']!r}"
     if kind not in ("actuator", "hammer"):
         raise CaseError(f"{where}: kind is actuator or hammer; got {shown(kind)}")
-    if "patch" not in entry or modes is None:
-        if "axis" in entry:
-            raise CaseError(
-                f"{where}: axis is of the moments of a patch; give patch, its two sides in m, or leave it out"
-            )
-        return Actuator(entry["name"], at, direct=kind == "hammer")
-    if kind == "hammer":
+    if "patch" in entry:
+        actuator = _patch(entry, at, where)
+    else:
+        quantity = entry.get("quantity", ACTING[0])
+        if quantity not in ACTING:
+            raise CaseError(f"{where}: quantity is {' or '.join(ACTING)}; got {shown(quantity)}")
+        turning = quantity == "moment"
+        if turning and kind == "hammer":
+            raise CaseError(f"{where}: a hammer gives a force; the kind of what gives a moment is actuator")
+        direction = _direction(entry, turning, where)
+        actuator = Actuator(entry["name"], at, quantity, direct=kind == "hammer", direction=direction)
+    _check_stands(actuator, modes, where)
+    return actuator
+
+
+def _patch(entry: dict[str, Any], at: Place, where: str) -> Actuator:
+    if entry["kind"] == "hammer":
         raise CaseError(f"{where}: a patch is no hammer; its kind is actuator")
+    if entry.get("quantity", "moment") != "moment":
+        raise CaseError(f"{where}: a patch acts by moments along its edges; leave quantity out")
     length: float | tuple[float, float]
     if isinstance(at, tuple):
         width, height = numbers(entry, "patch", where, 2).tolist()
@@ -304,14 +339,12 @@ def _actuator(entry: dict[str, Any], at: Place, modes: Modes | None = None) -> A
     if axis not in (None, "x", "y"):
         raise CaseError(f"{where}: axis is x or y, or left out for moments about both; got {shown(axis)}")
     try:
-        patch = piezo_patch(entry["name"], at, length=length, direction=axis)
-        modes.phi_at(patch.at, 1, direction=axis)
+        return piezo_patch(entry["name"], at, length=length, direction=axis)
     except ValueError as error:
         raise CaseError(f"{where}: {error}") from error
-    return patch
 
 
-def _sensor(entry: dict[str, Any], at: Place) -> Sensor:
+def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
     where = f"[[output]] {entry['name']!r}"
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
@@ -319,7 +352,10 @@ def _sensor(entry: dict[str, Any], at: Place) -> Sensor:
     noise = number(entry, "noise_std", where, low=0.0)
     if noise == 0:
         raise CaseError(f"{where}: noise_std must be positive; the diagnosis weights every residual by it")
-    return Sensor(entry["name"], at, quantity, noise_std=noise)
+    direction = _direction(entry, MEASURED[quantity][0] == 1, where)
+    sensor = Sensor(entry["name"], at, quantity, noise_std=noise, direction=direction)
+    _check_stands(sensor, modes, where)
+    return sensor
 
 
 # --- records

@@ -11,8 +11,8 @@ from workbench.cases.case import Case
 from workbench.cases.points import write_points
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
-from workbench.rig.rig import Rig
-from workbench.rig.sensors import Sensor
+from workbench.rig.rig import Rig, shape_of
+from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, middle, position
 from workbench.structure.member import Beam, Structure
@@ -35,7 +35,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
     Raises:
         ValueError: what the format cannot say: profiles that are not linear between their breaks, a plate that varies,
             attachments, ends or edges without a name, damping that differs from mode to mode of a structure or couples
-            modes, an input that is no ideal point force or piezo patch, elements.
+            modes, an input that is no ideal point force, moment or piezo patch, elements.
     """
     folder = Path(folder)
     (folder / "records").mkdir(parents=True, exist_ok=True)
@@ -82,7 +82,7 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
             f"point {sorted(unused)[0]!r} has no position and is neither input nor output, so the format has no place"
             " for it; give the points positions"
         )
-    return [_modal(rig.modes), *_ports(rig, at=lambda port: {"shape": rig.modes.phi(port.at)[0].tolist()})]
+    return [_modal(rig.modes), *_ports(rig, at=lambda port: {"shape": shape_of(rig.modes, port).tolist()})]
 
 
 def _member(member: Structure, n_modes: int) -> str:
@@ -179,17 +179,19 @@ def _check_ports(rig: Rig) -> None:
         raise ValueError(
             f"the case format knows no elements of the nominal rig; take {type(rig.elements[0]).__name__} out"
         )
+    moments = isinstance(rig.structure, Beam | Plate) or getattr(rig.modes.domain, "positions", None) is not None
     ports: tuple[Port, ...] = (*rig.actuators, *rig.sensors)
     for port in ports:
         patch = isinstance(port, Actuator) and _is_patch(port, rig)
-        kind = "moment" if patch else "force"
-        plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, kind)
-        kept = ("direction",) if patch else ("direct",) if isinstance(port, Actuator) else ("quantity", "noise_std")
+        plain = Sensor(port.name, port.at) if isinstance(port, Sensor) else Actuator(port.name, port.at, port.kind)
+        kept = ["direct"] if isinstance(port, Actuator) else ["quantity", "noise_std"]
+        kept += ["direction"] * (not isinstance(rig.structure, Structure))
         other = [f.name for f in fields(port) if f.name not in kept and getattr(port, f.name) != getattr(plain, f.name)]
+        other += ["a moment"] * (isinstance(port, Actuator) and port.kind == "moment" and not moments)
         if other or (isinstance(port.at, Between) and not patch):
             raise ValueError(
                 f"{port.name!r} has {other[0] if other else 'two places'} beside what the case format holds: a point"
-                " force, a piezo patch or a reading at one place, with nothing lost on the way"
+                " force, a moment, a piezo patch or a reading at one place, with nothing lost on the way"
             )
 
 
@@ -201,12 +203,27 @@ def _is_patch(actuator: Actuator, rig: Rig) -> bool:
 def _ports(rig: Rig, *, at: Callable[[Port], dict[str, Any]]) -> list[str]:
     """Inputs and outputs; `at` gives the keys of a place and their values."""
     inputs = [
-        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", **at(a)) for a in rig.actuators
+        _table("[[input]]", name=a.name, kind="hammer" if a.direct else "actuator", **_acting(a), **at(a), **_way(a))
+        for a in rig.actuators
     ]
     outputs = [
-        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), noise_std=s.noise_std) for s in rig.sensors
+        _table("[[output]]", name=s.name, quantity=s.quantity, **at(s), **_way(s), noise_std=s.noise_std)
+        for s in rig.sensors
     ]
     return [*inputs, *outputs]
+
+
+def _acting(actuator: Actuator) -> dict[str, str]:
+    at_point = not isinstance(actuator.at, Patch | Between)
+    return {"quantity": "moment"} if actuator.kind == "moment" and at_point else {}
+
+
+def _way(port: Port) -> dict[str, str]:
+    """The direction of a force or a motion, or the axis of a moment or a rotation, where it has one."""
+    turning = port.kind == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
+    if port.direction is None or (not turning and not isinstance(port.at, str)):  # a plate moves along its normal
+        return {}
+    return {"axis" if turning else "direction": port.direction}
 
 
 def _along(port: Port) -> dict[str, Any]:
@@ -217,10 +234,9 @@ def _along(port: Port) -> dict[str, Any]:
 
 
 def _over(port: Port) -> dict[str, Any]:
-    """Its place on a plate, and the sides and the axis of a patch."""
+    """Its place on a plate, and the sides of a patch."""
     if isinstance(port.at, Patch):
-        axis = {} if port.direction is None else {"axis": port.direction}
-        return {"at": list(port.at[:2]), "patch": [port.at.width, port.at.height], **axis}
+        return {"at": list(port.at[:2]), "patch": [port.at.width, port.at.height]}
     return {"at": list(port.at)}  # type: ignore[arg-type]
 
 
