@@ -17,12 +17,14 @@ class Field:
         x_breaks, y_breaks: lines x = const and y = const, m, across which the quantity or its slope jumps;
             quadrature never straddles one.
         is_constant: whether the quantity is the same everywhere.
+        multiple_of: (another field, factor) where this is so many times that one; None where it stands by itself.
     """
 
     function: Callable[[np.ndarray, np.ndarray], ArrayLike]
     x_breaks: tuple[float, ...] = ()
     y_breaks: tuple[float, ...] = ()
     is_constant: bool = False
+    multiple_of: "tuple[Field, float] | None" = None
 
     @classmethod
     def constant(cls, value: float) -> "Field":
@@ -39,6 +41,13 @@ class Field:
     def mapped(self, change: Callable[[np.ndarray], np.ndarray]) -> "Field":
         """A field of changed values, with the same breaks."""
         return Field(lambda x, y: change(self(x, y)), self.x_breaks, self.y_breaks, self.is_constant)
+
+    def scaled(self, factor: float) -> "Field":
+        """A field of so many times the values."""
+        base, already = self.multiple_of or (self, 1.0)
+        whole = already * factor
+        values = base.mapped(lambda each: whole * each)
+        return Field(values.function, self.x_breaks, self.y_breaks, self.is_constant, (base, whole))
 
 
 FieldLike = Field | float | Callable[[np.ndarray, np.ndarray], ArrayLike]

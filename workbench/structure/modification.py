@@ -11,7 +11,9 @@ OWN = 4  # modes that move on their own, for each that is asked for
 ROUNDING = 1e-9  # of the largest eigenvalue: what a rigid-body mode may be off by
 
 
-def attach(modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | None = None) -> Modes:
+def attach(
+    modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | None = None, residual: float = 0.0
+) -> Modes:
     """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
 
     Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes (`truncation_error`).
@@ -23,11 +25,12 @@ def attach(modes: Modes, attachments: tuple[Attachment, ...], *, kept: int | Non
         kept: how many modes come out, and how many of those at hand move on their own, four times as many; the others
             go with the force of each attachment as they do at rest: an error of the order of (ω / ω_kept)⁴. All of
             them where not given.
+        residual: flexibility at a point of all modes that are not at hand, m/N.
 
     MacNeal, Computers & Structures 1 (1971) 581, on residual flexibility.
     """
     if kept is not None:
-        return _with_residual(modes, attachments, kept)
+        return _with_residual(modes, attachments, kept, residual)
     n = modes.n_modes
     mass, stiffness, extra_damping = np.eye(n), np.diag(modes.omega**2), []
     for part in attachments:
@@ -83,17 +86,22 @@ def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.nd
     return error
 
 
-def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int) -> Modes:
-    """The lowest modes, from the next few as they are and the rest by their static answer to each attachment."""
+def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int, residual: float) -> Modes:
+    """The lowest modes, from the next few as they are and the rest by their static answer to each attachment.
+
+    Modes that are not at hand answer at the place of the force alone: a coordinate of its own, as fast as the highest.
+    """
     own = min(OWN * kept, modes.n_modes)
     moving = [part for part in attachments if not isinstance(part, PointDamper)]
     rows = np.vstack([np.zeros((0, modes.n_modes)), *(_moved(modes, part, 0) for part in moving)])
     # each row of `rest` is the rest's static answer to one force, all of them of unit energy and apart from each other
     _, sizes, directions = np.linalg.svd(rows[:, own:] / modes.omega[own:], full_matrices=False)
     rest = directions[sizes > 1e-6 * sizes.max(initial=0.0)] / modes.omega[own:]
-    basis = np.zeros((modes.n_modes, own + len(rest)))
+    places = list(dict.fromkeys(part.at for part in moving)) if residual else []
+    alone = own + len(rest)
+    basis = np.zeros((modes.n_modes, alone + len(places)))
     basis[:own, :own] = np.eye(own)
-    basis[own:, own:] = rest.T
+    basis[own:, own:alone] = rest.T
     full = modes.shapes
     reduced = Modes(
         omega=np.zeros(basis.shape[1]),
@@ -103,8 +111,13 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int)
         essential=modes.essential,
     )
     mass, stiffness = basis.T @ basis, basis.T @ (modes.omega[:, None] ** 2 * basis)
+    stiffness[alone:, alone:] = np.eye(len(places))  # of unit energy, as the others
+    mass[alone:, alone:] = np.eye(len(places)) / modes.omega[-1] ** 2
     for part in moving:
         shapes = _moved(reduced, part, 0)
+        if places:
+            shapes = shapes.copy()
+            shapes[:, alone + places.index(part.at)] = np.sqrt(residual)
         value = part.mass if isinstance(part, PointMass) else part.stiffness
         target = mass if isinstance(part, PointMass) else stiffness
         target += value * shapes.T @ shapes

@@ -11,8 +11,9 @@ from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, plac
 from workbench.gap.effects.evidence import Evidence, Moved
 from workbench.gap.effects.scales import Scales
 from workbench.rig.rig import Rig
-from workbench.structure.damping import ModalDamping
+from workbench.structure.damping import ModalDamping, ViscousDamping
 from workbench.structure.domain import Between
+from workbench.structure.field import Field
 from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
@@ -41,8 +42,41 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
     """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many."""
     facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
     facts["edges"] = tuple(surface.edges.items())
+    base, factor = _stiffer_all_over(surface)
+    if base is not None:  # the modes of one solution, faster
+        facts["bending_stiffness"] = base
+    damping = facts["damping"]
+    if not isinstance(damping, ViscousDamping):  # which takes part in no solution
+        facts["damping"] = None
     kind: Any = type(surface)
-    return attach(_bare_modes(kind, tuple(facts.items()), n_modes), _attachments(surface), kept=n_modes)
+    bare = _bare_modes(kind, tuple(facts.items()), n_modes)
+    if base is not None:
+        bare = _scaled_modes(bare, np.sqrt(factor))
+    if not isinstance(damping, ViscousDamping):
+        bare = replace(bare, damping=damping.matrix(bare.omega))
+    return attach(bare, _attachments(surface), kept=n_modes, residual=_residual_flexibility(surface, bare.n_modes))
+
+
+def _residual_flexibility(surface: Plate | Membrane, n_modes: int) -> float:
+    """Flexibility at a point, m/N, of all but so many of the lowest modes of a plate: A / (16 π² D n).
+
+    n modes lie below ω = 4 π n √(D / m) / A, and φ² is 1 / (m A) in their mean (Weyl; Courant & Hilbert, Methods of
+    Mathematical Physics 1 (1953), section VI.4), so that Σ φ² / ω² over all others is that.
+    """
+    if not isinstance(surface, Plate):
+        return 0.0
+    points, weights = surface.domain.quadrature(4)
+    rigidity = float(weights @ surface.bending_stiffness(*points.T) / weights.sum())
+    return float(np.prod(surface.length)) / (16.0 * np.pi**2 * rigidity * n_modes)
+
+
+def _stiffer_all_over(surface: Plate | Membrane) -> tuple[Field | None, float]:
+    """The bending stiffness that a plate's is a multiple of, and the factor, where all of its strain energy is that."""
+    if not isinstance(surface, Plate) or surface.bending_stiffness.multiple_of is None:
+        return None, 1.0
+    supports = [value for edge in surface.edges.values() for value in (edge.translation, edge.rotation)]
+    bends_alone = not any(surface.tension) and all(value in (0.0, HELD) for value in supports)
+    return surface.bending_stiffness.multiple_of if bends_alone else (None, 1.0)
 
 
 def _attachments(structure: object) -> tuple[Attachment, ...]:
@@ -52,7 +86,8 @@ def _attachments(structure: object) -> tuple[Attachment, ...]:
 @lru_cache(maxsize=16)
 def _bare_modes(kind: Any, facts: tuple[tuple[str, Any], ...], n_modes: int) -> Modes:
     """Modes of a plate or membrane without attachments, as many as describe what one does to the lowest `n_modes`."""
-    surface = kind(**{**dict(facts), "edges": dict(dict(facts)["edges"])})
+    given = dict(facts)
+    surface = kind(**{**given, "edges": dict(given["edges"]), "damping": given["damping"] or ModalDamping()})
     in_closed_form = getattr(surface, "is_navier", False)
     modes: Modes = surface.modes((MANY if in_closed_form else FEWER) * n_modes, tolerance=ROUGHLY)
     return modes
@@ -121,7 +156,7 @@ def _stiffened(rig: Rig, surface: Plate | Membrane, factor: float) -> Rig:
     """A plate of `factor` times the bending stiffness; a membrane's stiffness is its tension, which is no property."""
     if isinstance(surface, Membrane):
         return replace(rig, structure=None, modes=_scaled_modes(rig.modes, np.sqrt(factor)))
-    return resolved(rig, replace(surface, bending_stiffness=surface.bending_stiffness.mapped(lambda d: factor * d)))
+    return resolved(rig, replace(surface, bending_stiffness=surface.bending_stiffness.scaled(factor)))
 
 
 def _scaled_modes(modes: Modes, factor: float) -> Modes:

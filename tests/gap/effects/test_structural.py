@@ -1,0 +1,66 @@
+"""Structures as a search alters them: one solution of a plate serves every stiffness and damping of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.structural import modes_of
+from workbench.rig.rig import Rig
+from workbench.structure.damping import ModalDamping
+from workbench.structure.plate import Plate
+from workbench.structure.supports import Edge, PointMass, PointSpring
+
+
+def _plate(**changes) -> Plate:
+    facts = {
+        "length": (1.0, 0.7),
+        "mass_per_area": 2.0,
+        "bending_stiffness": 3.0,
+        "poisson_ratio": 0.3,
+        "edges": {"left": "clamped", "right": "simply supported", "bottom": "simply supported", "top": "clamped"},
+        "damping": ModalDamping(0.01),
+    }
+    return Plate(**{**facts, **changes})
+
+
+def test_a_stiffer_and_more_damped_plate_with_a_mass_is_that_plate_solved_anew(monkeypatch):
+    plate = _plate()
+    rig = Rig(modes_of(plate, 4), (), (), structure=plate)
+    solved = []
+    solve = Plate.modes
+    monkeypatch.setattr(Plate, "modes", lambda self, *args, **how: solved.append(self) or solve(self, *args, **how))
+    for factor, mass in ((1.3, 0.01), (0.8, 0.02)):
+        for name, values in (
+            ("modulus_error", {"factor": factor}),
+            ("modal_damping", {"factor": 2.0}),
+            ("point_mass", {"x": 0.3, "y": 0.45, "mass": mass}),
+        ):
+            rig = kind_named(name).apply(rig, None, values)
+    assert not solved, "a search has no time for another solution"
+    anew = _plate(
+        bending_stiffness=3.0 * 1.3 * 0.8,
+        attachments=[PointMass((0.3, 0.45), 0.03)],
+        damping=ModalDamping(0.04),
+    ).modes(4)
+    np.testing.assert_allclose(rig.modes.omega, anew.omega, rtol=3e-4)
+    np.testing.assert_allclose(rig.modes.zeta, 0.04, rtol=1e-12)
+    at = (0.62, 0.31)
+    np.testing.assert_allclose(rig.modes.phi(at), anew.phi(at), atol=2e-3 * np.abs(anew.phi(at)).max())
+
+
+@pytest.mark.parametrize("other", [{"tension": 40.0}, {"edges": Edge(200.0, 1.0)}], ids=["tension", "elastic edges"])
+def test_what_is_stiff_beside_bending_stays_as_it_is(other):
+    plate = _plate(**other)
+    rig = kind_named("modulus_error").apply(Rig(plate.modes(3), (), (), structure=plate), None, {"factor": 1.5})
+    np.testing.assert_allclose(rig.modes.omega, _plate(**other, bending_stiffness=4.5).modes(3).omega, rtol=1e-4)
+
+
+@pytest.mark.parametrize(("edges", "within"), [("simply supported", 5e-6), ("clamped", 3e-4)])
+def test_what_stands_on_a_plate_feels_the_modes_that_are_left_out(edges, within):
+    plate = _plate(edges=edges)
+    for part in (PointMass((0.52, 0.33), 0.03), PointSpring((0.3, 0.45), 200.0)):
+        there = replace(plate, attachments=(part,))
+        exact = there.modes(8, tolerance=1e-5).omega[:4]
+        np.testing.assert_allclose(modes_of(there, 8).omega[:4], exact, rtol=within)
