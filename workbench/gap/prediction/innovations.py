@@ -1,16 +1,19 @@
 """Predictions one sample ahead: a rig, with all its laws, that every sample of a record sets right."""
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import expm
 
 from workbench.arrays import Floats
 from workbench.gap.prediction.unmodelled_force import driven, force_filter, sampled_model
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.rig.simulate import follow, move, read
+from workbench.rig.simulate import follow, move, read, reading_of
 from workbench.structure.domain import Interval, Where
+from workbench.structure.modes import Modes
 
 LOOSE = 0.01  # of the inputs: random forces that hold a rig beside the records
 
@@ -22,10 +25,12 @@ class Follower:
     Attributes:
         gain: (2, n_modes, n_outputs) of their displacements and velocities.
         whitening: (n_outputs, n_outputs) to errors of unit covariance.
+        sensors: that it is made for.
     """
 
     gain: np.ndarray
     whitening: np.ndarray
+    sensors: tuple[Sensor, ...]
 
     @classmethod
     def of(
@@ -52,7 +57,8 @@ class Follower:
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
         found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), patterns, variances, 0.0)
         gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
-        return cls(gain.reshape(2, n, -1).copy(), np.linalg.inv(np.linalg.cholesky(found.innovation)))
+        whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))
+        return cls(gain.reshape(2, n, -1).copy(), whitening, rig.sensors)
 
     def errors(self, rig: Rig, record: Record, substeps: int) -> np.ndarray:
         """Errors (n_outputs, n_samples) of a rig whose predictions are stepped through time, of unit covariance.
@@ -70,7 +76,7 @@ class Follower:
         """
         errors = self._followed(rig, record, substeps)
         model = sampled_model(rig.modes, rig.sensors, np.ones(len(rig.sensors)), record.sample_time)
-        gain = self._gain_for(rig.modes.n_modes).reshape(-1, errors.shape[0])
+        gain = self._gain_for(rig, record.sample_time).reshape(-1, errors.shape[0])
         # every correction goes on to be a motion
         return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]
 
@@ -81,7 +87,7 @@ class Follower:
         if quick is not slow:
             motion = move(rig, record.inputs, sample_time=dt, substeps=substeps, input_hold=record.input_hold)
             measured = measured + read(quick, motion, sample_time=dt) - read(slow, motion, sample_time=dt)
-        gain = self._gain_for(rig.modes.n_modes)
+        gain = self._gain_for(rig, dt)
         hold = record.input_hold
         return follow(quick, record.inputs, measured, gain, sample_time=dt, substeps=substeps, input_hold=hold)
 
@@ -96,18 +102,49 @@ class Follower:
         """
         sensors = tuple(Sensor(s.name, s.at, s.quantity, gain=s.gain, direction=s.direction) for s in rig.sensors)
         bare = replace(rig, actuators=(), elements=(), sensors=sensors)
-        gain, no_inputs = self._gain_for(rig.modes.n_modes), np.zeros((0, left.shape[1]))
+        gain, no_inputs = self._gain_for(rig, sample_time), np.zeros((0, left.shape[1]))
         substeps = 1 if rig.modes.proportional else substeps
         errors = follow(bare, no_inputs, left, gain, sample_time=sample_time, substeps=substeps)
         white: Floats = self.whitening @ errors
         return white
 
-    def _gain_for(self, n_modes: int) -> np.ndarray:
-        """The gain with none for modes that are more than it knows of."""
-        gain = np.zeros((2, n_modes, self.whitening.shape[0]))
-        known = min(n_modes, self.gain.shape[1])
+    def _gain_for(self, rig: Rig, sample_time: float) -> np.ndarray:
+        """The gain, with none for modes that are more than it knows of.
+
+        A sensor that stands elsewhere may make the correction of a rig run away: then it corrects none.
+        """
+        gain = np.zeros((2, rig.modes.n_modes, self.whitening.shape[0]))
+        known = min(rig.modes.n_modes, self.gain.shape[1])
         gain[:, :known] = self.gain[:, :known]
+        moved = [j for j, each in enumerate(zip(rig.sensors, self.sensors, strict=True)) if not _alike(*each)]
+        if moved and _runs_away(rig, gain, sample_time):
+            gain[:, :, moved] = 0.0
+            if _runs_away(rig, gain, sample_time):
+                gain[:] = 0.0
         return gain
+
+
+def _alike(one: Sensor, other: Sensor) -> bool:
+    """Whether two sensors measure the same quantity at the same place."""
+    return (one.at, one.quantity, one.direction) == (other.at, other.quantity, other.direction)
+
+
+def _runs_away(rig: Rig, gain: Floats, sample_time: float) -> bool:
+    """Whether the modes grow when every sample corrects them: an eigenvalue of (I - K C) A is beyond 1."""
+    step = _step_of(rig.modes, sample_time)
+    rows, orders = reading_of(rig)
+    n = rig.modes.n_modes
+    derivatives = np.vstack([np.eye(2 * n), rig.modes.state_matrix[n:]]).reshape(3, n, 2 * n)
+    output = np.einsum("jr,jrs->js", rows, derivatives[orders])
+    corrected = step - gain.reshape(2 * n, -1) @ (output @ step)
+    return bool(np.abs(np.linalg.eigvals(corrected)).max() > 1.0)
+
+
+@lru_cache(maxsize=4)
+def _step_of(modes: Modes, sample_time: float) -> Floats:
+    """The free motion of modes over a sample, (2 n_modes, 2 n_modes)."""
+    step: Floats = expm(modes.state_matrix * sample_time)
+    return step
 
 
 def _unrounded(rig: Rig) -> Rig:
