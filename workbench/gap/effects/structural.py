@@ -54,20 +54,21 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
         bare = _scaled_modes(bare, np.sqrt(factor))
     if not isinstance(damping, ViscousDamping):
         bare = replace(bare, damping=damping.matrix(bare.omega))
-    return attach(bare, _attachments(surface), kept=n_modes, residual=_residual_flexibility(surface, bare.n_modes))
+    residual = _residual_flexibility(surface, float(bare.omega[-1]))
+    return attach(bare, _attachments(surface), kept=n_modes, residual=residual)
 
 
-def _residual_flexibility(surface: Plate | Membrane, n_modes: int) -> float:
-    """Flexibility at a point, m/N, of all but so many of the lowest modes of a plate: A / (16 π² D n).
+def _residual_flexibility(surface: Plate | Membrane, omega: float) -> float:
+    """Flexibility at a point, m/N, of all modes of a plate above a frequency, rad/s: 1 / (4 π √(m D) ω).
 
-    n modes lie below ω = 4 π n √(D / m) / A, and φ² is 1 / (m A) in their mean (Weyl; Courant & Hilbert, Methods of
-    Mathematical Physics 1 (1953), section VI.4), so that Σ φ² / ω² over all others is that.
+    Below ω the mean of Σ φ_r² away from the edges is ω / (4 π √(m D)), whatever these are (the local law of Weyl;
+    Courant & Hilbert, Methods of Mathematical Physics 1 (1953), section VI.4), so that Σ φ_r² / ω_r² above it is that.
     """
     if not isinstance(surface, Plate):
         return 0.0
     points, weights = surface.domain.quadrature(4)
-    rigidity = float(weights @ surface.bending_stiffness(*points.T) / weights.sum())
-    return float(np.prod(surface.length)) / (16.0 * np.pi**2 * rigidity * n_modes)
+    impedance = np.sqrt(surface.mass_per_area(*points.T) * surface.bending_stiffness(*points.T))
+    return float(weights.sum() / (4.0 * np.pi * (weights @ impedance) * omega))
 
 
 def _stiffer_all_over(surface: Plate | Membrane) -> tuple[Field | None, float]:
