@@ -8,8 +8,7 @@ from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_measured, read_record
 from workbench.records.record import Channel, Record
 from workbench.records.resample import decimate
-from workbench.records.transfer import impulse_record
-from workbench.records.transfer_file import read_transfer
+from workbench.records.transfer_file import impulse_record, read_transfer
 
 
 def test_transfer_function_of_an_oscillator_is_its_impulse_response():

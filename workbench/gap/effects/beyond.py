@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
-from workbench.gap.effects.evidence import Evidence
+from workbench.gap.effects.effect import Effect, Evidence, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import CUBIC_SPRING, QUADRATIC_DAMPER, strength_along, with_element
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring

@@ -1,14 +1,16 @@
 """An effect: a change of rig, with parameters."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, Protocol
 from weakref import WeakValueDictionary
 
 import numpy as np
 
-from workbench.gap.effects.evidence import Evidence
+from workbench.arrays import Floats
+from workbench.records.record import Record
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, NamedPoints, Rectangle, Where
 
 ALL = "all"
@@ -83,6 +85,54 @@ def place_values(where: Where) -> dict[str, Any]:
     if isinstance(where, tuple) and not isinstance(where, Between):
         return {"x": float(where[0]), "y": float(where[1])}
     return {"at": where}
+
+
+class Moved(Protocol):
+    """The unmodelled force (N) at a place and the motion there, each (n_total,), the records joined end to end."""
+
+    @property
+    def at(self) -> Where: ...
+    @property
+    def force(self) -> Floats: ...
+    @property
+    def displacement(self) -> Floats: ...
+    @property
+    def velocity(self) -> Floats: ...
+    @property
+    def acceleration(self) -> Floats: ...
+
+
+class Measured(Protocol):
+    """The fit records, whole and without the samples at their start (`lead`) that are not counted."""
+
+    @property
+    def records(self) -> tuple[Record, ...]: ...
+    @property
+    def counted(self) -> tuple[Record, ...]: ...
+    @property
+    def lead(self) -> int: ...
+
+
+class Evidence(Protocol):
+    """What a kind of effect may look at to say where a fit starts: rig, records, motion and residuals.
+
+    `workbench.gap.localisation.evidence` computes it all.
+    """
+
+    @property
+    def rig(self) -> Rig: ...
+    @property
+    def data(self) -> Measured: ...
+    @property
+    def motions(self) -> tuple[Motion, ...]: ...
+    @property
+    def residuals(self) -> tuple[Floats, ...]: ...
+    @property
+    def domain(self) -> Domain: ...
+    @property
+    def at_peaks(self) -> Sequence[Moved]: ...
+    @property
+    def places_to_try(self) -> Sequence[Any]: ...
 
 
 @dataclass(frozen=True, eq=False)

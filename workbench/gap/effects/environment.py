@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Kind, Parameter, place_of, place_parameters, place_values
-from workbench.gap.effects.evidence import Evidence
+from workbench.gap.effects.effect import Evidence, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import with_element
 from workbench.identification.signal.periodicity import period_of
 from workbench.records.record import Record

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
-from workbench.gap.effects.evidence import Evidence
+from workbench.gap.effects.effect import Effect, Evidence, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.scales import Scales
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import (

@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import ALL, Effect, Kind, Parameter, place_of, place_parameters, place_values
-from workbench.gap.effects.evidence import Evidence
+from workbench.gap.effects.effect import (
+    ALL,
+    Effect,
+    Evidence,
+    Kind,
+    Parameter,
+    place_of,
+    place_parameters,
+    place_values,
+)
 from workbench.gap.effects.scales import Scales
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig

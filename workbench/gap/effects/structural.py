@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, Kind, Parameter, place_of, place_parameters, place_values
-from workbench.gap.effects.evidence import Evidence, Moved
+from workbench.gap.effects.effect import (
+    Effect,
+    Evidence,
+    Kind,
+    Moved,
+    Parameter,
+    place_of,
+    place_parameters,
+    place_values,
+)
 from workbench.gap.effects.scales import Scales
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping, ViscousDamping
