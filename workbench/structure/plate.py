@@ -168,11 +168,14 @@ class Plate(_Surface):
             tension=tension,
         )
 
-    def modes(self, n_modes: int, *, tolerance: float = 1e-6) -> Modes:
+    def modes(self, n_modes: int, *, tolerance: float = 1e-6, beyond: int = 0) -> Modes:
         """The lowest `n_modes` modes, mass-normalised, their frequencies to `tolerance`, relative.
 
         In closed form where all edges are simply supported and mass, stiffness and tension constant; else by the
         Rayleigh-Ritz method, refined until the frequencies stand (`surface_ritz.solve`).
+
+        Args:
+            beyond: so many further modes at most, as they come with those asked for, to no tolerance.
 
         Raises:
             ValueError: the tolerance cannot be reached, and how far the frequencies are known; buckling.
@@ -181,8 +184,9 @@ class Plate(_Surface):
             raise ValueError(f"at least one mode must be asked for; got {n_modes}")
         heavy = any(isinstance(part, PointMass | PointSpring) for part in self.attachments)
         if self.is_navier and not heavy and not isinstance(self.damping, ViscousDamping):
-            return self._with_dampers(self._closed_form(n_modes))
-        return self._with_dampers(self._solved(solve(self.ritz_problem(), n_modes, tolerance=tolerance)))
+            return self._with_dampers(self._closed_form(n_modes + beyond))
+        found = solve(self.ritz_problem(), n_modes, tolerance=tolerance, beyond=beyond)
+        return self._with_dampers(self._solved(found))
 
     @property
     def is_navier(self) -> bool:

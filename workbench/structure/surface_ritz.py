@@ -27,6 +27,7 @@ from workbench.structure.surface_basis import (
     weights_on,
 )
 
+WORTH = 4  # functions for each further mode that they give well enough
 MOST_FUNCTIONS = 3000  # of the eigenvalue problem: so many take ten seconds
 MOST_STATIC = 5000  # of a static response: a Cholesky factor only
 RIGID = 1e-12  # of the scale of ω²: below it a mode moves as a rigid body
@@ -65,8 +66,11 @@ class SurfaceModes:
         return total
 
 
-def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float) -> SurfaceModes:
+def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: int = 0) -> SurfaceModes:
     """The lowest modes, refined until the frequencies are known to `tolerance`, relative.
+
+    Args:
+        beyond: so many further ones at most, as the functions have them that give those asked for.
 
     Raises:
         ValueError: the tolerance is not reached with `MOST_FUNCTIONS` functions, by how much; buckling.
@@ -85,6 +89,9 @@ def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float) -> Surface
             last, change = change, float(np.abs(found.omega[elastic] / before[elastic] - 1.0).max(initial=0.0))
             error = _remaining(change, last)
             if error <= tolerance:
+                further = min(beyond, axes[0].n * axes[1].n // WORTH - n_modes)
+                if further > 0:
+                    found = _ritz(problem, axes, tuple(s for s in statics if s is not None), n_modes + further)
                 return replace(found, error=error)
         before = found.omega
     if not np.isfinite(error):

@@ -44,10 +44,10 @@ def test_a_stiffer_and_more_damped_plate_with_a_mass_is_that_plate_solved_anew(m
         attachments=[PointMass((0.3, 0.45), 0.03)],
         damping=ModalDamping(0.04),
     ).modes(4)
-    np.testing.assert_allclose(rig.modes.omega, anew.omega, rtol=1e-4)
+    np.testing.assert_allclose(rig.modes.omega, anew.omega, rtol=3e-5)
     np.testing.assert_allclose(rig.modes.zeta, 0.04, rtol=1e-12)
     at = (0.62, 0.31)
-    np.testing.assert_allclose(rig.modes.phi(at), anew.phi(at), atol=2e-3 * np.abs(anew.phi(at)).max())
+    np.testing.assert_allclose(rig.modes.phi(at), anew.phi(at), atol=1e-3 * np.abs(anew.phi(at)).max())
 
 
 @pytest.mark.parametrize("other", [{"tension": 40.0}, {"edges": Edge(200.0, 1.0)}], ids=["tension", "elastic edges"])
@@ -57,7 +57,7 @@ def test_what_is_stiff_beside_bending_stays_as_it_is(other):
     np.testing.assert_allclose(rig.modes.omega, _plate(**other, bending_stiffness=4.5).modes(3).omega, rtol=1e-4)
 
 
-@pytest.mark.parametrize(("edges", "within"), [("simply supported", 1e-6), ("clamped", 1e-4)])
+@pytest.mark.parametrize(("edges", "within"), [("simply supported", 1e-6), ("clamped", 2e-5)])
 def test_what_stands_on_a_plate_feels_the_modes_that_are_left_out(edges, within):
     plate = _plate(edges=edges)
     for part in (PointMass((0.52, 0.33), 0.03), PointSpring((0.3, 0.45), 200.0)):

@@ -29,7 +29,8 @@ from workbench.structure.plate import Membrane, Plate
 from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring
 
 RESOLUTION, ROUGHLY = 1e-6, 1e-4  # of a frequency; of the highest of many
-MANY, FEWER = 60, 6  # modes of a surface for each that is asked for: in closed form, or solved
+MANY = 60  # modes of a plate in closed form, for each that is asked for
+SOLVED, BESIDES = 3, 20  # of others: solved to a tolerance, and further ones that come with them
 EDGE = 1e-9  # of the length
 BESIDE = 0.1  # of the length: farther out a spring does not turn the hinge, it holds the beam
 
@@ -97,9 +98,11 @@ def _bare_modes(kind: Any, facts: tuple[tuple[str, Any], ...], n_modes: int) -> 
     """Modes of a plate or membrane without attachments, as many as describe what one does to the lowest `n_modes`."""
     given = dict(facts)
     surface = kind(**{**given, "edges": dict(given["edges"]), "damping": given["damping"] or ModalDamping()})
-    in_closed_form = getattr(surface, "is_navier", False)
-    modes: Modes = surface.modes((MANY if in_closed_form else FEWER) * n_modes, tolerance=ROUGHLY)
-    return modes
+    if not isinstance(surface, Plate):  # which carries nothing
+        return surface.modes(n_modes, tolerance=RESOLUTION)  # type: ignore[no-any-return]
+    if surface.is_navier:
+        return surface.modes(MANY * n_modes)
+    return surface.modes(SOLVED * n_modes, tolerance=ROUGHLY, beyond=BESIDES * n_modes)
 
 
 def solved_once(change: Callable[[Rig, Any, dict[str, float]], Rig]) -> Callable[[Rig, Any, dict[str, float]], Rig]:
