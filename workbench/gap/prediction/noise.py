@@ -1,17 +1,12 @@
 """The noise of each sensor, found from what a fitted model leaves of several records."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from workbench.arrays import Floats
-from workbench.gap.prediction.residuals import FitData
-from workbench.rig.rig import Rig
-from workbench.rig.simulate import predict
 
-MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
 REACH, QUIET = 5, 0.25  # bands to either side, and their quantile: modes leave a quarter of them free of peaks
 LOWER = 0.67  # deviations by which that quantile lies below the mean
@@ -37,44 +32,6 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
     power: Floats = np.where(alike | (under > LOUD * whole[0]), noise, under)
     return np.sqrt(power)
-
-
-def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
-    """Mean square (n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors' noise.
-
-    For white noise of each input, as strong as the input itself; inputs at rest have none. The structure smooths it,
-    so one draw of a record's length gives its power to a few per cent.
-
-    Args:
-        rig: nominal.
-        data: fit records.
-    """
-    rng = np.random.default_rng(0)
-    rows = []
-    for record in data.counted:
-        rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
-        noise = rms * rng.standard_normal(record.inputs.shape)
-        response = predict(replace(rig, elements=()), replace(record, inputs=noise))
-        rows.append((response**2).mean(axis=1) / data.noise**2)
-    return np.array(rows)
-
-
-def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np.ndarray) -> float:
-    """Noise of the logged inputs as a share of their rms.
-
-    It accounts for the median of what is left beyond what the record with the weakest inputs leaves.
-
-    Args:
-        by_channel: (n_records, n_outputs) mean squares of what is left, in units of the stated noise.
-        sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
-        per_unit: of `logging_noise_power`.
-    """
-    rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
-    beyond, per = by_channel - sensor_noise, per_unit
-    if rows.any():  # the record with the weakest inputs shows the noise of the sensors itself
-        beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
-    share = np.median(np.maximum(beyond, 0.0) / np.maximum(per, 1e-300))
-    return float(min(np.sqrt(share), MOST_LOGGED))
 
 
 def _under_peaks(residual: Floats) -> Floats:

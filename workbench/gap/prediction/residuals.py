@@ -1,6 +1,7 @@
 """The fit records as a yardstick: how far a rig's prediction stands from them, in units of the noise."""
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from threading import Lock
@@ -28,21 +29,24 @@ class FitData:
         substeps: of a sample, for rigs that are not linear.
         lead: samples at the start of each record that are simulated but not counted, while the rig settles from the
             rest that the simulation assumes to the motion it really had.
-        whitener: filter of a random force on the structure, through which every residual is seen; None where there is
-            none. With a follower, laws then act on the motion that was measured: that of the rig has no such force.
+        whiteners: filter of random forces on the structure, by record, through which its residual is seen; none where
+            there are none. With a follower, laws then act on the motion that was measured: that of the rig has no such
+            force.
         given_way: (n_values, k) orthonormal directions and (k,) shares by which residuals give way along them, for
             uncertain parameters that are re-estimated with every candidate to first order; None where none are.
         follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
             they are of the whole record.
+        heat: mean square of a residual that counts as noise, for now.
     """
 
     records: tuple[Record, ...]
     noise: np.ndarray
     substeps: int = 4
     lead: int = 0
-    whitener: ForceFilter | None = None
+    whiteners: Mapping[str, ForceFilter] = field(default_factory=dict)
     given_way: tuple[np.ndarray, np.ndarray] | None = None
     follower: Follower | None = None
+    heat: float = 1.0
     _memory: OrderedDict[Any, tuple[Modes, tuple[Motion, ...]]] = field(
         default_factory=OrderedDict, repr=False, init=False
     )
@@ -70,9 +74,17 @@ class FitData:
         """The same yardstick with other standard deviations of the sensors' noise (n_outputs,)."""
         return replace(self, noise=noise)
 
+    def tempered(self, heat: float) -> "FitData":
+        """The same yardstick with that mean square as noise."""
+        return replace(self, heat=heat)
+
     def through(self, whitener: ForceFilter, follower: Follower) -> "FitData":
         """The same yardstick beside a random force."""
-        return replace(self, whitener=whitener, follower=follower)
+        return replace(self, whiteners={record.name: whitener for record in self.records}, follower=follower)
+
+    def beside_inputs(self, whiteners: Mapping[str, ForceFilter]) -> "FitData":
+        """The same yardstick beside noise of the logged inputs."""
+        return replace(self, whiteners=whiteners)
 
     def giving_way(self, sensitivity: np.ndarray) -> "FitData":
         """The same measure with residuals as small as uncertain parameters make them, to first order.
@@ -91,10 +103,10 @@ class FitData:
         Args:
             loose: random forces on it, as a share of the inputs: the less, the more it goes its own way.
         """
-        if self.whitener is not None:  # its innovations are errors one sample ahead as they are
+        if self.follower is not None:  # innovations beside a random force are errors one sample ahead as they are
             return replace(self, given_way=None)
         follower = Follower.of(rig, self.noise, self.force_rms, self.records[0].sample_time, loose=loose)
-        return replace(self, follower=follower, given_way=None)
+        return replace(self, follower=follower, whiteners={}, given_way=None)
 
     @cached_property
     def force_rms(self) -> float:
@@ -145,12 +157,13 @@ class FitData:
         if self.given_way is not None:
             directions, shares = self.given_way
             residual -= directions @ (shares * (directions.T @ residual))
-        return residual
+        return residual if self.heat == 1.0 else residual / np.sqrt(self.heat)
 
     def _left(self, rig: Rig) -> np.ndarray:
         follower = self.follower
-        if self.whitener is not None:
-            return np.concatenate([whiten(self.whitener, r).ravel() for r in self.left_beside(rig, follower)])
+        if self.whiteners:
+            each = zip(self.records, self.left_beside(rig, follower), strict=True)
+            return np.concatenate([whiten(self.whiteners[record.name], left).ravel() for record, left in each])
         if follower is None:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
         if is_stepped(rig) or steps_exactly(rig):

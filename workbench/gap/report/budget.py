@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import group_of
-from workbench.gap.prediction.noise import logging_noise_power
+from workbench.gap.prediction.logged_inputs import logging_noise_power
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig

@@ -12,7 +12,8 @@ from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
-from workbench.gap.prediction.noise import logging_noise, noise_found
+from workbench.gap.prediction.logged_inputs import logging_noise
+from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -194,18 +195,19 @@ def attribute(
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
-    outcome, best, random, rivals, noise = decision
+    outcome, best, random, rivals, noise, beside_inputs = decision
+    within = beside_inputs or search
     best = common_as_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
-        best = widened(search, best)
+        best = widened(within, best)
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
     beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
     if beside is not None:
-        best = _beside_identified(search, best, beside, seen)
+        best = _beside_identified(within, best, beside, seen)
     if random is None:
-        best = with_intervals(search.rig, best, search.data, workers, wide=beside is not None)
+        best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None)
         best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
         if outcome == "explained":
             standing = tuple(e for e in best.effects if e in seen or e.stands_out(search.rig))
@@ -225,7 +227,7 @@ def attribute(
         evidence=found.nominal,
         search=search,
         noise=noise,
-        logged=_logged(search, best, noise) if random is None else 0.0,
+        logged=within.logged or (_logged(search, best, noise) if random is None else 0.0),
     )
 
 

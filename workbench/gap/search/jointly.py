@@ -8,7 +8,8 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
-from workbench.gap.prediction.noise import logging_noise, noise_found
+from workbench.gap.prediction.logged_inputs import logging_noise
+from workbench.gap.prediction.noise import noise_found
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.search import Search
@@ -157,7 +158,7 @@ def fit_jointly(
         if level > (1.0 - (SETTINGS.last_settled if to_the_end else SETTINGS.settled)) * before:
             break
         before = level if known is not None or not quickly else np.inf
-        tempered = data.with_noise(data.noise * np.sqrt(level))
+        tempered = data.tempered(level)
         found = fit(
             search.rig,
             (*effects, errors),
@@ -170,10 +171,20 @@ def fit_jointly(
         )
         *effects, errors = found.effects
         errors = _resized(errors)
-    residuals = whole.differences(apply_all(search.rig, (*effects, errors)))
+    return measured(search, replace(found, effects=(*effects, errors if to_the_end else _closed(errors))), substeps)
+
+
+def measured(search: Search, found: Fit, substeps: int = 4) -> Step:
+    """Effects and errors, the errors last, as they leave the records of a search."""
+    whole, rig = search.data.stepped(substeps), apply_all(search.rig, found.effects)
+    if search.logged:
+        by_channel = whole.by_channel(whole.residual(rig))
+        of_noise = np.ones_like(by_channel)
+        step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
+        return Step(step, of_noise[0], search.logged, of_noise)
+    residuals = whole.differences(rig)
     by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
-    errors = errors if to_the_end else _closed(errors)
-    step = replace(found, effects=(*effects, errors), cost=float(by_channel.mean()), cost_by_channel=by_channel)
+    step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     sensor_noise = np.minimum(noise_found(residuals) / whole.noise, SETTINGS.credible) ** 2
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)

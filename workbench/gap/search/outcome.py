@@ -6,16 +6,22 @@ import numpy as np
 
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.search.fit import Fit
+from workbench.gap.search.search import Search
 
 
 class Decision(NamedTuple):
-    """What is claimed; see `Attribution` for its parts."""
+    """What is claimed; see `Attribution` for its parts.
+
+    Attributes:
+        beside: the search that it was found in, where that was beside noise of the logged inputs.
+    """
 
     outcome: str
     best: Fit
     random: RandomForceFit | None = None
     rivals: tuple[tuple[Fit, float], ...] = ()
     noise: np.ndarray | None = None
+    beside: Search | None = None
 
 
 def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) -> Decision:

@@ -129,7 +129,7 @@ def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
         iterations: on whole records, at most.
     """
     rig = apply_all(search.rig, effects)
-    if is_stepped(rig) and not search.held and search.data.whitener is None:
+    if is_stepped(rig) and not search.held and search.data.follower is None:
         for loose in LETTING_GO:
             data = search.data.following(rig, loose).stepped(FINE)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)

@@ -12,7 +12,7 @@ from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Follower
-from workbench.gap.prediction.noise import logging_noise_power
+from workbench.gap.prediction.logged_inputs import input_filters, logging_noise_power
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
@@ -47,6 +47,7 @@ class Search:
         workers: processes that share the work.
         nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
         held: effects that every candidate stands beside, as they are.
+        logged: noise of the logged inputs, as a share of their rms, beside which residuals are seen.
     """
 
     rig: Rig
@@ -58,6 +59,7 @@ class Search:
     workers: Workers
     nominal: np.ndarray
     held: tuple[Effect, ...] = ()
+    logged: float = 0.0
 
     def explains(self, candidate: Fit) -> bool:
         """Whether what is left is noise, in every record, up to the error of integration.
@@ -115,6 +117,18 @@ class Search:
         """The same search beside a random force."""
         data, quick, first = (data.through(whitener, follower) for data in (self.data, self.quick, self.first))
         return replace(self, data=data, quick=quick, first=first)
+
+    def beside_inputs(self, rig: Rig, share: float) -> "Search":
+        """The same search beside noise of the logged inputs.
+
+        Args:
+            rig: whose modes answer to it.
+            share: of the inputs' rms.
+        """
+        filters = input_filters(rig, self.data, share)
+        data, quick, first = (d.beside_inputs(filters) for d in (self.data, self.quick, self.first))
+        nominal = data.by_channel(data.residual(self.rig))
+        return replace(self, data=data, quick=quick, first=first, nominal=nominal, logged=share)
 
     def evidence_of(self, rig: Rig) -> Evidence:
         """What the records say of an unmodelled force beside what a rig has."""

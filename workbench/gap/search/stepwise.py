@@ -11,13 +11,14 @@ from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import SETTINGS as JOINTLY
-from workbench.gap.search.jointly import Step, fit_jointly, on_their_sides, opened
+from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.plain import COMMON, MOST_COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import one_more
-from workbench.gap.search.search import Search, most_telling, spread_over_kinds
+from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
 
@@ -48,6 +49,9 @@ class StepwiseSettings:
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         excluded: probability below which another set that explains the records is no rival.
         astray: share of the nominal gap's power from which on errors may be fitted out of step.
+        surely_late: of a sample: an accelerometer that is later stays on that side of the jumps when an effect is added;
+            what a gap shows of the others may be the gap.
+        inputs: mean square, white, that a set may leave beside noise of the logged inputs for that to be searched on.
     """
 
     shorter: float = 30.0
@@ -69,6 +73,8 @@ class StepwiseSettings:
     no_gap: float = 0.15
     excluded: float = 1e-3
     astray: float = 0.02
+    surely_late: float = 0.05
+    inputs: float = 2.0
 
 
 SETTINGS = StepwiseSettings()
@@ -84,6 +90,7 @@ class Stepwise:
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
         is_beyond: whether effects crowd about one place, as they do where a law is beyond the catalogue.
+        is_tried: whether an effect has been tried beside noise of the logged inputs, which may stand for it.
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
@@ -91,6 +98,8 @@ class Stepwise:
         self.singles = [f for f in likeliest if f.effects[0].kind not in COMMON][: SETTINGS.singles]
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
+        self.at_first = self.search
+        self.is_tried = False
         self.plain: Fit | None = None
         self.is_beyond = False
         search.report("small errors of the nominal model", 0.4)
@@ -104,6 +113,7 @@ class Stepwise:
         again = on_their_sides(search, opened(search, self.last.errors))
         if again.target.late != self.last.errors.target.late:  # what errors had hidden at first
             self.steps = [fit_jointly(search, (), again)]
+        self._hear_inputs(self.last)
 
     @property
     def last(self) -> Step:
@@ -120,6 +130,8 @@ class Stepwise:
         if not self._alone:
             return False
         best = self._alone[0]
+        if not self.explains(best):
+            best = self._hear_inputs(best) or best
         left = best.excess(best.noise_power)
         if not self.explains(best) and left > SETTINGS.further * float(self.search.nominal.mean()):
             return False
@@ -127,6 +139,7 @@ class Stepwise:
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
         self.steps.append(best)
+        self._hear_inputs(best)
         return True
 
     def run(self) -> None:
@@ -136,7 +149,9 @@ class Stepwise:
             step = self._with_one_more(before)
             if step is None:
                 break
-            self.steps += [step, self._without_needless(step)]
+            self.steps.append(step)
+            self._hear_inputs(step)
+            self.steps.append(self._without_needless(self.last))
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
                 break
         self.plain = self._without_errors(self.last)
@@ -150,7 +165,29 @@ class Stepwise:
     def is_enough(self) -> bool:
         """Whether the last set leaves nothing that is worth another effect."""
         left = self.explains(self.last) or (self.last.effects and self.unexplained < SETTINGS.further)
-        return bool(left and self.last.is_plausible)
+        return bool(left and self.last.is_plausible and (self.is_tried or not self.search.logged))
+
+    def _hear_inputs(self, step: Step) -> Step | None:
+        """The step beside noise of the logged inputs, where that makes what it leaves all but white; None elsewhere.
+
+        The search goes on beside that noise, as loud as what this step leaves shows it, and so do the steps before.
+        """
+        search = self.at_first
+        plain = measured(search, step.fit)
+        if plain.logged < LEAST_LOGGED or self.explains(plain):
+            return None
+        rig = apply_all(search.rig, step.fit.effects)
+        found = search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
+        # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
+        heard = [likeliest_share(rig, s.data, search.data.differences(rig)) for s in (search, found)]
+        (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
+        beside = louder.beside_inputs(rig, share)
+        if share < LEAST_LOGGED or measured(beside, step.fit).fit.cost > SETTINGS.inputs:
+            return None
+        self.search, self.is_tried = beside, False
+        fitted = fit_jointly(beside, step.effects, step.errors)
+        self.steps = [fitted if s is step else replace(measured(beside, s.fit), others=s.others) for s in self.steps]
+        return fitted
 
     def explains(self, step: Step) -> bool:
         """Whether next to nothing is left but noise of the sensors."""
@@ -184,14 +221,15 @@ class Stepwise:
         """What the effects of the last set explain."""
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
+        beside = self.search if self.search.logged else None
         if self.plain is not None:
-            return Decision("explained", self.plain, noise=noise)
+            return Decision("explained", self.plain, noise=noise, beside=beside)
         closed = self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)
         if effects and closed and not self.is_beyond:
-            return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise)
+            return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
         if self.is_nothing:
-            return Decision("none", self.last.fit, noise=noise)
-        return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise)
+            return Decision("none", self.last.fit, noise=noise, beside=beside)
+        return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
 
     def _rivals(self) -> tuple[tuple[Fit, float], ...]:
         """Other sets that leave only noise too, with their probabilities by description length."""
@@ -208,6 +246,7 @@ class Stepwise:
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
+        self.is_tried = True
         quick, first = most_telling(self.search.data, step.fit.cost_by_channel)
         self.search = search = replace(self.search, quick=quick, first=first)
         search.report("another effect beside small errors of the model", 0.5 + 0.1 * len(step.effects))
@@ -266,6 +305,8 @@ class Stepwise:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
         if not self._matters(best):
             return False
+        if self.search.logged and self._is_likelier(best, step):
+            return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
         trifle = bool(step.effects) and before - after < SETTINGS.least * self._gap
@@ -274,6 +315,12 @@ class Stepwise:
             return True
         saved = step.description(noise, of_errors_alone=trifle) - best.description(noise, of_errors_alone=trifle)
         return not step.is_plausible and saved > SETTINGS.shorter
+
+    def _is_likelier(self, best: Step, step: Step) -> bool:
+        """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
+        more = max(best.fit.n_parameters - step.fit.n_parameters, 1)
+        gain = float(np.log(step.fit.cost / best.fit.cost))
+        return gain > WORTHWHILE and self.search.tells_apart(best.fit.cost, step.fit.cost, more)
 
     def _matters(self, step: Step) -> bool:
         """Whether each effect of a set alters what the sensors read by more than the tolerance, in some record."""
@@ -310,8 +357,13 @@ class Stepwise:
         Where frequencies are far off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        late = self.last.errors.target.late if self.steps else ()
-        known = {name: self.last.errors.values[name] for name in (f"delay_{sensor}" for sensor in late)}
+        delays = (
+            {name: self.last.errors.values[f"delay_{name}"] for name in self.last.errors.target.late}
+            if self.steps
+            else {}
+        )
+        late = tuple(name for name, delay in delays.items() if delay > SETTINGS.surely_late)
+        known = {f"delay_{name}": delays[name] for name in late}
         none = on_their_sides(search, nominal_errors(search.rig, replace(search.prior, late=late), known), effects)
         found = fit_jointly(search, effects, none)
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):

@@ -1,0 +1,107 @@
+"""Noise of the logged inputs: what it leaves, how loud it is, and the filter that makes it white."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from workbench.arrays import Floats
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import ForceFilter, force_filter, log_likelihood, sampled_model
+from workbench.records.record import Record
+from workbench.rig.rig import Rig, shape_of
+from workbench.rig.simulate import predict
+
+MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
+LEAST_LOGGED = 1e-3  # likewise: less is told from none by no record
+SHARES = tuple(MOST_LOGGED * 0.5**k for k in range(5))  # that are tried; between them the likeliest is interpolated
+QUIETEST = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
+
+
+def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
+    """Mean square (n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors' noise.
+
+    For white noise of each input, as strong as the input itself; inputs at rest have none. The structure smooths it,
+    so one draw of a record's length gives its power to a few per cent.
+
+    Args:
+        rig: nominal.
+        data: fit records.
+    """
+    rng = np.random.default_rng(0)
+    rows = []
+    for record in data.counted:
+        rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
+        noise = rms * rng.standard_normal(record.inputs.shape)
+        response = predict(replace(rig, elements=()), replace(record, inputs=noise))
+        rows.append((response**2).mean(axis=1) / data.noise**2)
+    return np.array(rows)
+
+
+def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np.ndarray) -> float:
+    """Noise of the logged inputs as a share of their rms.
+
+    It accounts for the median of what is left beyond what the record with the weakest inputs leaves.
+
+    Args:
+        by_channel: (n_records, n_outputs) mean squares of what is left, in units of the stated noise.
+        sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
+        per_unit: of `logging_noise_power`.
+    """
+    rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
+    beyond, per = by_channel - sensor_noise, per_unit
+    if rows.any():  # the record with the weakest inputs shows the noise of the sensors itself
+        beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
+    share = np.median(np.maximum(beyond, 0.0) / np.maximum(per, 1e-300))
+    return float(min(np.sqrt(share), MOST_LOGGED))
+
+
+def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilter]:
+    """Filters, by record, that make white what noise of the logged inputs and of the sensors leaves.
+
+    The noise is white at every input that is not at rest, a share of its rms; the structure answers linearly.
+
+    Args:
+        rig: with the modes that answer; its laws and what its actuators lose on the way are left out.
+        data: records, with the noise of the sensors.
+        share: of the inputs' rms.
+    """
+    model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
+    patterns = np.column_stack([a.gain * shape_of(rig.modes, a) for a in rig.actuators])
+    return {r.name: force_filter(model, patterns, _variances(r, share), 0.0) for r in data.records}
+
+
+def _variances(record: Record, share: float) -> Floats:
+    power: Floats = share**2 * (record.inputs**2).mean(axis=1)
+    return np.maximum(power, max(QUIETEST * power.max(), 1e-300))
+
+
+class Heard(NamedTuple):
+    """Noise of the logged inputs, as a share of their rms, and minus the log-likelihood of what is left beside it."""
+
+    share: float
+    loss: float
+
+
+def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) -> Heard:
+    """Noise of the logged inputs by maximum likelihood of what is left.
+
+    Args:
+        rig: whose modes answer to it.
+        data: records, with the noise of the sensors.
+        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+    """
+
+    def loss(share: float) -> float:
+        filters = input_filters(rig, data, share)
+        each = zip(data.records, residuals, strict=True)
+        return -sum(log_likelihood(filters[record.name], [left]) for record, left in each)
+
+    losses = np.array([loss(share) for share in SHARES])
+    best = int(np.argmin(losses))
+    if best in (0, len(SHARES) - 1):
+        return Heard(SHARES[best], float(losses[best]))
+    before, at, after = losses[best - 1 : best + 2]
+    turn = 0.5 * (before - after) / (before - 2.0 * at + after)
+    return Heard(float(SHARES[best] * 0.5**turn), float(at))
