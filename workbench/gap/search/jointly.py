@@ -28,7 +28,9 @@ class JointSettings:
         decisive: description length, nats, of a factor e in the power that is left above the noise.
         last_waves: cosines of a variation in the last fit, so that intervals allow for what fewer cannot follow.
         narrowest: smallest, as a share of the widest: what is learnt to be none stays differentiable.
-        rounds: of learning the sizes, at most.
+        rounds, most_rounds: of learning the sizes, at most; those that a fall of the cost went before do not count as
+            such, but are not without end.
+        falling: share of what was left that a round leaves where the cost falls.
         settled, last_settled: share of what is left that a round must have taken away for another; in the last fit.
         iterations, tolerance: of the fit in each round.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
@@ -55,6 +57,8 @@ class JointSettings:
     last_waves: int = 13
     narrowest: float = 1e-3
     rounds: int = 4
+    most_rounds: int = 12
+    falling: float = 0.3
     settled: float = 0.02
     last_settled: float = 1e-3
     iterations: int = 4
@@ -149,7 +153,8 @@ def fit_jointly(
     if known is None:
         errors = opened(search, errors)
     whole, before = search.data.stepped(substeps), np.inf
-    for i in range(rounds):
+    i = counted = 0
+    while counted < rounds and i < SETTINGS.most_rounds:
         # the two most telling records lead the way
         quickly = known is not None or (i == 0 and not to_the_end)
         data = search.quick.stepped(substeps) if quickly else whole
@@ -157,7 +162,9 @@ def fit_jointly(
         level = max(float(left @ left) / left.size, 1.0)
         if level > (1.0 - (SETTINGS.last_settled if to_the_end else SETTINGS.settled)) * before:
             break
+        counted += level > SETTINGS.falling * before or not np.isfinite(before)
         before = level if known is not None or not quickly else np.inf
+        i += 1
         tempered = data.tempered(level)
         found = fit(
             search.rig,

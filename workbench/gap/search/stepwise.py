@@ -48,10 +48,11 @@ class StepwiseSettings:
         in_part: likewise, for effects that are named although something else is there.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         excluded: probability below which another set that explains the records is no rival.
-        astray: share of the nominal gap's power from which on errors may be fitted out of step.
-        surely_late: of a sample: an accelerometer that is later stays on that side of the jumps when an effect is added;
-            what a gap shows of the others may be the gap.
+        astray: share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray.
+        surely_late: of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added;
+            what was seen of the others may have been the gap.
         inputs: mean square, white, that a set may leave beside noise of the logged inputs for that to be searched on.
+        too_white: likewise, for less of which that noise was not what was left.
     """
 
     shorter: float = 30.0
@@ -75,6 +76,7 @@ class StepwiseSettings:
     astray: float = 0.02
     surely_late: float = 0.05
     inputs: float = 2.0
+    too_white: float = 0.8
 
 
 SETTINGS = StepwiseSettings()
@@ -184,8 +186,10 @@ class Stepwise:
         beside = louder.beside_inputs(rig, share)
         if share < LEAST_LOGGED or measured(beside, step.fit).fit.cost > SETTINGS.inputs:
             return None
-        self.search, self.is_tried = beside, False
         fitted = fit_jointly(beside, step.effects, step.errors)
+        if fitted.fit.cost < SETTINGS.too_white:
+            return None
+        self.search, self.is_tried = beside, False
         self.steps = [fitted if s is step else replace(measured(beside, s.fit), others=s.others) for s in self.steps]
         return fitted
 
@@ -354,22 +358,19 @@ class Stepwise:
     def _afresh(self, effects: tuple[Effect, ...]) -> Step:
         """The effects beside errors that start from none, fitted to all records.
 
-        Where frequencies are far off, motions of whole records run out of step, and the way is told one sample ahead.
+        Where frequencies are off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        delays = (
-            {name: self.last.errors.values[f"delay_{name}"] for name in self.last.errors.target.late}
-            if self.steps
-            else {}
-        )
+        before = self.last.errors if self.steps else nominal_errors(search.rig, search.prior)
+        delays = {name: before.values[f"delay_{name}"] for name in before.target.late}
         late = tuple(name for name, delay in delays.items() if delay > SETTINGS.surely_late)
         known = {f"delay_{name}": delays[name] for name in late}
         none = on_their_sides(search, nominal_errors(search.rig, replace(search.prior, late=late), known), effects)
-        found = fit_jointly(search, effects, none)
+        ahead = fit(search.rig, (*effects, none), search.ahead, iterations=JOINTLY.iterations, chord=True)
+        found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
             return found
-        ahead = fit(search.rig, (*effects, none), search.ahead, iterations=JOINTLY.iterations, chord=True)
-        return min(found, fit_jointly(search, ahead.effects[:-1], ahead.effects[-1]), key=lambda s: s.fit.cost)
+        return min(found, fit_jointly(search, effects, none), key=lambda s: s.fit.cost)
 
     def _whole(self, step: Step) -> Step:
         """The step fitted to all records.
