@@ -57,12 +57,12 @@ def _moved(side: str, key: str) -> Hide:
 
 
 def _swapped(side: str, key: str) -> Hide:
-    """Two actuators or two sensors on each other's wires; a channel keeps its name and its noise."""
+    """Two actuators or two sensors on each other's wires; a channel keeps its name, its noise and its rounding."""
 
     def hide(plant: Plant, e: dict[str, Any]) -> Plant:
         by_name = {port.name: port for port in getattr(plant, side)}
         pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
-        kept = ("name", "noise_std") if side == "sensors" else ("name",)
+        kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
         ports: Any = tuple(
             replace(pair[name], **{field: getattr(port, field) for field in kept}) if name in pair else port
             for name, port in by_name.items()

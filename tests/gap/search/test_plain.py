@@ -54,6 +54,14 @@ def test_stiffness_and_damping_that_are_a_little_off_are_no_effect(search):
     assert in_place_of_errors(one, (), nominal_errors(one.rig, replace(one.prior, delay=0.0))) is None
 
 
+@pytest.mark.parametrize("common", [MODULUS, DAMPING])
+def test_one_of_them_alone_is_an_effect(search, common):
+    one = search((common,))
+    found = in_place_of_errors(one, (), nominal_errors(one.rig, replace(one.prior, delay=0.0)))
+    assert [effect.kind for effect in found.effects] == [common.kind]
+    assert found.effects[0].values["factor"] == pytest.approx(common.values["factor"], rel=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "kinds", "dirt", "size"),

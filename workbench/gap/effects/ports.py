@@ -65,10 +65,10 @@ def _change_sensors(rig: Rig, target: str, **changes: Any) -> Rig:
 
 
 def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
-    """Two actuators or two sensors on each other's wires: a channel keeps its name and its noise."""
+    """Two actuators or two sensors on each other's wires: a channel keeps its name, its noise and its rounding."""
     by_name = {port.name: port for port in getattr(rig, side)}
     elsewhere = {pair[0]: by_name[pair[1]], pair[1]: by_name[pair[0]]}
-    kept = ("name", "noise_std") if side == "sensors" else ("name",)
+    kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
     ports: Any = tuple(
         replace(elsewhere.get(name, port), **{field: getattr(port, field) for field in kept})
         for name, port in by_name.items()

@@ -22,6 +22,7 @@ MOST_ALONE = {"modulus_error": 0.015, "modal_damping": 0.25}  # likewise, where 
 PLAINLY = 8  # iterations without errors
 PUNCTUAL = 0.01  # of a sample: sensors that are late by less are not
 NEAR = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
+NEEDLESS = 6.0  # twice the log-likelihood that one number more may gain by chance
 LIKELIEST = 4  # kinds of the one more that are tried
 
 
@@ -76,14 +77,25 @@ def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effe
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
     late = _late(search, errors)
     if not effects:
-        if _explaining(search, [(*common, *late)]):
-            return None  # errors they are
+        both = _explaining(search, [(*common, *late)])
+        if both is not None:
+            return _one_common(search, common, late, both)
         return _one_more(search, (*common, *late), ())
     sets = [effects, *((*effects, effect) for effect in common), (*effects, *common)]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
     return _explaining(search, [(*s, *late) for s in sets]) or _one_more(search, (*effects, *late), common)
+
+
+def _one_common(search: Search, common: tuple[Effect, ...], late: tuple[Effect, ...], both: Fit) -> Fit | None:
+    """One error common to all as the one effect, where the records do without the other; None where they show both.
+
+    A model that is a little off is so in both.
+    """
+    most = both.cost + NEEDLESS / search.data.n_values
+    alone = [found for one in common if (found := _explaining(search, [(one, *late)])) and found.cost < most]
+    return min(alone, key=lambda f: f.cost, default=None)
 
 
 def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:

@@ -1,0 +1,76 @@
+"""Noise of the logged inputs: how loud it is, and what makes it white."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.linalg import toeplitz
+
+from workbench.gap.prediction.logged_inputs import MOST_LOGGED, input_filters, likeliest_share
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
+from workbench.rig.actuators import Actuator
+from workbench.rig.simulate import simulate
+
+NOISE = 1e-5
+SHARE = 0.005
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(n_modes=3, actuators=(Actuator("F", 0.45), Actuator("G", 1.3)))
+
+
+@pytest.fixture(scope="module")
+def logged(rig, record_of):
+    """Records of two levels whose inputs were logged with noise, the second input at rest in one of them."""
+    rng, records = np.random.default_rng(3), []
+    for name, level, at_rest in (("low", 0.2, True), ("high", 1.0, False)):
+        sent = level * np.repeat(rng.normal(size=(2, 400)), 5, axis=1)
+        sent[1] *= not at_rest
+        record = record_of(rig, sent, rng, name=name)
+        rms = sent.std(axis=1, keepdims=True)
+        records.append(replace(record, inputs=sent + SHARE * rms * rng.normal(size=sent.shape)))
+    return FitData(tuple(records), np.full(4, NOISE))
+
+
+def test_how_loud_it_is(rig, logged):
+    assert likeliest_share(rig, logged, logged.differences(rig)).share == pytest.approx(SHARE, rel=0.05)
+
+
+def test_none_is_told_from_some(rig, record_of):
+    rng = np.random.default_rng(4)
+    quiet = FitData((record_of(rig, rng.normal(size=(2, 1000)), rng, name="quiet"),), np.full(4, NOISE))
+    assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * MOST_LOGGED
+
+
+def test_what_it_leaves_is_white_through_the_filter(rig, logged):
+    filters = input_filters(rig, logged, SHARE)
+    plain = [(r / NOISE) ** 2 for r in logged.differences(rig)]
+    assert np.mean(plain[1]) > 100.0
+    for record, left in zip(logged.records, logged.differences(rig), strict=True):
+        white = whiten(filters[record.name], left)
+        assert np.mean(white**2) == pytest.approx(1.0, abs=0.06)
+        later = np.mean(white[:, 1:] * white[:, :-1], axis=1)
+        assert np.abs(later).max() < 5.0 / np.sqrt(white.shape[1])
+        between = np.cov(white) - np.eye(4)
+        assert np.abs(between).max() < 5.0 / np.sqrt(white.shape[1])
+
+
+def test_the_likelihood_is_that_of_the_whole_covariance(rig, logged):
+    """Beside the Gaussian density with the covariance written out from the impulse responses."""
+    n = 250
+    record = logged.records[1].between(0.0, (n - 1) * 0.01)
+    left = logged.differences(rig)[1][:, :n]
+    covariance = NOISE**2 * np.eye(4 * n)
+    for i, rms in enumerate(np.sqrt((logged.records[1].inputs ** 2).mean(axis=1))):
+        impulse = np.zeros((2, n))
+        impulse[i, 0] = 1.0
+        response = simulate(rig, impulse, sample_time=record.sample_time).outputs
+        rows = np.vstack([toeplitz(row, np.zeros(n)) for row in response])
+        covariance += (SHARE * rms) ** 2 * rows @ rows.T
+    stacked = left.ravel()
+    dense = -0.5 * (stacked @ np.linalg.solve(covariance, stacked) + np.linalg.slogdet(covariance)[1])
+    filters = input_filters(rig, logged, SHARE)
+    # the filter starts from its steady state, the record from rest
+    assert log_likelihood(filters["high"], [left]) == pytest.approx(dense, rel=2e-3)
