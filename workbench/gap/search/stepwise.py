@@ -172,12 +172,13 @@ class Stepwise:
     def _hear_inputs(self, step: Step) -> Step | None:
         """The step beside noise of the logged inputs, where that makes what it leaves all but white; None elsewhere.
 
-        The search goes on beside that noise, as loud as what this step leaves shows it, and so do the steps before.
+        The search goes on beside that noise, as loud as what this step leaves shows it, and so do the steps before;
+        without it where this step explains the records.
         """
         search = self.at_first
-        plain = measured(search, step.fit)
+        plain = fit_jointly(search, step.effects, step.errors) if self.search.logged else measured(search, step.fit)
         if plain.logged < LEAST_LOGGED or self.explains(plain):
-            return None
+            return self._go_on(search, step, plain) if self.search.logged else None
         rig = apply_all(search.rig, step.fit.effects)
         found = search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
         # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
@@ -187,10 +188,12 @@ class Stepwise:
         if share < LEAST_LOGGED or measured(beside, step.fit).fit.cost > SETTINGS.inputs:
             return None
         fitted = fit_jointly(beside, step.effects, step.errors)
-        if fitted.fit.cost < SETTINGS.too_white:
-            return None
-        self.search, self.is_tried = beside, False
-        self.steps = [fitted if s is step else replace(measured(beside, s.fit), others=s.others) for s in self.steps]
+        return None if fitted.fit.cost < SETTINGS.too_white else self._go_on(beside, step, fitted)
+
+    def _go_on(self, search: Search, step: Step, fitted: Step) -> Step:
+        """The step as it was fitted in another search, which goes on in that."""
+        self.search, self.is_tried = search, False
+        self.steps = [fitted if s is step else replace(measured(search, s.fit), others=s.others) for s in self.steps]
         return fitted
 
     def explains(self, step: Step) -> bool:
