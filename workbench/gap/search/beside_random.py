@@ -13,6 +13,7 @@ from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.jointly import on_their_sides
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
@@ -65,7 +66,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     tried = [alone, *(with_random(search, single) for single in gaining)]
     found = _likeliest(search, tried)
     if found is None:
-        errors = nominal_errors(search.rig, search.prior)
+        errors = on_their_sides(beside, nominal_errors(search.rig, search.prior))
         off = with_random(search, fit(search.rig, (errors,), beside.data, iterations=TOGETHER))
         found = Decision("explained", *off) if off[1].holds_within(WHITENED_BESIDE) else None
     return found, [each[0] for each in tried]
