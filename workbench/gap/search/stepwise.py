@@ -107,11 +107,6 @@ class Stepwise:
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
         self.steps.append(self._afresh(()))
-        common = next((f.effects[0] for f in likeliest[:1] if f.effects[0].kind is MODULUS_ERROR), None)
-        if common is not None and "stiffness" in search.prior.groups and not self.is_enough:
-            start = {"stiffness_0": float(np.log(common.values["factor"]))}
-            stiffer = fit_jointly(search, (), nominal_errors(search.rig, search.prior, start))
-            self.steps = [min(self.last, stiffer, key=lambda s: s.fit.cost)]
         again = on_their_sides(search, opened(search, self.last.errors))
         if again.target.late != self.last.errors.target.late:  # what errors had hidden at first
             self.steps = [fit_jointly(search, (), again)]
