@@ -14,6 +14,8 @@ from workbench.gap.search.fit import cost_of, fit, sensitivity
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
+from workbench.trials.make import make_trial
+from workbench.trials.scoring import score_dirty
 
 NOISE = 1e-5
 DAMPING = np.array([1.1, 0.95, 1.08, 0.9])
@@ -91,6 +93,26 @@ def test_friction_beside_small_errors(rig, measured, records):
     assert abs(force - truth.force) < 3.0 * named.deviations["force"] + 1e-3 * truth.force
     assert abs(at - truth.at) < 0.01 and verdict.shrinkage.overall > 0.98
     assert sum(verdict.budget.effects.values()) + verdict.budget.nominal > 0.99
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "kinds", "dirt", "size"),
+    [
+        (866047253, ("point_mass",), "input", 0.5),  # 6 % of the response, beside noise of the inputs
+        (1848887362, ("truncated_modes",), "input", 1.0),
+        (323714690, (), "shape", 2.0),  # frequencies off by percents, and nothing else
+        (1068387374, ("bouc_wen",), "shape", 2.0),
+        (147580016, ("random_disturbance",), "offset", 0.5),
+        (1954737329, ("modulus_error",), "late", 1.0),
+    ],
+)
+def test_effects_beside_small_errors_are_named(seed, kinds, dirt, size):
+    """Plants by another numerical route, with an effect among small errors that would hide it from a mean square."""
+    case, label = make_trial(seed, kinds=[*kinds], dirt=dirt, size=size)
+    verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1).to_json()
+    score = score_dirty(verdict, label, length=case.rig.modes.length)
+    assert score["named"] and not (score["wrong"] or score["false_alarm"])
 
 
 def test_noise_that_was_stated_too_small_is_found(rig, measured):

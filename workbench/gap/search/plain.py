@@ -127,4 +127,10 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
     weighed = Weighed.of(replace(search, catalogue=alike), given, evidence).likeliest()
     likeliest = {effect.kind: effect for effect in reversed(weighed)}  # the best of each kind
     more = [(*given, effect) for effect in weighed if effect is likeliest[effect.kind]][:LIKELIEST]
-    return _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))])
+    found = _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))])
+    if found is None:
+        return None
+    rest = [e for e in found.effects if e.kind in COMMON or any(e.label == other.label for other in given)]
+    without = fit(search.rig, rest, search.data.stepped(FINE), iterations=PLAINLY)
+    extra = found.n_parameters - without.n_parameters
+    return found if search.surely_better(found, without.cost, extra) else None

@@ -53,6 +53,7 @@ class StepwiseSettings:
             what was seen of the others may have been the gap.
         inputs: mean square, white, that a set may leave beside noise of the logged inputs for that to be searched on.
         too_white: likewise, for less of which that noise was not what was left.
+        hearings: rounds of learning the sensors' noise beside it.
     """
 
     shorter: float = 30.0
@@ -77,6 +78,7 @@ class StepwiseSettings:
     surely_late: float = 0.05
     inputs: float = 2.0
     too_white: float = 0.8
+    hearings: int = 2
 
 
 SETTINGS = StepwiseSettings()
@@ -175,13 +177,18 @@ class Stepwise:
         if plain.logged < LEAST_LOGGED or self.explains(plain):
             return self._go_on(search, step, plain) if self.search.logged else None
         rig = apply_all(search.rig, step.fit.effects)
-        found = search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
+        left, found = search.data.differences(rig), search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
         # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
-        heard = [likeliest_share(rig, s.data, search.data.differences(rig)) for s in (search, found)]
+        heard = [likeliest_share(rig, s.data, left) for s in (search, found)]
         (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
         beside = louder.beside_inputs(rig, share)
-        if share < LEAST_LOGGED or measured(beside, step.fit).fit.cost > SETTINGS.inputs:
+        white = measured(beside, step.fit).fit
+        if share < LEAST_LOGGED or white.cost > SETTINGS.inputs:
             return None
+        for _ in range(SETTINGS.hearings):  # each sensor's noise by the power of its innovations
+            louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
+            beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
+            white = measured(beside, step.fit).fit
         fitted = fit_jointly(beside, step.effects, step.errors)
         return None if fitted.fit.cost < SETTINGS.too_white else self._go_on(beside, step, fitted)
 
