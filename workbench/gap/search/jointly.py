@@ -35,6 +35,8 @@ class JointSettings:
         iterations, tolerance: of the fit in each round.
         last_iterations, last_tolerance: of the last fit, which intervals are taken from.
         credible: times the stated noise that noise found may be; more is a gap.
+        surely_late: of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added;
+            what was seen of the others may have been the gap.
         jump: times the power of the change over the span before a sample that the change after it has at a jump.
     """
 
@@ -66,6 +68,7 @@ class JointSettings:
     last_iterations: int = 6
     last_tolerance: float = 1e-7
     credible: float = 3.0
+    surely_late: float = 0.05
     jump: float = 10.0
 
 
@@ -231,6 +234,12 @@ def opened(search: Search, errors: Effect) -> Effect:
     before = search.prior
     closed = {g: getattr(before, g) for g, _ in SETTINGS.widest if not getattr(errors.target, g)}
     return nominal_errors(search.rig, replace(errors.target, **closed), errors.values)
+
+
+def surely_late(errors: Effect) -> Effect:
+    """The errors with the sides of accelerometers open, but for those that are later than a gap makes them seem."""
+    late = tuple(name for name in errors.target.late if errors.values[f"delay_{name}"] > SETTINGS.surely_late)
+    return replace(errors, target=replace(errors.target, late=late, early=()))
 
 
 def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:

@@ -8,9 +8,11 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
+from workbench.gap.effects.ports import SENSOR_DELAY
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.finish import finished
 from workbench.gap.search.fit import Fit, fit
+from workbench.gap.search.jointly import on_their_sides, surely_late
 from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import Search
@@ -23,6 +25,7 @@ PLAINLY = 8  # iterations without errors
 PUNCTUAL = 0.01  # of a sample: sensors that are late by less are not
 NEAR = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
 NEEDLESS = 6.0  # twice the log-likelihood that one number more may gain by chance
+SEVERAL = 3  # sensors, of which one alone is hardly late by chance
 LIKELIEST = 4  # kinds of the one more that are tried
 
 
@@ -111,10 +114,32 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | Non
     """The simplest of sets that leaves only noise."""
     quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAINLY), list(sets))
     for candidate in sorted((f for f in quickly if f.cost < NEAR), key=lambda f: f.n_parameters):
-        found = fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=PLAINLY)
+        effects = _on_their_sides(search, candidate.effects)
+        found = fit(search.rig, effects, search.data.stepped(FINE), iterations=PLAINLY)
         if search.explains(found):
-            return finished(search, found)
+            return _with_one_late(search, finished(search, found))
     return None
+
+
+def _on_their_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:
+    """The effects with accelerometers on the side of the jumps that the records show beside these effects."""
+    others = tuple(effect for effect in effects if effect.kind is not NOMINAL_ERRORS)
+    late = (on_their_sides(search, surely_late(e), others) for e in effects if e.kind is NOMINAL_ERRORS)
+    return (*others, *late)
+
+
+def _with_one_late(search: Search, found: Fit) -> Fit:
+    """The fit with a delay as the effect that it is where one of several sensors is late alone."""
+    late = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
+    if late is None or len(late.values) < SEVERAL:
+        return found
+    delays = {name.removeprefix("delay_"): float(value) for name, value in late.values.items()}
+    off = [name for name, delay in delays.items() if abs(delay) > PUNCTUAL]
+    if len(off) != 1 or delays[off[0]] < 0:
+        return found
+    delay = Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * late.target.sample_time})
+    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(FINE))
+    return alone if search.explains(alone) else found
 
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...]) -> Fit | None:

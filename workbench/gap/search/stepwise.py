@@ -14,7 +14,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import SETTINGS as JOINTLY
-from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
+from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened, surely_late
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.plain import COMMON, MOST_COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import one_more
@@ -49,8 +49,8 @@ class StepwiseSettings:
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
         excluded: probability below which another set that explains the records is no rival.
         astray: share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray.
-        surely_late: of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added;
-            what was seen of the others may have been the gap.
+        loud: times the noise of the sensors that a set must leave above it for noise of the inputs to be heard in it;
+            less of it does no harm to a mean square.
         inputs: mean square, white, that a set may leave beside noise of the logged inputs for that to be searched on.
         too_white: likewise, for less of which that noise was not what was left.
         hearings: rounds of learning the sensors' noise beside it.
@@ -75,7 +75,7 @@ class StepwiseSettings:
     no_gap: float = 0.15
     excluded: float = 1e-3
     astray: float = 0.02
-    surely_late: float = 0.05
+    loud: float = 0.5
     inputs: float = 2.0
     too_white: float = 0.8
     hearings: int = 2
@@ -174,7 +174,8 @@ class Stepwise:
         """
         search = self.at_first
         plain = fit_jointly(search, step.effects, step.errors) if self.search.logged else measured(search, step.fit)
-        if plain.logged < LEAST_LOGGED or self.explains(plain):
+        loud = plain.excess(plain.sensor_noise) > SETTINGS.loud * float(plain.sensor_noise.mean())
+        if plain.logged < LEAST_LOGGED or not loud:
             return self._go_on(search, step, plain) if self.search.logged else None
         rig = apply_all(search.rig, step.fit.effects)
         left, found = search.data.differences(rig), search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
@@ -366,11 +367,12 @@ class Stepwise:
         Where frequencies are off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        before = self.last.errors if self.steps else nominal_errors(search.rig, search.prior)
-        delays = {name: before.values[f"delay_{name}"] for name in before.target.late}
-        late = tuple(name for name, delay in delays.items() if delay > SETTINGS.surely_late)
-        known = {f"delay_{name}": delays[name] for name in late}
-        none = on_their_sides(search, nominal_errors(search.rig, replace(search.prior, late=late), known), effects)
+        none = nominal_errors(search.rig, search.prior)
+        if self.steps:
+            before = surely_late(self.last.errors)
+            known = {name: self.last.errors.values[name] for name in (f"delay_{late}" for late in before.target.late)}
+            none = nominal_errors(search.rig, replace(search.prior, late=before.target.late), known)
+        none = on_their_sides(search, none, effects)
         ahead = fit(search.rig, (*effects, none), search.ahead, iterations=JOINTLY.iterations, chord=True)
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
