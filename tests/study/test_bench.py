@@ -6,21 +6,27 @@ import socket
 import threading
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from workbench.cases.points import write_points
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state
 from workbench.design.spillover.spillover import effort, finite_spillover
 from workbench.rig.actuators import Actuator, piezo_patch
+from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import PointShapes
 from workbench.study.bench import bench_server
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import describe, run_study
 from workbench.study.outcome import Outcome
 from workbench.study.saved_design import save
 from workbench.study.trying import asked, read_structure, shown, start, try_out
+from workbench.trials.plane_frame import Section, plane_frame
 
 RIG, TEXT = read_structure(None)
 PLATE = """[structure]
@@ -295,14 +301,103 @@ def test_actuators_are_dragged_over_a_plate(plate, look, until, width, tmp_path)
         assert [entry for entry in browser.get_log("browser") if "422" not in entry["message"]] == []
 
 
-def test_plain_modal_data_know_no_places_to_stand(tmp_path):
+@pytest.fixture
+def frame(tmp_path):
+    """A portal of two nodes a column and one on its beam, with its rig and its description."""
+    strips = Section.of_strip(0.03, 0.004, youngs_modulus=2.1e11, density=7850.0)
+    nodes = {
+        "0": (0, 0),
+        "l": (0, 0.2),
+        "L": (0, 0.4),
+        "m": (0.2, 0.4),
+        "R": (0.4, 0.4),
+        "r": (0.4, 0.2),
+        "1": (0.4, 0),
+    }
+    chain = [(one, other, strips) for one, other in pairwise(nodes)]
+    model = plane_frame(nodes, chain, fixed=("0", "1"), damping=ModalDamping(0.01))
+    named = [name for name in model.nodes.names if not name.endswith("rz")]
+    at = model.nodes.locate(named)
+    points = NamedPoints(
+        tuple(named), model.nodes.positions[at], ("x", "y") * 5, tuple(name.split(".")[0] for name in named)
+    )
+    modes = model.modes(5)
+    shapes = PointShapes(modes.phi(named))
+    write_points(tmp_path / "points.csv", points, shapes.values)
+    (tmp_path / "frame.toml").write_text(
+        '[structure]\nkind = "modal"\npoints = "points.csv"\n'
+        f"natural_frequencies_hz = {modes.frequencies_hz.tolist()}\ndamping_ratios = {[0.01] * 5}\n"
+        '[[input]]\nname = "F1"\nkind = "actuator"\npoint = "l.x"\n[[input]]\nname = "F2"\nkind = "actuator"\n'
+        'point = "R.x"\n[[input]]\nname = "hammer"\nkind = "hammer"\npoint = "m.y"\n'
+        '[[output]]\nname = "a"\nquantity = "acceleration"\npoint = "r.x"\nnoise_std = 0.01\n'
+    )
+    return read_structure(tmp_path / "frame.toml")
+
+
+def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
+    rig, _ = frame
+    design = start(rig)
+    assert design.actuators == ("R.x", "l.x") and design.struck_at == "m.y"
+    moved = asked({**plain(design), "actuators": ["L.x", "m.y"]})
+    actuators = [Actuator("F1", "L.x"), Actuator("F2", "m.y")]
+    law = imsc(rig.modes, 2, actuators, weight=design.weight)
+    loop = close_loop(rig.modes, law)
+    at_rest = impulse_state(rig.modes, "m.y")
+    at_rest[rig.modes.n_modes + 2 :] = 0.0
+    expected = finite_spillover(loop, at_rest, design.final_time).residual_total
+    assert shown(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
+    for change, words in (
+        ({"actuators": ["L.x", "Q.x"]}, "there is no point 'Q.x'"),
+        ({"sensors": ["r.x"]}, "leave the sensors out"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            shown(rig, asked({**plain(design), **change}))
+
+
+def test_a_design_saved_on_a_frame_is_a_study_that_runs_and_agrees(frame, tmp_path):
+    rig, text = frame
+    path = save(rig, text, start(rig), "found", tmp_path / "studies")
+    outcome = Outcome("found", figures_folder=tmp_path / "figures")
+    run_study(describe(path), None, outcome, tmp_path)
+    assert outcome.holds and len(outcome.checks) == 3
+
+
+@pytest.mark.parametrize("width", [390, 1200])
+def test_actuators_are_dragged_from_point_to_point_of_a_frame(frame, look, until, width, tmp_path):
+    from selenium.webdriver import ActionChains, Keys
+
+    rig, text = frame
+    with serving(rig, text, tmp_path / "studies") as port:
+        browser = look(f"http://127.0.0.1:{port}/", width)
+        until(lambda: browser.find_elements("css selector", "#work .marks rect"))
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        track, drawn = browser.find_element("css selector", ".track"), set()
+        until(lambda: drawn.add(track.get_attribute("d")) or len(drawn) > 3)
+        first = browser.find_elements("css selector", ".handle.actuators")[0]
+        assert first.get_attribute("aria-valuetext") == "R.x"
+        grip = first.find_element("css selector", ".halo")
+        # half a column down stands r
+        spots = {c.find_element("css selector", "title").get_attribute("textContent"): c for c in
+                 browser.find_elements("css selector", ".stand > circle")}  # fmt: skip
+        down = spots["r.x"].location["y"] - spots["R.x"].location["y"]
+        ActionChains(browser).click_and_hold(grip).move_by_offset(3, round(down) - 4).release().perform()
+        until(lambda: first.get_attribute("aria-valuetext") == "r.x")
+        residual = browser.find_element("id", "residual")
+        moved = shown(rig, replace(start(rig), actuators=("r.x", "l.x")))["residual"]
+        until(lambda: float(residual.text.replace("−", "-")) == pytest.approx(moved, rel=1e-3))
+        ActionChains(browser).send_keys(Keys.ARROW_RIGHT).perform()
+        until(lambda: first.get_attribute("aria-valuetext") == "r.y")
+        assert [entry for entry in browser.get_log("browser") if "422" not in entry["message"]] == []
+
+
+def test_points_without_positions_cannot_be_drawn(tmp_path):
     path = tmp_path / "modal.toml"
     path.write_text(
         '[structure]\nkind = "modal"\nnatural_frequencies_hz = [1.0]\ndamping_ratios = [0.01]\n'
         '[[input]]\nname = "F"\nkind = "actuator"\nshape = [1.0]\n'
         '[[output]]\nname = "y"\nquantity = "displacement"\nshape = [1.0]\nnoise_std = 0.001\n'
     )
-    with pytest.raises(StudyError, match="modal data and points know no places between them"):
+    with pytest.raises(StudyError, match="points without positions cannot be drawn"):
         bench_server(*read_structure(path))
 
 

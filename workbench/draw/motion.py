@@ -113,7 +113,7 @@ def mode_motion(
 
 def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
     first = next(iter(modes.values()))
-    spots = _plate_net(first.domain) if isinstance(first.domain, Rectangle) else _frame_net(first.domain)
+    spots = _plate_net(first.domain) if isinstance(first.domain, Rectangle) else frame_net(first.domain)
     size = np.ptp(spots.rest, axis=0).max()
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
@@ -142,7 +142,7 @@ def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], senso
 
 
 @dataclass(frozen=True, eq=False)
-class _Net:
+class Net:
     """Spots of a structure as a page shows them.
 
     Attributes:
@@ -168,7 +168,7 @@ def _front(at: np.ndarray) -> np.ndarray:
     return at[..., :2]
 
 
-def _plate_net(domain: Rectangle) -> _Net:
+def _plate_net(domain: Rectangle) -> Net:
     sides = domain.length
     n, m = (max(round(PER_SIDE * side / max(sides)), 6) for side in sides)
     x, y = (np.linspace(0.0, side, count) for side, count in zip(sides, (n, m), strict=True))
@@ -181,10 +181,15 @@ def _plate_net(domain: Rectangle) -> _Net:
         up = modes.phi(places)
         return np.stack([np.zeros_like(up), up], axis=1)
 
-    return _Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place)[:2] @ flat))
+    return Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place)[:2] @ flat))
 
 
-def _frame_net(domain: Domain) -> _Net:
+def frame_net(domain: Domain) -> Net:
+    """A frame as its nodes, neighbours joined, seen from above the front; a plane one from the front.
+
+    Raises:
+        ValueError: named points without positions.
+    """
     if not isinstance(domain, NamedPoints) or domain.positions is None:
         raise ValueError("shapes at named points are drawn where their positions are known; give positions")
     names = list(dict.fromkeys(domain.nodes))
@@ -206,7 +211,7 @@ def _frame_net(domain: Domain) -> _Net:
     def spot(place: Any) -> np.ndarray:
         return see(np.asarray(domain.positions)[domain.locate(place)[0]])
 
-    return _Net(see(at), _neighbours(at), moves, spot)
+    return Net(see(at), _neighbours(at), moves, spot)
 
 
 def _neighbours(at: np.ndarray) -> list[list[int]]:

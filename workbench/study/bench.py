@@ -11,14 +11,20 @@ from typing import Any
 from jinja2 import Environment
 
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval, Rectangle
+from workbench.structure.domain import Interval, NamedPoints, Rectangle
 from workbench.study.cases import StudyError
 from workbench.study.page import asset, in_script
 from workbench.study.saved_design import save
 from workbench.study.trying import asked, setting, shown
 
 HERE = "127.0.0.1"
-SEEN = {Interval: "Grey: without control.", Rectangle: "Red is up, blue is down."}
+DRAG = "Drag a triangle (actuator), a circle (sensor) or the hammer; the arrow keys move them too."
+SEEN = {
+    Interval: f"{DRAG} Grey: without control.",
+    Rectangle: f"{DRAG} Red is up, blue is down.",
+    NamedPoints: "Drag a triangle (actuator) or the hammer from point to point; the arrow keys move them too. Grey:"
+    " without control.",
+}
 MOST_BYTES = 65536
 CLIENT_SECONDS = 10.0  # after which a client that sends nothing is dropped
 MOST_WAITING = 128  # connections not yet taken
@@ -38,7 +44,7 @@ def bench_server(rig: Rig, structure: str, *, port: int = 0, folder: Path = Path
         folder: where designs are saved as studies.
 
     Raises:
-        StudyError: modes known at points alone, or a port that cannot be had.
+        StudyError: modes at points without positions, or a port that cannot be had.
     """
     content = {**setting(rig), "folder": str(folder)}
     template = Environment(autoescape=True, trim_blocks=True).from_string(asset("bench.html"))

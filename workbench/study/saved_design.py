@@ -1,10 +1,12 @@
 """A design found on the bench, saved as a study of its own."""
 
+import re
 from dataclasses import fields
 from pathlib import Path
 
+from workbench.cases.points import write_points
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Rectangle
+from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.study.templates import free_path
 from workbench.study.trying import Design, try_out
 from workbench.study.whole_file import write_whole
@@ -36,7 +38,8 @@ def study(outcome, data=None):
     outcome.say("W_R = {{W_R:.3e}} for an effort of {{effort:.3e}}.".format(**found))
     outcome.figure("work", plot_work({{"this design": tried.work}}), "Spillover work by residual mode.")
 {motion}'''
-# what shows the motion: of a member, and of a plate
+TABLE = re.compile(r"^points *= *.*$", re.MULTILINE)
+# what shows the motion: of a member, a plate, and a frame
 MEMBER = (
     """from workbench.draw.beam import plot_motion
 from workbench.draw.motion import response_motion""",
@@ -57,10 +60,16 @@ PLATE = (
     outcome.figure("motion", figure, "Displacement after the impulse (star), controlled (crosses are actuators).")
 """,
 )
+FRAME = (
+    "from workbench.draw.motion import mode_motion",
+    """    motion = mode_motion({"structure": rig.modes}, actuators=tried.law.actuators)
+    outcome.motion(motion, "Mode shapes; triangles are actuators.")
+""",
+)
 
 
 def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> Path:
-    """Write a design as a study: folder/name.py, and the structure (TOML) beside it.
+    """Write a design as a study: folder/name.py, and the structure (TOML, and a table of named points) beside it.
 
     Raises:
         StudyError: a name that is none, or that is taken.
@@ -68,11 +77,19 @@ def save(rig: Rig, structure: str, design: Design, name: str, folder: Path) -> P
     path = free_path(name, folder)
     tried = try_out(rig, design)
     found = {"W_R": tried.work.residual_total, "effort": tried.effort}
-    imports, motion = PLATE if isinstance(rig.modes.domain, Rectangle) else MEMBER
+    domain = rig.modes.domain
+    imports, motion = MEMBER
+    if isinstance(domain, Rectangle):
+        imports, motion = PLATE
+    if isinstance(domain, NamedPoints):
+        imports, motion = FRAME
+        structure = TABLE.sub(f'points = "{path.with_suffix(".csv").name}"', structure)
     script = SCRIPT.format(
         design=_written(design), shown=found, stable=tried.loop.stable, imports=imports, motion=motion
     )
     write_whole(path.with_suffix(".toml"), structure)
+    if isinstance(domain, NamedPoints):
+        write_points(path.with_suffix(".csv"), domain, rig.modes.phi(domain.names))
     return write_whole(path, script)
 
 

@@ -18,9 +18,10 @@ from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
 from workbench.design.placement.task import patch_of
 from workbench.design.spillover.spillover import Spillover, finite_spillover
+from workbench.draw.motion import frame_net
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
+from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
 from workbench.study.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
@@ -28,6 +29,7 @@ MOST_PORTS = 40
 LARGEST = 1e100
 N_TIMES, N_FRAMES, N_PLACES, N_CELLS = 2001, 251, 121, 44
 USUAL_WEIGHT, FIRMNESS = 20.0, 25.0
+BESIDE = 0.03  # of the frame: how far from its node a point is drawn, in its direction
 ON_AXIS = 1e-9  # damping ratio below which a pole stands on the imaginary axis
 MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
 
@@ -36,7 +38,7 @@ MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
 class Design:
     """What can be moved on the bench.
 
-    Places are x along a member and (x, y) on a plate, m.
+    Places are x along a member and (x, y) on a plate, m, and names of points.
 
     Attributes:
         actuators: places; middles of piezo patches, where the rig has these.
@@ -107,7 +109,9 @@ def asked(content: Mapping[str, Any]) -> Design:
 
 
 def _place(value: object, name: str) -> Place:
-    """A position, or a pair of them."""
+    """A position, a pair of them, or the name of a point."""
+    if isinstance(value, str):
+        return value
     if isinstance(value, list | tuple) and len(value) == 2:
         return (_number(value[0], name), _number(value[1], name))
     return _number(value, name)
@@ -123,14 +127,14 @@ def start(rig: Rig) -> Design:
     """The design that a rig begins with: its actuators, as many modes as these, its hammer, exact modal coordinates.
 
     Raises:
-        StudyError: a structure known at points alone, or without an elastic mode.
+        StudyError: points without positions, or no elastic mode.
     """
     domain = _domain(rig)
     elastic = rig.modes.omega[rig.modes.omega > 0]
     if elastic.size == 0:
         raise StudyError("the structure has no elastic mode; ask for more modes")
-    places = sorted({middle(a.at) for a in rig.actuators if not a.direct}) or [_share(domain, 0.37)]
-    struck = next((a.at for a in rig.actuators if a.direct), _share(domain, 0.63))
+    places = sorted({middle(a.at) for a in rig.actuators if not a.direct}) or [_share(rig, 0.37)]
+    struck = next((a.at for a in rig.actuators if a.direct), _share(rig, 0.63))
     count = min(len(places), rig.modes.n_modes)
     # on a plate a damping ratio of some 0.14 of the first mode; along a member that of section 5.8
     weight = USUAL_WEIGHT if isinstance(domain, Interval) else float(f"{FIRMNESS / elastic[0] ** 2:.3g}")
@@ -139,24 +143,39 @@ def start(rig: Rig) -> Design:
     )
 
 
-def _domain(rig: Rig) -> Interval | Rectangle:
+def _domain(rig: Rig) -> Domain:
     """Where actuators can be moved about.
 
     Raises:
-        StudyError: modes known at points alone.
+        StudyError: modes at points that stand nowhere, or along or over nothing that is known.
     """
     domain = rig.modes.domain
-    if rig.structure is None or isinstance(domain, NamedPoints):
-        raise StudyError(
-            "modal data and points know no places between them; describe the structure as a beam, a rod or a plate"
-        )
+    if isinstance(domain, NamedPoints):
+        if domain.positions is None:
+            raise StudyError(
+                "points without positions cannot be drawn; give them in a table of points, or describe the structure as"
+                " a beam, a rod or a plate"
+            )
+    elif rig.structure is None:
+        raise StudyError("these modes have no structure behind them; describe it as a beam, a rod or a plate")
     return domain
 
 
-def _share(domain: Interval | Rectangle, share: float) -> Place:
+def _share(rig: Rig, share: float) -> Place:
+    """A place at that share of the structure; of named points the one that moves most."""
+    domain = rig.modes.domain
+    if isinstance(domain, NamedPoints):
+        return liveliest(rig)
     if isinstance(domain, Interval):
         return share * domain.length
     return (share * domain.length[0], share * domain.length[1])
+
+
+def liveliest(rig: Rig) -> str:
+    """The named point that the first elastic mode moves most."""
+    first = int(np.argmax(rig.modes.omega > 0))
+    names = rig.modes.domain.grid(1)
+    return str(names[int(np.argmax(np.abs(rig.modes.phi(names)[:, first])))])
 
 
 def try_out(rig: Rig, design: Design) -> Tried:
@@ -166,7 +185,11 @@ def try_out(rig: Rig, design: Design) -> Tried:
         ValueError: places, weights or numbers that make no design, and the way out.
     """
     modes, domain = rig.modes, _domain(rig)
-    for at in (*design.actuators, *design.sensors, design.struck_at):
+    if isinstance(domain, NamedPoints):
+        domain.locate([*design.actuators, design.struck_at])
+        if design.sensors:
+            raise StudyError("modal filters from sensors need a structure between them; leave the sensors out")
+    for at in () if isinstance(domain, NamedPoints) else (*design.actuators, *design.sensors, design.struck_at):
         if isinstance(at, tuple) != isinstance(domain, Rectangle):
             wanted = "a pair (x, y) on the plate" if isinstance(domain, Rectangle) else "a position along the structure"
             raise StudyError(f"a place is {wanted}, m; got {at}")
@@ -222,6 +245,8 @@ def shown(rig: Rig, design: Design) -> dict[str, Any]:
 def setting(rig: Rig) -> dict[str, Any]:
     """What the bench needs to know once: the structure, its modes and its shapes."""
     domain, patch = _domain(rig), patch_of(rig)
+    if isinstance(domain, NamedPoints):
+        return {**_points(rig, domain), **_common(rig, [])}
     if isinstance(domain, Interval):
         shown_at, across = np.linspace(0.0, domain.length, N_PLACES), [N_PLACES]
     else:  # middles of cells, each a spot of one colour
@@ -233,7 +258,34 @@ def setting(rig: Rig) -> dict[str, Any]:
         "cells": across,
         "x": _plain(shown_at),
         "shapes": _plain(rig.modes.phi(shown_at)),
-        "patch": [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0]),
+        **_common(rig, [] if patch is None else _plain(2.0 * reach(domain, patch.at)[0])),
+    }
+
+
+def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
+    """A frame as it is seen: spots and what joins them, how they move, and where each point is taken hold of."""
+    net = frame_net(domain)
+    corner, size = net.rest.min(axis=0), float(np.ptp(net.rest, axis=0).max())
+    names = domain.grid()
+    # points of one node are drawn beside it, each in its own direction
+    beside = {"": (0.0, 0.0), "x": (1.0, 0.0), "y": (0.0, 1.0), "z": (0.6, 0.6)}
+    at = [net.at(n) + BESIDE * size * np.array(beside[domain.directions[domain.locate(n)[0]]]) for n in names]
+    moves = np.asarray(net.moves(rig.modes))
+    return {
+        "length": _plain(np.maximum(np.ptp(net.rest, axis=0), BESIDE * size)),
+        "points": {
+            "names": names,
+            "spots": _plain(np.array(at) - corner),
+            "rest": _plain(net.rest - corner),
+            "lines": net.lines,
+        },
+        "shapes": _plain(moves.reshape(-1, rig.modes.n_modes)),
+    }
+
+
+def _common(rig: Rig, patch: list[float]) -> dict[str, Any]:
+    return {
+        "patch": patch,
         "omega": _plain(rig.modes.omega),
         "zeta": _plain(rig.modes.zeta),
         "most": MOST_PORTS,

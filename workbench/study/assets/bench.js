@@ -5,7 +5,7 @@
   var svg = workbench.svg, html = workbench.html, shown = workbench.shown, by = function (id) { return document.getElementById(id); };
   var stand = document.querySelector(".stand"), say = document.querySelector(".say"), hint = say.textContent;
   var answer = null, busy = false, waiting = false, calm = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  var plate = Array.isArray(setting.length), sides = [].concat(setting.length), usual = Math.floor(Math.log10(design.weight[0]));
+  var frame = setting.points, plate = Array.isArray(setting.length) && !frame, flat = plate || frame, sides = [].concat(setting.length), usual = Math.floor(Math.log10(design.weight[0]));
   var COLOURS = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"];
 
   document.querySelector(".theme").addEventListener("click", function () {
@@ -62,7 +62,7 @@
       ask();
     });
     ports("actuators", "actuators");
-    ports("sensors", "sensors (none: exact modes)");
+    if (!frame) ports("sensors", "sensors (none: exact modes)");
     var t = row("count until [s]"), time = html("input", { id: "time", type: "number", min: 0, step: "any", value: +design.final_time.toPrecision(4) }, t);
     time.addEventListener("change", function () { if (+time.value > 0) { design.final_time = +time.value; ask(); } });
     weights();
@@ -81,6 +81,10 @@
   }
   // the middle of the widest gap between those that stand already; on a plate the spot farthest from them and the rim
   function gap(places) {
+    if (frame) {
+      var taken = places.map(spotOf), away = function (name) { var p = spotOf(name); return Math.min.apply(null, taken.map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); })); };
+      return frame.names.reduce(function (one, other) { return away(other) > away(one) ? other : one; });
+    }
     if (plate) {
       var spots = setting.x.filter(function (_, i) { return i % 7 === 0; }).map(function (p) { return held("actuators", p); });
       var far = function (p) { return Math.min.apply(null, places.map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); }).concat([p[0], sides[0] - p[0], p[1], sides[1] - p[1]])); };
@@ -89,6 +93,12 @@
     var all = [0].concat(places.slice().sort(function (a, b) { return a - b; }), [setting.length]), best = 0;
     for (var i = 1; i < all.length - 1; i++) if (all[i + 1] - all[i] > all[best + 1] - all[best]) best = i;
     return 0.5 * (all[best] + all[best + 1]);
+  }
+  // where a named point is taken hold of, and the point nearest to a spot
+  function spotOf(name) { return frame.spots[frame.names.indexOf(name)]; }
+  function nearest(p) {
+    var far = frame.spots.map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); });
+    return frame.names[far.indexOf(Math.min.apply(null, far))];
   }
   function weights() {
     sliders.forEach(function (s) { s.remove(); });
@@ -113,7 +123,7 @@
     var width = stand.clientWidth;
     if (!width) return;
     stand.textContent = "";
-    var height = plate ? above(width) : aside(width);
+    var height = frame ? front(width) : plate ? above(width) : aside(width);
     stand.setAttribute("viewBox", "0 0 " + width + " " + height);
     stand.setAttribute("height", height);
     free = svg("g", {}, stand);
@@ -134,6 +144,21 @@
     workbench.ticks({}, [0, sides[0]], Math.round(width / 90)).forEach(function (t) {
       svg("text", { x: X(t[0]), y: y, "text-anchor": "middle" }, stand, t[1]);
     });
+  }
+  // the frame from the front, its elements moving
+  function front(width) {
+    var pad = 46, scale = Math.min((width - 2 * pad) / sides[0], 440 / sides[1]), w = scale * sides[0], h = scale * sides[1], left = 0.5 * (width - w);
+    X = workbench.scale([0, sides[0]], false, left, left + w);
+    Y = workbench.scale([0, sides[1]], false, pad + h, pad);
+    frame.sway = 0.07 * Math.max(w, h);
+    still = svg("path", { fill: "none", stroke: "var(--soft)", "stroke-width": 1.2, opacity: 0.6 }, stand);
+    line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
+    frame.spots.forEach(function (p, i) { svg("title", {}, svg("circle", { cx: X(p[0]), cy: Y(p[1]), r: 2, fill: "var(--soft)" }, stand), frame.names[i]); });
+    return h + 2 * pad;
+  }
+  function joined(values) {
+    var size = frame.sway / reach, spot = function (i) { return (X(frame.rest[i][0]) + size * values[2 * i]).toFixed(1) + "," + (Y(frame.rest[i][1]) - size * values[2 * i + 1]).toFixed(1); };
+    return frame.lines.map(function (ends) { return "M" + spot(ends[0]) + "L" + spot(ends[1]); }).join("");
   }
   // the plate as it is controlled, and small beside it as it is without control
   function above(width) {
@@ -175,10 +200,11 @@
     free.textContent = "";
     design.actuators.forEach(function (_, i) { handle("actuators", i, stand.viewBox.baseVal.height - 42, "M0,-10L8,6H-8Z", "var(--bad)", "actuator " + (i + 1)); });
     design.sensors.forEach(function (_, i) { handle("sensors", i, beamY, "M0,-6A6,6 0 1 1 -0.01,-6Z", "var(--paper)", "sensor " + (i + 1)); });
-    handle("struck_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", plate ? "var(--ink)" : "var(--soft)", "hammer");
+    handle("struck_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", flat ? "var(--ink)" : "var(--soft)", "hammer");
   }
   // a place inside, all of a patch on the structure
   function held(kind, place) {
+    if (frame) return nearest(place);
     var inside = [].concat(place).map(function (v, d) {
       var half = kind === "actuators" && setting.patch.length ? setting.patch[d] / 2 : 0;
       return +Math.max(half, Math.min(sides[d] - half, v)).toPrecision(5);
@@ -192,15 +218,16 @@
       svg("rect", { x: -w / 2, y: plate ? -h / 2 : 7, width: w, height: h, fill: "var(--bad)", "fill-opacity": 0.18, stroke: "var(--bad)" }, g);
     }
     svg("circle", { class: "halo", r: 20 }, g);
-    svg("path", { d: path, fill: fill, stroke: plate && kind !== "sensors" ? "var(--paper)" : "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : plate ? 1 : 0 }, g);
-    var beside = kind === "struck_at" && !plate;
+    svg("path", { d: path, fill: fill, stroke: flat && kind !== "sensors" ? "var(--paper)" : "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : flat ? 1 : 0 }, g);
+    var beside = kind === "struck_at" && !flat;
     var label = svg("text", { y: beside ? 5 : 20, x: beside ? 14 : 0, "text-anchor": beside ? "start" : "middle" }, g);
     function at() { return i === null ? design[kind] : design[kind][i]; }
     function put() {
-      var spot = plate ? [X(at()[0]), Y(at()[1])] : [X(at()), lane], text = [].concat(at()).map(function (v) { return v.toPrecision(3); }).join(", ");
+      var p = frame ? spotOf(at()) : at(), spot = flat ? [X(p[0]), Y(p[1])] : [X(p), lane];
+      var text = frame ? at() : [].concat(p).map(function (v) { return v.toPrecision(3); }).join(", ");
       g.setAttribute("transform", "translate(" + spot + ")");
-      g.setAttribute("aria-valuenow", [].concat(at())[0]);
-      if (plate) g.setAttribute("aria-valuetext", text);
+      g.setAttribute("aria-valuenow", [].concat(p)[0]);
+      if (flat) g.setAttribute("aria-valuetext", text);
       label.textContent = text;
     }
     function move(place) {
@@ -213,13 +240,17 @@
     g.addEventListener("pointermove", function (e) {
       if (!g.dragged) return;
       var box = stand.getBoundingClientRect(), x = X.back(e.clientX - box.left);
-      move(plate ? [x, Y.back(e.clientY - box.top)] : x);
+      move(flat ? [x, Y.back(e.clientY - box.top)] : x);
     });
     ["pointerup", "pointercancel"].forEach(function (end) { g.addEventListener(end, function () { g.dragged = false; }); });
     g.addEventListener("keydown", function (e) {
       var way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowDown: [0, -1], ArrowUp: [0, 1] }[e.key], step = e.shiftKey ? 1000 : 100;
-      if (!way || (way[1] && !plate)) return;
+      if (!way || (way[1] && !flat)) return;
       e.preventDefault();
+      if (frame) {
+        var n = frame.names.length, next = frame.names[(frame.names.indexOf(at()) + way[0] + way[1] + n) % n];
+        return move(spotOf(next));
+      }
       move([].concat(at()).map(function (v, d) { return v + way[d] * sides[d] / step; }));
     });
     put();
@@ -279,7 +310,8 @@
     if (!answer || !X) return;
     var k = Math.round(clock % 1 * (answer.time.length - 1)), size = (beamY - 40) / reach;
     [[line, displaced(k)], [still, idle(k)]].forEach(function (shape) {
-      if (plate) shape[0].setAttribute("href", painted(shape[1]));
+      if (frame) shape[0].setAttribute("d", joined(shape[1]));
+      else if (plate) shape[0].setAttribute("href", painted(shape[1]));
       else shape[0].setAttribute("d", "M" + shape[1].map(function (w, i) { return X(setting.x[i]).toFixed(1) + "," + (beamY - size * w).toFixed(1); }).join("L"));
     });
     by("clock").textContent = "t = " + shown(answer.time[k]) + " s";
