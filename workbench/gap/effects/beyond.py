@@ -8,6 +8,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Evidence, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import CUBIC_SPRING, QUADRATIC_DAMPER, strength_along, with_element
+from workbench.gap.effects.scales import Scales
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
@@ -36,7 +37,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
         path="structure",
         parameters=lambda rig, _: (
             *place_parameters(rig),
-            Parameter("force_at_rms", "N", -1e15, 1e15),
+            Parameter("force_at_rms", "N", -1e15 * Scales.of(rig).force, 1e15 * Scales.of(rig).force),
             Parameter("exponent", "", 1.0, 9.0),
         ),
         apply=lambda rig, _, v: with_element(rig, element(place_of(v), v["force_at_rms"], v["rms"], v["exponent"])),

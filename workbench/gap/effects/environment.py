@@ -7,9 +7,11 @@ import numpy as np
 
 from workbench.gap.effects.effect import Evidence, Kind, Parameter, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import with_element
+from workbench.gap.effects.scales import Scales
 from workbench.identification.signal.periodicity import period_of
 from workbench.records.record import Record
 from workbench.rig.elements import PeriodicForce, RandomForce
+from workbench.rig.rig import Rig
 from workbench.structure.domain import Between
 
 SAME_LINE = 0.15  # of the resolution 1/T: so near is the strongest sinusoid to one that is there
@@ -60,13 +62,18 @@ def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
 
+def _force(name: str, rig: Rig) -> Parameter:
+    unit = Scales.of(rig).force
+    return Parameter(name, "N", 1e-15 * unit, 1e9 * unit, logarithmic=True)
+
+
 PERIODIC_DISTURBANCE = Kind(
     name="periodic_disturbance",
     path="environment",
     parameters=lambda rig, _: (
         *place_parameters(rig),
-        Parameter("frequency", "Hz", 1e-6, 1e6, logarithmic=True),
-        Parameter("amplitude", "N", 1e-15, 1e9, logarithmic=True),
+        Parameter("frequency", "Hz", 1e-6 / Scales.of(rig).time, 1e6 / Scales.of(rig).time, logarithmic=True),
+        _force("amplitude", rig),
         Parameter("phase", "rad", -20.0, 20.0),
     ),
     apply=lambda rig, _, v: with_element(rig, PeriodicForce(place_of(v), v["frequency"], v["amplitude"], v["phase"])),
@@ -84,10 +91,7 @@ def _random_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
 RANDOM_DISTURBANCE = Kind(
     name="random_disturbance",
     path="environment",
-    parameters=lambda rig, _: (
-        *place_parameters(rig),
-        Parameter("rms", "N", 1e-15, 1e9, logarithmic=True),
-    ),
+    parameters=lambda rig, _: (*place_parameters(rig), _force("rms", rig)),
     apply=lambda rig, _, v: with_element(rig, RandomForce(place_of(v), v["rms"])),
     starts=_random_starts,
     found_in="residual",

@@ -94,6 +94,14 @@ def _sample_time(evidence: Evidence) -> float:
     return evidence.data.records[0].sample_time
 
 
+def _time(rig: Rig) -> float:
+    return Scales.of(rig).time
+
+
+def _force(rig: Rig) -> float:
+    return Scales.of(rig).force
+
+
 def _actuator(
     name: str,
     field: str,
@@ -107,14 +115,20 @@ def _actuator(
     log: bool = True,
     attribute: str | None = None,
     neutral: float | None = None,
+    size: Callable[[Rig], float] = lambda rig: 1.0,
     **options: Any,
 ) -> Kind:
-    """A kind that sets one number of an actuator, the attribute of that name unless another one is given."""
+    """A kind that sets one number of an actuator, the attribute of that name unless another one is given.
+
+    Its bounds are times a size that the rig has of itself.
+    """
     attribute = attribute or field
     return Kind(
         name=name,
         path="actuator",
-        parameters=lambda rig, _: (Parameter(field, unit, low, high, logarithmic=log, scale=0.1, neutral=neutral),),
+        parameters=lambda rig, _: (
+            Parameter(field, unit, low * size(rig), high * size(rig), logarithmic=log, scale=0.1, neutral=neutral),
+        ),
         apply=lambda rig, target, v: _change_actuators(rig, target, **{attribute: v[field]}),
         starts=starts,
         targets=targets,
@@ -146,6 +160,7 @@ ACTUATOR_LAG = _actuator(
     targets=actuators_or_all,
     low=1e-6,
     high=1e4,
+    size=_time,
     starts=lambda evidence, _: [{"time_constant": s * _sample_time(evidence)} for s in (0.1, 0.4, 1.2, 4.0, 12.0)],
 )
 
@@ -158,6 +173,7 @@ ACTUATOR_DELAY = _actuator(
     targets=actuators_or_all,
     low=1e-9,
     high=1e4,
+    size=_time,
     starts=lambda evidence, _: [
         {"delay": s * _sample_time(evidence)} for s in (0.1, 0.4, 0.8, 1.3, 1.8, 2.5, 3.5, 5.0, 8.0, 12.0)
     ],
@@ -171,6 +187,7 @@ ACTUATOR_SATURATION = _actuator(
     targets=actuators_or_all,
     low=1e-12,
     high=1e12,
+    size=_force,
     nonlinear=True,
     starts=lambda evidence, target: [
         {"limit": float(q)} for q in np.quantile(_commands(evidence, target), (0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
@@ -187,6 +204,7 @@ ACTUATOR_DEAD_ZONE = _actuator(
     targets=actuators_or_all,
     low=1e-12,
     high=1e12,
+    size=_force,
     nonlinear=True,
     starts=lambda evidence, target: [
         {"width": float(q)} for q in np.quantile(_commands(evidence, target), (0.03, 0.08, 0.15, 0.3, 0.5, 0.7))
@@ -206,10 +224,6 @@ ACTUATOR_BIAS = Kind(
     signed=True,
     phrase="a constant force of an actuator",
 )
-
-
-def _force(rig: Rig) -> float:
-    return Scales.of(rig).force
 
 
 def _rate_starts(evidence: Evidence, target: str) -> list[dict[str, float]]:
@@ -351,18 +365,19 @@ def _size(evidence: Evidence, target: str) -> float:
 
 
 def _sensor(name: str, field: str, phrase: str, starts: Starts, unit: str = "", **options: Any) -> Kind:
-    """A kind that sets one figure of a sensor."""
+    """A kind that sets one figure of a sensor; its bounds are times a size that the rig has of itself."""
     attribute = {"drift_over_record": "drift"}.get(field, field)
     log = options.pop("log", False)
     low, high = options.pop("low", -1e12), options.pop("high", 1e12)
-    neutral = options.pop("neutral", None)
+    neutral, size = options.pop("neutral", None), options.pop("size", lambda rig: 1.0)
 
     def parameters(rig: Rig, target: str) -> tuple[Parameter, ...]:
         noise = max((s.noise_std for s in rig.sensors if target in (s.name, ALL)), default=1.0)
         scale = 0.1 if field == "gain" else max(noise, 1e-300)
         quantity = next((s.quantity for s in rig.sensors if target in (s.name, ALL)), "")
         shown = QUANTITIES.get(quantity, "") if unit == OF_THE_SENSOR else unit
-        return (Parameter(field, shown, low, high, logarithmic=log, scale=scale, neutral=neutral),)
+        bounds = low * size(rig), high * size(rig)
+        return (Parameter(field, shown, *bounds, logarithmic=log, scale=scale, neutral=neutral),)
 
     return Kind(
         name=name,
@@ -420,6 +435,7 @@ SENSOR_LAG = _sensor(
     log=True,
     low=1e-6,
     high=1e4,
+    size=_time,
     neutral=0.0,
     targets=sensors_or_all,
 )
@@ -434,6 +450,7 @@ SENSOR_DELAY = _sensor(
     log=True,
     low=1e-9,
     high=1e4,
+    size=_time,
     neutral=0.0,
 )
 

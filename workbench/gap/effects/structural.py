@@ -483,7 +483,9 @@ def _duration(evidence: Evidence) -> float:
 STIFFNESS_DRIFT = Kind(
     name="stiffness_drift",
     path="structure",
-    parameters=lambda rig, _: (Parameter("rate", "1/s", -1.0, 10.0, scale=1e-4, neutral=0.0),),
+    parameters=lambda rig, _: (
+        Parameter("rate", "1/s", -1.0 / Scales.of(rig).time, 10.0 / Scales.of(rig).time, scale=1e-4, neutral=0.0),
+    ),
     apply=lambda rig, _, v: replace(rig, stiffness_rate=v["rate"]),
     starts=lambda evidence, _: [
         {"rate": share / _duration(evidence)}
