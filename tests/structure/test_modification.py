@@ -1,11 +1,15 @@
 """Modes with something attached, from modes at hand, against a structure that is solved anew."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from workbench.structure.damping import ModalDamping
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
-from workbench.structure.modification import attach
+from workbench.structure.modification import attach, truncation_error
+from workbench.structure.plate import Plate
 from workbench.structure.supports import PointDamper, PointMass, PointSpring
 
 
@@ -41,3 +45,28 @@ def test_the_static_answer_of_modes_left_out_makes_the_few_that_are_kept_exact(p
     signs = np.sign(np.sum(shapes * expected, axis=0))
     np.testing.assert_allclose(shapes * signs, expected, atol=2e-3 * np.abs(expected).max())
     np.testing.assert_allclose(np.diag(with_rest.damping), np.diag(exact.damping), rtol=2e-3)
+
+
+def test_the_cost_of_leaving_out_modes_of_a_plate_is_as_stated():
+    plate = Plate(
+        length=(1.2, 0.8), mass_per_area=8.0, bending_stiffness=175.0, poisson_ratio=0.3, edges="simply supported"
+    )
+    parts = (PointMass((0.43, 0.31), 0.2),)
+    exact = replace(plate, attachments=parts).modes(8, tolerance=1e-7).omega
+    for n in (40, 80, 160):
+        told = truncation_error(plate.modes(n), parts)[:8]
+        true = np.abs(attach(plate.modes(n), parts).omega[:8] / exact - 1.0)
+        np.testing.assert_allclose(told, true, rtol=0.6)
+
+
+def test_no_cost_is_stated_where_the_flexibility_at_a_point_has_no_end():
+    """A net of springs and masses is a membrane, which a force at a point moves by the logarithm of its mesh."""
+    n = 24
+    line = 2.0 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    stiffness = np.kron(line, np.eye(n)) + np.kron(np.eye(n), line)
+    at = [(i, j, 0.0) for i in range(n) for j in range(n)]
+    net = FiniteElements(np.eye(n * n), stiffness, nodes=at, directions=("z",))
+    parts = (PointMass("300z", 3.0),)
+    modes = net.modes(40)
+    true = np.abs(attach(modes, parts).omega[:20] / net.attached(parts).modes(20).omega - 1.0)
+    assert true.max() > 5e-4 and np.isinf(truncation_error(modes, parts)[:20][true > 1e-9]).all()
