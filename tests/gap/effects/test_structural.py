@@ -64,3 +64,11 @@ def test_what_stands_on_a_plate_feels_the_modes_that_are_left_out(edges, within)
         there = replace(plate, attachments=(part,))
         exact = there.modes(8, tolerance=1e-5).omega[:4]
         np.testing.assert_allclose(modes_of(there, 8).omega[:4], exact, rtol=within)
+
+
+def test_a_plate_has_the_modes_that_a_model_left_out():
+    plate = _plate(edges="simply supported")
+    rig = Rig(plate.modes(4), (), (), structure=plate)
+    full = kind_named("truncated_modes").apply(rig, 7, {})
+    np.testing.assert_allclose(full.modes.omega, plate.modes(7).omega, rtol=1e-9)
+    np.testing.assert_allclose(full.modes.zeta, 0.01)

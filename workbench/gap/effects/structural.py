@@ -426,7 +426,9 @@ AXIAL_LOAD = Kind(
 
 
 def _truncated(rig: Rig, count: int, _: object) -> Rig:
-    return replace(rig, modes=_member(rig).modes(count, tolerance=RESOLUTION))
+    if rig.structure is None:
+        raise ValueError("plain modal data have no further modes; describe the structure as a beam, a rod or a plate")
+    return replace(rig, modes=modes_of(rig.structure, count))
 
 
 def _one_mode_fewer(truncation: Effect, rig: Rig) -> tuple[Effect, ...]:
