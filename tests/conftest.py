@@ -1,10 +1,12 @@
-"""The order of the tests, the beam that most of their rigs are built on, the same by elements, and a square plate."""
+"""One thread of linear algebra a worker, the order of the tests, a hinged beam, the same by elements, a plate."""
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from workbench.structure.damping import Damping, ModalDamping
 from workbench.structure.domain import NamedPoints
@@ -12,6 +14,9 @@ from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Plate
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    threadpool_limits(1, user_api="blas")  # one worker a core; inner functions that tests call do not limit threads
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -170,7 +170,7 @@ def test_a_placement_is_proven_under_every_limit(rig, tmp_path):
     limits = ("--peak-force", 0.5, "--condition", 3, "--forbid", "4.9:5.6", "--proof", 0.05)
     result = run("place", rig, "--control", 2, "--weight", 20, *limits, "--json", found)
     assert result.exit_code == 0, result.output
-    assert "no placement under the limits spills less than 95.0%" in result.output
+    assert "no placement under the limits has less than 95.0%" in result.output
     written = json.loads(found.read_text())
     best = written["placements"][0]
     assert written["lower_bound"] == pytest.approx(0.95 * best["residual_work"])
@@ -182,7 +182,7 @@ def test_places_are_chosen_from_those_there_are(rig, tmp_path):
     given = ("--at", "1.5,3,4.5,6.5,7,8.5", "--effort", 3, "--proof", 0.05)
     result = run("place", rig, "--control", 3, "--weight", 20, *given, "--json", found)
     assert result.exit_code == 0, result.output
-    assert "no placement under the limits spills less than 100.0%" in result.output
+    assert "no placement under the limits has less than 100.0%" in result.output
     assert set(json.loads(found.read_text())["placements"][0]["positions"]) <= {1.5, 3, 4.5, 6.5, 7, 8.5}
 
 

@@ -239,7 +239,7 @@ def test_the_certificate_proves_an_optimum_and_finds_out_a_pretender():
     limits = Limits(effort=1.5 * nodes.effort, spacing=0.5)
     proven = certify(two, limits, gap=0.01)
     assert proven.complete and proven.gap == pytest.approx(0.01) and proven.cell is None
-    assert "no placement under the limits spills less than 99.0%" in str(proven)
+    assert "no placement under the limits has less than 99.0% of its residual work" in str(proven)
     found_out = certify(two, limits, placement=nodes, gap=0.01)
     assert found_out.better is not None
     assert two.placed(found_out.better, "").residual_work < nodes.residual_work

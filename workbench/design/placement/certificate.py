@@ -67,8 +67,8 @@ class Certificate:
         count = f"{self.cells:,} cells, {self.seconds:.0f} s"
         if self.better is not None:
             unit = "" if self.better.dtype == object else " m"
-            return f"not the optimum: actuators at {_listed(self.better)}{unit} spill less ({count})"
-        text = f"no placement under the limits spills less than {1.0 - self.gap:.1%} of this one ({count})"
+            return f"not the optimum: actuators at {_listed(self.better)}{unit} have less residual work ({count})"
+        text = f"no placement under the limits has less than {1.0 - self.gap:.1%} of its residual work ({count})"
         if self.cell is None:
             return text
         where = "; ".join(f"{low:.4g} to {high:.4g}" for low, high in self.cell)
@@ -92,7 +92,7 @@ def certify(
     most_cells: int = 200_000_000,
     progress: Progress | None = None,
 ) -> Certificate:
-    """A proof that no placement under the limits spills less than this one by more than a gap, as far as it comes.
+    """A proof that no placement under the limits has less residual work by more than a gap, as far as it comes.
 
     A limit of the condition alone leaves actuators beside the supports, where B vanishes and no bound holds: give a
     margin with it.

@@ -1,4 +1,4 @@
-"""What coupled LQR spills and spends with its actuators here or there: its forces depend on the places.
+"""Residual work and effort of coupled LQR by the places of its actuators: its forces depend on them.
 
 W_R = ½ Σ_r |b_rᵀ F(iω_r)|² with F(s) = -K (s - A + B K)⁻¹ x0. Of many designs at once, the stable half (X1, X2, Λ) of
 the Hamiltonian's eigenvectors is the closed loop itself: F(t) = -R⁻¹ Bᵀ X2 e^{Λt} X1⁻¹ x0.
@@ -20,7 +20,7 @@ ON_THE_AXIS = 1e-7
 def coupled_costs(
     modes: Modes, n_controlled: int, positions: ArrayLike, *, impulse_at: float, weight: float, impulse: float = 1.0
 ) -> Placement:
-    """What coupled LQR spills and spends with force actuators at the positions; infinite where it cannot be.
+    """Residual work and effort of coupled LQR with force actuators at the positions; infinite where it is unstable.
 
     Args:
         modes: controlled first, then residual; undamped, residual ones at rest at first.

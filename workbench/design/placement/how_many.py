@@ -1,4 +1,4 @@
-"""How many modes to control: what the disturbance gives each mode, and what controlling n of them spills.
+"""How many modes to control: what the disturbance gives each, and the residual work of controlling n of them.
 
 Controlling the lowest n leaves Σ_{r>n} E_r of the disturbance where it is (5.27 is what control takes out) and adds
 the spillover W_R (5.43). What is left either way is the yardstick.

@@ -1,4 +1,4 @@
-"""The work of the actuators in every mode: what control takes from the controlled, and spills into the residual.
+"""The work of the actuators in every mode: taken from the controlled ones, and given to the residual ones (spillover).
 
 Dissertation (5.18)-(5.44). With W_r the work of all actuators in mode r, W_C sums the controlled modes and W_R the
 residual ones. For an undamped residual mode at rest and t_f to infinity the double integral (5.43) is
