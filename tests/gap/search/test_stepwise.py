@@ -111,7 +111,7 @@ def test_effects_beside_small_errors_are_named(seed, kinds, dirt, size):
     """Plants by another numerical route, with an effect among small errors that would hide it from a mean square."""
     case, label = make_trial(seed, kinds=[*kinds], dirt=dirt, size=size)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1).to_json()
-    score = score_dirty(verdict, label, length=case.rig.modes.length)
+    score = score_dirty(verdict, label, domain=case.rig.modes.domain)
     assert score["named"] and not (score["wrong"] or score["false_alarm"])
 
 
