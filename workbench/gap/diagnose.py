@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -9,7 +11,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.report.budget import Budget, budget_of
+from workbench.gap.report.budget import Budget, budget_of, power_of_inputs
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.shrinkage import Shrinkage, measure
@@ -91,7 +93,7 @@ def diagnose(
         )
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
-        outcome = _outcome(attribution, shrinkage)
+        outcome = _outcome(rig, attribution, shrinkage, validation, settle)
         errors = next((e for e in attribution.best.effects if e.kind is NOMINAL_ERRORS), None)
         named = tuple(e for e in attribution.best.effects if e is not errors)
         effects = named if outcome in ("none", "explained") else ()
@@ -130,21 +132,32 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
     return {name for target in targets for name in (target if isinstance(target, tuple) else (target,))}
 
 
-def _outcome(found: Attribution, shrinkage: Shrinkage | None) -> str:
-    return "part" if found.outcome == "explained" and _fails_unseen(found, shrinkage) else found.outcome
+def _outcome(rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: Sequence[Record], settle: float) -> str:
+    fails = found.outcome == "explained" and _fails_unseen(rig, found, shrinkage, unseen, settle)
+    return "part" if fails else found.outcome
 
 
-def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None) -> bool:
+def _fails_unseen(
+    rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: Sequence[Record], settle: float
+) -> bool:
     """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
 
     Enough effects of the wrong kind bend to the records that they are fitted to, not to others.
     """
     if shrinkage is None or _remainders(found):
         return False
-    noise_power = max(found.noise_ratio, 1.0) ** 2
-    left = any(shrinkage.after[n] ** 2 > (1.0 + LEFT) * noise_power * shrinkage.floor[n] ** 2 for n in shrinkage.after)
+    before, after, floor = (
+        np.array([by_name[record.name] for record in unseen]) ** 2
+        for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor)
+    )
+    floor = max(found.noise_ratio, 1.0) ** 2 * floor
+    closed = shrinkage.overall
+    if found.logged:  # what noise of the inputs leaves, no model closes
+        floor = floor + found.logged**2 * power_of_inputs(rig, unseen, settle)
+        left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
+        closed = max(closed, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
     beside = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
-    return left and shrinkage.overall < (BESIDE_ERRORS if beside else HELD_OUT)
+    return bool((after > (1.0 + LEFT) * floor).any()) and closed < (BESIDE_ERRORS if beside else HELD_OUT)
 
 
 def _remainders(found: Attribution) -> list[str]:

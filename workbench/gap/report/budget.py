@@ -16,6 +16,7 @@ from workbench.rig.simulate import predict
 
 REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
 IN_PERCENT = ("stiffness", "mass", "frequency", "damping")
+SCATTER = 1.5  # of the power that noise of the inputs leaves: resonances make few independent values of a record
 RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
 PLURAL = {"stiffness": "stiffness", "mass": "mass", "frequency": "frequencies", "damping": "damping"}
 
@@ -117,7 +118,7 @@ def budget_of(
     order = [effects[i] for i in by_size]
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
-    by_inputs = np.minimum(logged**2 * _power_of_inputs(rig, records, settle), rest) if logged else np.zeros_like(left)
+    by_inputs = np.minimum(SCATTER * logged**2 * power_of_inputs(rig, records, settle), rest) if logged else 0.0 * left
     rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
     for i, effect in enumerate(order):  # what no model can predict is theirs
         if effect.kind.remainder:
@@ -153,7 +154,7 @@ def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
     return float(((noise[:, None] / _scale(measured)) ** 2).mean())
 
 
-def _power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
+def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
     """Mean square (n_records,) that noise of the logged inputs leaves, were it as strong as they are."""
     lead = round(settle / records[0].sample_time)
     powers = logging_noise_power(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))

@@ -177,6 +177,19 @@ class Stepwise:
         loud = plain.excess(plain.sensor_noise) > SETTINGS.loud * float(plain.sensor_noise.mean())
         if plain.logged < LEAST_LOGGED or not loud:
             return self._go_on(search, step, plain) if self.search.logged else None
+        beside = self._beside_inputs(step, plain)
+        if beside is None:
+            return None
+        fitted = fit_jointly(beside, step.effects, step.errors)
+        return None if fitted.fit.cost < SETTINGS.too_white else self._go_on(beside, step, fitted)
+
+    def _beside_inputs(self, step: Step, plain: Step) -> Search | None:
+        """The search beside noise of the logged inputs as a step shows it; None where that is not what it leaves.
+
+        Args:
+            plain: the step as it leaves the records without that noise.
+        """
+        search = self.at_first
         rig = apply_all(search.rig, step.fit.effects)
         left, found = search.data.differences(rig), search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
         # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
@@ -190,8 +203,7 @@ class Stepwise:
             louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
             beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
             white = measured(beside, step.fit).fit
-        fitted = fit_jointly(beside, step.effects, step.errors)
-        return None if fitted.fit.cost < SETTINGS.too_white else self._go_on(beside, step, fitted)
+        return beside
 
     def _go_on(self, search: Search, step: Step, fitted: Step) -> Step:
         """The step as it was fitted in another search, which goes on in that."""
@@ -229,11 +241,11 @@ class Stepwise:
 
     def decision(self) -> Decision:
         """What the effects of the last set explain."""
-        effects, left = self.last.effects, self.unexplained
-        noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         beside = self.search if self.search.logged else None
         if self.plain is not None:
-            return Decision("explained", self.plain, noise=noise, beside=beside)
+            return Decision("explained", self.plain, noise=self.search.data.noise, beside=beside)
+        effects, left = self.last.effects, self.unexplained
+        noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
         closed = self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)
         if effects and closed and not self.is_beyond:
             return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
@@ -422,7 +434,12 @@ class Stepwise:
         if self.unexplained > SETTINGS.explained:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
-        return in_place_of_errors(search, step.effects, step.errors)
+        if step.logged > LEAST_LOGGED and not self.search.logged:
+            search = self._beside_inputs(step, step) or search
+        found = in_place_of_errors(search, step.effects, step.errors)
+        if found is not None:
+            self.search = search
+        return found
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small, and common to all, as effects of their own."""
