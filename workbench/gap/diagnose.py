@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
@@ -133,29 +134,28 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
 
 
 def _outcome(rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: Sequence[Record], settle: float) -> str:
-    fails = found.outcome == "explained" and _fails_unseen(rig, found, shrinkage, unseen, settle)
-    return "part" if fails else found.outcome
+    if found.outcome != "explained" or shrinkage is None:
+        return found.outcome
+    inputs = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else np.zeros(len(unseen))
+    return "part" if _fails_unseen(found, shrinkage, inputs) else found.outcome
 
 
-def _fails_unseen(
-    rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: Sequence[Record], settle: float
-) -> bool:
+def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, inputs: float | Floats = 0.0) -> bool:
     """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
 
     Enough effects of the wrong kind bend to the records that they are fitted to, not to others.
+
+    Args:
+        inputs: (n_records,) what noise of the logged inputs leaves of them, which no set closes.
     """
     if shrinkage is None or _remainders(found):
         return False
     before, after, floor = (
-        np.array([by_name[record.name] for record in unseen]) ** 2
-        for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor)
+        np.array([*by_name.values()]) ** 2 for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor)
     )
-    floor = max(found.noise_ratio, 1.0) ** 2 * floor
-    closed = shrinkage.overall
-    if found.logged:  # what noise of the inputs leaves, no model closes
-        floor = floor + found.logged**2 * power_of_inputs(rig, unseen, settle)
-        left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
-        closed = max(closed, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
+    floor = max(found.noise_ratio, 1.0) ** 2 * floor + inputs
+    left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
+    closed = max(shrinkage.overall, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
     beside = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)
     return bool((after > (1.0 + LEFT) * floor).any()) and closed < (BESIDE_ERRORS if beside else HELD_OUT)
 
