@@ -12,12 +12,11 @@ from workbench.design.placement.coupled_spillover import coupled_batch, coupled_
 from workbench.design.placement.limits import Limits
 from workbench.design.spillover.spillover import effort, spillover
 from workbench.rig.actuators import Actuator
-from workbench.structure.member import Beam
 
 
 @pytest.fixture(scope="module")
-def modes():
-    return Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+def modes(hinged_modes):
+    return hinged_modes(9)
 
 
 def test_figures_are_those_of_the_law(modes):

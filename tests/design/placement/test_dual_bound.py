@@ -9,12 +9,11 @@ from workbench.design.placement.dual_bound import dual_bound
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place, placement_task
 from workbench.design.placement.task import batch_costs
-from workbench.structure.member import Beam
 
 
 @pytest.fixture(scope="module")
-def task():
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+def task(hinged_modes):
+    modes = hinged_modes(9)
     return placement_task(modes, 4, impulse_at=6.3, weight=20.0)
 
 
@@ -68,9 +67,9 @@ def test_no_placement_that_keeps_the_limit_is_below_the_bound(task):
 
 
 @pytest.mark.slow
-def test_six_actuators_have_a_bound_above_zero():
+def test_six_actuators_have_a_bound_above_zero(hinged_modes):
     """After two million cells; by Neumann's series alone six million leave it at zero."""
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(10)
+    modes = hinged_modes(10)
     six = placement_task(modes, 6, impulse_at=6.3, weight=20.0)
     even = six.placed(10.0 * np.arange(1, 7) / 7, "")
     limits = Limits(effort=1.5 * even.effort, spacing=0.5)

@@ -17,8 +17,8 @@ from workbench.structure.member import Beam
 
 
 @pytest.fixture(scope="module")
-def task():
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+def task(hinged_modes):
+    modes = hinged_modes(9)
     return placement_task(modes, 4, impulse_at=6.3, weight=20.0)
 
 
@@ -132,11 +132,11 @@ def test_a_distribution_of_blows_is_the_mean_over_them(task):
     assert many.peak_force == pytest.approx(max(e.peak_force for e in each), rel=2e-6)
 
 
-def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses():
+def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses(hinged_modes):
     """Covariance of the driven loop, mode 3 residual and lightly damped: ½ S_ff / c, against a Lyapunov equation."""
     from scipy.linalg import solve_continuous_lyapunov
 
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(3)
+    modes = hinged_modes(3)
     task = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
     law = task.law([2.5, 6.0])
     a = np.array(close_loop(modes, law).matrix)
@@ -148,8 +148,8 @@ def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses():
     assert c * covariance[5, 5] == pytest.approx(task.placed([2.5, 6.0], "").by_mode[0], rel=1e-3)
 
 
-def test_the_tail_bound_holds_and_is_not_idle(task):
-    many = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(60)
+def test_the_tail_bound_holds_and_is_not_idle(task, hinged_modes):
+    many = hinged_modes(60)
     places = [1.5, 3.5, 6.5, 8.5]
     all_ = placement_task(many, 4, impulse_at=6.3, weight=20.0).placed(places, "")
     left_out = all_.by_mode[16:].sum()
@@ -232,8 +232,8 @@ def test_bounds_hold_on_every_cell(task, limits):
     assert informative > 100 and refused > 50
 
 
-def test_the_certificate_proves_an_optimum_and_finds_out_a_pretender():
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+def test_the_certificate_proves_an_optimum_and_finds_out_a_pretender(hinged_modes):
+    modes = hinged_modes(9)
     two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
     nodes = two.placed(nodes_of_mode(modes, 2), "nodes")
     limits = Limits(effort=1.5 * nodes.effort, spacing=0.5)
@@ -296,8 +296,8 @@ def test_four_actuators_and_ten_modes_are_proven_within_five_per_cent(ends, fact
         Limits(peak_force=0.5, candidates=tuple(np.linspace(0.5, 9.5, 31))),
     ],
 )
-def test_every_limit_is_part_of_the_proof(limits):
-    modes = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged").modes(9)
+def test_every_limit_is_part_of_the_proof(limits, hinged_modes):
+    modes = hinged_modes(9)
     two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
     best = place(two, limits, starts=8)
     proof = certify(two, limits, placement=best, gap=0.01)

@@ -8,12 +8,10 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.spillover.comparison import compare
 from workbench.rig.actuators import Actuator
-from workbench.structure.member import Beam
 
 
-def test_crowded_actuators_cost_the_coupled_regulator_less():
-    beam = Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
-    modes = beam.modes(9)
+def test_crowded_actuators_cost_the_coupled_regulator_less(hinged_modes):
+    modes = hinged_modes(9)
     actuators = [Actuator(f"F{i}", x) for i, x in enumerate((1.3, 2.6, 3.9, 5.2))]
     state = impulse_state(modes, 6.3)
     state[13:] = 0.0
