@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from workbench.cases.case import Case
-from workbench.draw.distortion import plot_distortion
 from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
 from workbench.draw.motion import mode_motion
+from workbench.draw.spectra import plot_distortion
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
