@@ -123,13 +123,18 @@ def test_a_peak_between_samples_is_met():
     assert largest(np.array([-1.0, -2.0]), np.zeros((2, 2)), np.inf) == 0.0
 
 
-def test_a_distribution_of_blows_is_the_mean_over_them(task):
-    blows, chances = [2.2, 6.3, 9.1], [0.5, 0.3, 0.2]
-    many = placement_task(task.modes, 4, impulse_at=blows, weight=20.0, chances=chances).placed([2.1, 4, 6, 8.3], "")
-    each = [placement_task(task.modes, 4, impulse_at=x, weight=20.0).placed([2.1, 4, 6, 8.3], "") for x in blows]
-    np.testing.assert_allclose(many.by_mode, np.average([e.by_mode for e in each], axis=0, weights=chances), rtol=1e-10)
-    assert many.effort == pytest.approx(np.average([e.effort for e in each], weights=chances), rel=1e-10)
+def test_a_distribution_of_impulses_is_the_mean_over_them(task):
+    impulses, probabilities = [2.2, 6.3, 9.1], [0.5, 0.3, 0.2]
+    given, places = {"impulse_at": impulses, "weight": 20.0}, [2.1, 4, 6, 8.3]
+    many = placement_task(task.modes, 4, **given, probabilities=probabilities).placed(places, "")
+    each = [placement_task(task.modes, 4, impulse_at=x, weight=20.0).placed(places, "") for x in impulses]
+    np.testing.assert_allclose(
+        many.by_mode, np.average([e.by_mode for e in each], axis=0, weights=probabilities), rtol=1e-10
+    )
+    assert many.effort == pytest.approx(np.average([e.effort for e in each], weights=probabilities), rel=1e-10)
     assert many.peak_force == pytest.approx(max(e.peak_force for e in each), rel=2e-6)
+    with pytest.warns(DeprecationWarning, match="probabilities"):
+        assert placement_task(task.modes, 4, **given, chances=probabilities).placed(places, "").effort == many.effort
 
 
 def test_white_noise_pumps_energy_at_the_rate_of_unit_impulses(hinged_modes):

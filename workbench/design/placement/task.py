@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
+from warnings import warn
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -208,34 +209,39 @@ def placement_task(
     impulse_at: Any,
     weight: ArrayLike,
     impulse: float = 1.0,
-    chances: ArrayLike | None = None,
+    probabilities: ArrayLike | None = None,
     final_time: float = np.inf,
     actuator: Actuator | None = None,
+    chances: ArrayLike | None = None,
 ) -> PlacementTask:
     """The task for an impulse (N s) at a place, or at any of several, IMSC with control weight R (5.43).
 
-    White-noise forces of intensity s at those places, together Σ chances, are impulses of √s N s at every instant: W_R
-    and effort are then powers.
+    White-noise forces of intensity s at those places, given in place of probabilities, are impulses of √s N s at every
+    instant: W_R and effort are then powers.
 
     Args:
         impulse_at: a place of the domain, or several: x or (n_places,) m, (x, y) or (n_places, 2) m, names.
         weight: R, scalar or one a controlled mode.
         impulse: N s.
-        chances: (n_places,) of each place; even unless given.
+        probabilities: (n_places,) of each place; even unless given.
         final_time: t_f; work is counted up to it.
         actuator: what is to be placed, a point force unless given; a `piezo_patch` or a moment, with its gain.
+        chances: the former name of probabilities.
 
     Raises:
-        DesignError: no residual mode, chances that are none, or a time that is not positive.
+        DesignError: no residual mode, probabilities that are none, or a time that is not positive.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
     if not final_time > 0:
         raise DesignError(f"the final time must be positive; got {final_time}")
+    if chances is not None:
+        warn("placement_task(chances=...) is now placement_task(probabilities=...)", DeprecationWarning, stacklevel=2)
+        probabilities = chances
     places = listed(as_places(modes.domain, impulse_at))
-    shares = np.full(len(places), 1.0 / len(places)) if chances is None else np.asarray(chances, float)
+    shares = np.full(len(places), 1.0 / len(places)) if probabilities is None else np.asarray(probabilities, float)
     if shares.shape != (len(places),) or not (shares >= 0).all() or not shares.sum() > 0:
-        raise DesignError(f"{len(places)} places need as many chances, none negative; got {shares}")
+        raise DesignError(f"{len(places)} places need as many probabilities, none negative; got {shares}")
     if actuator is not None and isinstance(actuator.at, Between) and not isinstance(modes.domain, Interval):
         raise DesignError(
             f"actuator {actuator.name} acts between two places; such are placed along an interval only: place forces or"
