@@ -47,8 +47,12 @@ def modes_of(structure: Structure | Plate | Membrane, n_modes: int) -> Modes:
     return structure.modes(n_modes, tolerance=RESOLUTION)
 
 
-def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
-    """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many."""
+def _modes_of_surface(surface: Plate | Membrane, n_modes: int, solved_for: int = 0) -> Modes:
+    """Modes with what stands on a plate or membrane, from those that it has without: a search asks for many.
+
+    Args:
+        solved_for: how many modes the solution serves that these are taken from; so many where not given.
+    """
     facts = {f.name: getattr(surface, f.name) for f in fields(surface) if f.name != "attachments"}
     facts["edges"] = tuple(surface.edges.items())
     base, factor = _stiffer_all_over(surface)
@@ -58,7 +62,9 @@ def _modes_of_surface(surface: Plate | Membrane, n_modes: int) -> Modes:
     if not isinstance(damping, ViscousDamping):  # which takes part in no solution
         facts["damping"] = None
     kind: Any = type(surface)
-    bare = _bare_modes(kind, tuple(facts.items()), n_modes)
+    bare = _bare_modes(kind, tuple(facts.items()), solved_for or n_modes)
+    if bare.n_modes < n_modes:
+        bare = _bare_modes(kind, tuple(facts.items()), n_modes)
     if base is not None:
         bare = _scaled_modes(bare, np.sqrt(factor))
     if not isinstance(damping, ViscousDamping):
@@ -428,6 +434,8 @@ AXIAL_LOAD = Kind(
 def _truncated(rig: Rig, count: int, _: object) -> Rig:
     if rig.structure is None:
         raise ValueError("plain modal data have no further modes; describe the structure as a beam, a rod or a plate")
+    if isinstance(rig.structure, Plate):  # whose solution for the nominal modes has further ones
+        return replace(rig, modes=_modes_of_surface(rig.structure, count, solved_for=rig.modes.n_modes))
     return replace(rig, modes=modes_of(rig.structure, count))
 
 
