@@ -18,8 +18,9 @@ from workbench.identification.input_output.input_delays import act_later, first_
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.mode_clusters import overlap_remarks
-from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
+from workbench.identification.input_output.model_order import DECIDED, Selected, evidence_of, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
+from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.modal_estimates import ModalEstimates, credible, normalised_shapes
@@ -31,6 +32,8 @@ from workbench.threads import one_blas_thread
 
 # Modes for the first estimate of the noise, and how often noise and modes are estimated in turn.
 STRONGEST, LEARNT = 8, 4
+# States of a subspace model beyond two for each of the most modes: for noise.
+SPARE = 20
 # Times the limit up to which a mode may be noise; nepers over a record above which a pole grows.
 DOUBTED, MOST_GROWTH = 4.0, 0.5
 # Steps of a fit that only decides whether inputs act late.
@@ -241,25 +244,31 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
     first = first_lags(data.records)
     whole = np.maximum(first - (0 if data.straight else 1), 0)
     in_time: tuple[KnownInputs, Selected] | None = None
+    if not data.straight and not first.any():
+        return _selected(data, budget, **how)
+    late = data.delayed_by(whole, any_fraction=True)
+    strongest = _strongest(late, budget=budget, **how)
     if not whole.any():
-        punctual = data
-        strongest = select_modes(data, budget=budget, **_few(how))
-        if strongest.fit.poles.size == 0 or (not data.straight and not first.any()):
-            return _selected(data, budget, strongest, **how)
-        if not _late(data, strongest, budget):
-            in_time = data, selected = _selected(data, budget, strongest, **how)
-            if not _late(data, selected, budget):
+        if strongest.fit.poles.size == 0:
+            return _selected(data, budget, **how)
+        if not act_later(late, strongest.fit).any():
+            in_time = punctual, selected = _selected(
+                data, budget, _strongest(data, strongest.fit, budget=budget, **how), **how
+            )
+            further = selected.fit.poles.size > strongest.fit.poles.size
+            if not (further and _late(punctual, selected, budget)) or budget.spent("search for delays of the inputs"):
                 return in_time
-    if budget.spent("search for delays of the inputs") and in_time is not None:
-        return in_time
-    data, selected = _selected(data.delayed_by(whole, any_fraction=True).weighted_by(None), budget, **how)
+    punctual = data
+    data, selected = _selected(late, budget, strongest, **how)
     fit = selected.fit
     if fit.poles.size == 0:
         return in_time if in_time is not None else (data.delayed_by(whole), selected)
     derivative = time_derivatives(data.records[0].output_channels)[:, None]
     fraction = np.where(act_later(data, fit), fractions(data, fit, derivative), 0.0)
     if not whole.any() and not fraction.any() and not budget.spent("search for delays of the inputs"):
-        return in_time if in_time is not None else _selected(punctual, budget, strongest, **how)
+        if in_time is not None:
+            return in_time
+        return _selected(punctual, budget, _strongest(punctual, fit, budget=budget, **how), **how)
     turned = fit.participation.copy()
     turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, fraction) * data.dt)
     late = data.delayed_by(whole + fraction)
@@ -272,8 +281,18 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
 def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
     """Whether these modes leave what the inputs a sample earlier explain."""
     other = data.delayed_by(data.delays, any_fraction=True)
-    trial = settled(other, projected(other, selected.fit.poles, selected.fit.participation), STEPS, budget)
+    trial = settled(other, projected(other, selected.fit.poles, selected.fit.participation), STEPS, budget, DECIDED)
     return bool(act_later(other, trial).any())
+
+
+def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selected:
+    """Those of a start, or else of a subspace model, and as many more as the first estimate of the noise needs."""
+    if start is None:
+        poles = subspace_poles(data.records, data.whole, 2 * how["most_modes"] + SPARE)
+        start = fit_of_poles(data, poles, how["false_alarm"])
+    few = _few(how)
+    few["most_modes"] = max(few["most_modes"], start.poles.size)
+    return select_modes(data, start=start, **few)
 
 
 def _few(how: dict[str, Any]) -> dict[str, Any]:
@@ -310,7 +329,8 @@ def _selected(
     """
     how["budget"] = budget
     few = _few(how)
-    strongest = select_modes(data, **few) if strongest is None else strongest
+    strongest = _strongest(data, **how) if strongest is None else strongest
+    few["most_modes"] = max(few["most_modes"], strongest.fit.poles.size)
     data, selected = _with_noise(data, strongest, few, how, budget)
     doubtful = (selected.evidence < DOUBTED * selected.limit) | ~_oscillate(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
@@ -319,7 +339,7 @@ def _selected(
         data, projected(data, selected.fit.poles[~doubtful], selected.fit.participation[~doubtful]), budget=budget
     )
     other = data.weighted_by(data.noise_spectrum(sure))
-    other, fewer = _with_noise(other, select_modes(other, **how), how, how, budget)
+    other, fewer = _with_noise(other, select_modes(other, start=sure, **how), how, how, budget)
     if budget.spent("check of doubtful modes"):
         return data, selected
     worth = selected.limit * (selected.fit.poles.size - fewer.fit.poles.size)
@@ -366,7 +386,7 @@ def _with_noise(
         if budget.spent("estimation of the noise spectrum"):
             break
         weighted = data.weighted_by(line_std)
-        anew = select_modes(weighted, **how)
+        anew = select_modes(weighted, start=selected.fit, **how)
         # A search that was ended early is no better than the one before.
         if budget.spent("estimation of the noise spectrum") and anew.fit.poles.size < selected.fit.poles.size:
             break

@@ -38,10 +38,7 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
     """
     m, q = records[0].n_outputs, records[0].n_inputs
     rows = sum(record.n_samples for record in records)
-    sizes = np.abs(np.hstack([record.inputs for record in records]))
-    moved = int(
-        (sizes > MOVES * sizes.max(axis=1, keepdims=True)).sum(axis=1).min()
-    )  # blows are too short to tell lags by
+    moved = n_moving(records)  # blows are too short to tell lags by
     shortest = min(record.n_samples for record in records)
     lags = min(MOST_LAGS, rows // (ROWS_EACH * (m + q)), moved // ROWS_EACH, shortest // 4)
     if lags < 3:
@@ -68,6 +65,12 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
     evidence = np.einsum("kj,kj->k", b, np.linalg.solve(left / free, b.T).T) / spread[lags * m :]
     acts = evidence.reshape(lags + 1, q) > chi2.isf(FALSE_ALARM / (lags * q), m)
     return np.where(acts.any(axis=0), np.argmax(acts, axis=0), 0)
+
+
+def n_moving(records: Sequence[Record]) -> int:
+    """Samples at which the input that rests longest moves."""
+    sizes = np.abs(np.hstack([record.inputs for record in records]))
+    return int((sizes > MOVES * sizes.max(axis=1, keepdims=True)).sum(axis=1).min())
 
 
 def act_later(data: KnownInputs, fit: Fit) -> np.ndarray:

@@ -203,20 +203,21 @@ def search(
     noise: np.ndarray,
     most_steps: int = MOST_STEPS,
     budget: Budget | None = None,
+    negligible: float = NEGLIGIBLE,
 ) -> Fit:
-    """Least squares over poles and participation, outputs in units of `noise`."""
+    """Least squares over poles and participation, outputs in units of `noise`, until a step promises little χ²."""
     strength = np.abs(participation) * [np.linalg.norm(np.vstack(data.responses(pole)), axis=0) for pole in poles]
     held = participation[np.arange(poles.size), np.argmax(strength, axis=1)]
     start = projected(data, poles, participation / held[:, None])
-    found = minimise(_OutputError(data, noise), start, most_steps=most_steps, budget=budget)
+    found = minimise(_OutputError(data, noise, negligible), start, most_steps=most_steps, budget=budget)
     return replace(found.state, converged=found.converged, steps=found.steps)
 
 
 class _OutputError:
     """The `least_squares.Problem` of a measurement."""
 
-    def __init__(self, data: Measurement, noise: np.ndarray) -> None:
-        self.data, self.noise = data, noise
+    def __init__(self, data: Measurement, noise: np.ndarray, least: float) -> None:
+        self.data, self.noise, self.least = data, noise, least
         self.signal = float(((data.values / noise) ** 2).sum())
 
     def cost(self, state: Fit) -> float:
@@ -241,13 +242,19 @@ class _OutputError:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(NEGLIGIBLE * cost / self.data.values.size, ROUND_OFF * self.signal)
+        return decrease <= max(self.least * cost / self.data.values.size, ROUND_OFF * self.signal)
 
 
-def settled(data: Measurement, fit: Fit, most_steps: int = MOST_STEPS, budget: Budget | None = None) -> Fit:
+def settled(
+    data: Measurement,
+    fit: Fit,
+    most_steps: int = MOST_STEPS,
+    budget: Budget | None = None,
+    negligible: float = NEGLIGIBLE,
+) -> Fit:
     """Searched, weighted by the noise found, and searched again."""
     if fit.poles.size == 0:
         return fit
     for _ in range(2):
-        fit = search(data, fit.poles, fit.participation, fit.noise, most_steps, budget)
+        fit = search(data, fit.poles, fit.participation, fit.noise, most_steps, budget, negligible)
     return fit

@@ -6,7 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.input_output.modal_fit import Fit, Measurement, projected, search, settled
+from workbench.identification.input_output.fit_errors import covariance
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    Measurement,
+    free_parameters,
+    moves,
+    projected,
+    search,
+    settled,
+)
 from workbench.identification.signal.budget import Budget
 from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Stepwise
 from workbench.structure.modes import mac
@@ -15,10 +24,18 @@ from workbench.structure.modes import mac
 MOST_WEAK = 3
 # Steps of a fit that only decides whether a mode enters, or leaves.
 STEPS_IN, STEPS_OUT = 20, 12
+# χ² that a further step of such a fit must promise: the limit is some dozens.
+DECIDED = 0.1
 # A candidate is tried from this share of the limit on: fitted with the others it may gain more.
 ENTER = 0.5
 # Times the limit, and bandwidths to the next mode, below which a mode is tried again.
 WEAK, CLOSE = 4.0, 2.0
+# Times the limit from which on a mode close to another is one of its own, all that the others may take over counted.
+DISTINCT = 10.0
+# Share of each output that is noise in any case where poles of a start are weighed: -100 dB.
+FLOOR = 1e-5
+# Relative, added to the squares of columns that may be sums of one another.
+COLLINEAR = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,17 +56,96 @@ class Selected:
 
 
 def select_modes(
-    data: Measurement, *, most_modes: int, false_alarm: float = FALSE_ALARM, budget: Budget | None = None
+    data: Measurement,
+    *,
+    most_modes: int,
+    false_alarm: float = FALSE_ALARM,
+    budget: Budget | None = None,
+    start: Fit | None = None,
 ) -> Selected:
-    """The modes whose likelihood ratio is more than noise would give, taken in one by one and each tried again."""
+    """The modes whose likelihood ratio is more than noise would give, taken in one by one and each tried again.
+
+    Args:
+        data: the measurement.
+        most_modes: where to stop at the latest.
+        false_alarm: chance that noise alone is taken for a mode.
+        budget: of time; none unless given.
+        start: modes to start from, of whatever fit; none unless given.
+    """
     budget = Budget() if budget is None else budget
     problem = _Modes(data, false_alarm, budget)
     selection = Stepwise(problem, most_modes, MOST_WEAK, None, forgets=True, budget=budget)
-    fit = selection.select(projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex)))
+    fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
+    if start is not None and start.poles.size:
+        try:
+            fit = selection.backward(problem.started(projected(data, start.poles, start.participation)))
+        except np.linalg.LinAlgError:
+            pass  # modes that cannot be distinguished: without a start
+    fit = selection.select(fit)
     order = np.argsort(np.abs(fit.poles))
     evidence = np.array([evidence_of(fit, r) for r in order])
     ordered = projected(data, fit.poles[order], fit.participation[order])
     return Selected(replace(ordered, converged=fit.converged, steps=fit.steps), evidence, problem.limit, selection.full)
+
+
+def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALSE_ALARM) -> Fit:
+    """Those of given poles that the measurement holds, with the participation that suits each best; none is moved.
+
+    All residues are fitted at once, of any rank, and the pole that explains least is left out until none explains as
+    little as noise would.
+    """
+    inside = (poles.imag > 0) & (poles.imag < data.highest) & (-poles.real < MOST_DAMPED * np.abs(poles))
+    poles = poles[inside & (poles.real < data.resolution / (2.0 * np.pi))]
+    size = 2 * data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
+    x = np.hstack([*(np.hstack(data.responses(pole)) for pole in poles), data.fixed])
+    scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    together = [data.values] if data.weights is None else np.hsplit(data.values, data.values.shape[1])
+    spreads: list[np.ndarray] = []
+    coefficients: list[np.ndarray] = []
+    variances: list[np.ndarray] = []
+    for weights, y in zip(weights_of(data), together, strict=True):
+        weighted = weights * x / scale
+        gram = weighted.T @ weighted
+        gram[np.diag_indices_from(gram)] *= 1.0 + COLLINEAR
+        spreads.append(np.linalg.inv(gram))
+        coefficients.append(spreads[-1] @ (weighted.T @ y))
+        left = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
+        variances.append(np.maximum(left / max(len(x) - x.shape[1], 1), FLOOR**2 * (y**2).mean(axis=0)))
+    limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
+    while poles.size:
+        blocks = np.arange(poles.size * size).reshape(poles.size, size)
+        evidence = np.zeros(poles.size)
+        for spread, c, variance in zip(spreads, coefficients, variances, strict=True):
+            own = c[blocks]
+            inner = spread[blocks[:, :, None], blocks[:, None, :]]
+            evidence += (own * np.linalg.solve(inner, own) / variance).sum(axis=(1, 2))
+        weakest = int(np.argmin(evidence))
+        if evidence[weakest] >= limit:
+            break
+        out, rest = blocks[weakest], np.delete(np.arange(len(scale)), blocks[weakest])
+        for k, spread in enumerate(spreads):
+            taken = np.linalg.solve(spread[np.ix_(out, out)], np.column_stack([spread[out], coefficients[k][out]]))
+            spreads[k] = (spread - spread[:, out] @ taken[:, : len(scale)])[np.ix_(rest, rest)]
+            coefficients[k] = (coefficients[k] - spread[:, out] @ taken[:, len(scale) :])[rest]
+        poles, scale = np.delete(poles, weakest), scale[rest]
+    residues = (np.hstack(coefficients) / scale[:, None])[: poles.size * size].reshape(
+        poles.size, size, data.values.shape[1]
+    )
+    norms = scale[: poles.size * size].reshape(poles.size, size)
+    participation = [_of_rank_one(each, norm) for each, norm in zip(residues, norms, strict=True)]
+    return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
+
+
+def _of_rank_one(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
+    """Participation (n_excitations,) of the outer product nearest to residues (2 n_excitations, n_outputs).
+
+    Args:
+        residues: real parts, then imaginary parts with their sign turned.
+        norm: (2 n_excitations,) of the columns they belong to.
+    """
+    half = len(residues) // 2
+    size = np.maximum(np.hypot(norm[:half], norm[half:]), 1e-300)
+    return np.asarray(np.linalg.svd((residues[:half] - 1j * residues[half:]) * size[:, None])[0][:, 0] / size)
 
 
 class _Modes:
@@ -58,6 +154,7 @@ class _Modes:
     def __init__(self, data: Measurement, false_alarm: float, budget: Budget) -> None:
         self.data, self.budget = data, budget
         self.excitations = data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
+        self._scored: tuple[Fit, list[tuple[float, np.ndarray, complex]]] | None = None
         self.limit = float(chi2.isf(false_alarm / data.cells, 2 * (data.values.shape[1] + self.excitations)))
 
     def n_modes(self, model: Fit) -> int:
@@ -67,18 +164,19 @@ class _Modes:
         return candidate[0]
 
     def strongest(self, model: Fit, rejected: list[tuple[complex, float]]) -> tuple[complex, np.ndarray] | None:
-        tries = [pole for pole in _to_try(self.data, model) if not self._near(pole, rejected)]
-        bases, left = bases_of(self.data, model), model.residual / model.noise
-        scored = [(*_added(self.data, bases, left, pole), pole) for pole in tries]
-        if not scored:
+        if self._scored is None or self._scored[0] is not model:
+            bases, left = bases_of(self.data, model), model.residual / model.noise
+            self._scored = model, [(*_added(self.data, bases, left, p), p) for p in _to_try(self.data, model)]
+        left_over = [item for item in self._scored[1] if not self._near(item[2], rejected)]
+        if not left_over:
             return None
-        strength, participation, pole = max(scored, key=lambda item: item[0])
+        strength, participation, pole = max(left_over, key=lambda item: item[0])
         return None if strength < ENTER * self.threshold(model, pole) else (pole, participation)
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
         poles = np.append(model.poles, candidate[0])
         participation = np.vstack([model.participation, candidate[1]])
-        return search(self.data, poles, participation, model.noise, STEPS_IN, self.budget)
+        return search(self.data, poles, participation, model.noise, STEPS_IN, self.budget, DECIDED)
 
     def gain(self, smaller: Fit, larger: Fit) -> float:
         """The noise of each output unknown."""
@@ -96,15 +194,34 @@ class _Modes:
     def settled(self, model: Fit) -> Fit:
         return settled(self.data, model, budget=self.budget)
 
+    def started(self, start: Fit) -> Fit:
+        """A start fitted, without the modes that are spurious or that the others may take over.
+
+        The weaker half of them goes, then half of those that are left; one that goes in error is found again.
+        """
+        whole = model = self.settled(start)
+        while model.poles.size and not self.budget.spent("check of each mode"):
+            evidence = np.where(_spurious(self.data, model), 0.0, whole_evidence_of(model))
+            weak = np.flatnonzero(evidence < [self.threshold(model, pole) for pole in model.poles])
+            if not weak.size:
+                break
+            out = weak[np.argsort(evidence[weak])[: (weak.size + 1) // 2]]
+            rest = np.delete(np.arange(model.poles.size), out)
+            fewer = projected(self.data, model.poles[rest], model.participation[rest])
+            model = settled(self.data, fewer, STEPS_OUT, self.budget, DECIDED)
+        return model if model is whole else self.settled(model)
+
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """Those that are spurious, weak, or close to another."""
-        spurious = _spurious(self.data, model)
+        spurious, whole_evidence = _spurious(self.data, model), whole_evidence_of(model)
         for r, pole in enumerate(model.poles):
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < CLOSE * abs(pole.real)
-            if spurious[r] or near or evidence_of(model, r) < WEAK * self.threshold(model, pole):
+            threshold = self.threshold(model, pole)
+            doubtful = near and whole_evidence[r] < DISTINCT * threshold
+            if spurious[r] or doubtful or evidence_of(model, r) < WEAK * threshold:
                 rest = np.delete(np.arange(model.poles.size), r)
                 without = projected(self.data, model.poles[rest], model.participation[rest])
-                yield complex(pole), settled(self.data, without, STEPS_OUT, self.budget), bool(spurious[r])
+                yield complex(pole), settled(self.data, without, STEPS_OUT, self.budget, DECIDED), bool(spurious[r])
 
     def _near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
         return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
@@ -126,7 +243,7 @@ def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: c
     Only the part of its response outside the basis of the columns so far counts.
     """
     real, imaginary = data.responses(pole)
-    columns, size, strength, wanted = np.hstack([real, imaginary]), real.shape[1], 0.0, []
+    columns, strength, wanted = np.hstack([real, imaginary]), 0.0, []
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     together = [left] if data.weights is None else np.hsplit(left, left.shape[1])
     for weights, basis, rest in zip(weights_of(data), bases, together, strict=True):
@@ -138,9 +255,7 @@ def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: c
         wanted.append((vt.T[:, good] / s[good]) @ seen / scale[:, None])
         strength += float((seen**2).sum())
     residues = np.hstack(wanted)
-    norm = np.hypot(scale[:size], scale[size:])
-    participation = np.linalg.svd((residues[:size] - 1j * residues[size:]) * norm[:, None])[0][:, 0] / norm
-    return strength, participation
+    return strength, _of_rank_one(residues, scale)
 
 
 def bases_of(data: Measurement, fit: Fit) -> list[np.ndarray]:
@@ -186,4 +301,29 @@ def evidence_of(fit: Fit, r: int) -> float:
         c = part.coefficients[both] / noise[first : first + part.residual.shape[1]]
         first += c.shape[1]
         found += float((c * np.linalg.solve(part.spread[np.ix_(both, both)], c)).sum())
+    return found
+
+
+def whole_evidence_of(fit: Fit) -> np.ndarray:
+    """χ² of each mode's shape in the noise, (n_modes,), poles and participation of all modes unknown."""
+    n, bound, free = fit.poles.size, covariance(fit), free_parameters(fit)
+    found = np.zeros(n)
+    if n == 0:
+        return found
+    amplitudes = fit.coefficients[: 2 * n].reshape(2, n, -1)
+    drift = [np.einsum("ct,tkj->cjk", part.tilt[: 2 * n], moves(fit, part)[:, free]) for part in fit.parts]
+    for r in range(n):
+        both = [r, n + r]
+        drifts = np.concatenate([each[both] for each in drift], axis=1)
+        size = 2 * drifts.shape[1]
+        spread = drifts.reshape(size, -1) @ bound @ drifts.reshape(size, -1).T
+        spread = spread.reshape(2, size // 2, 2, size // 2)
+        first = 0
+        for part in fit.parts:
+            own = part.spread[np.ix_(both, both)]
+            for j in range(first, first + part.residual.shape[1]):
+                spread[:, j, :, j] += own * fit.noise[j] ** 2
+            first += part.residual.shape[1]
+        c = amplitudes[:, r].ravel()
+        found[r] = c @ np.linalg.solve(spread.reshape(size, size), c)
     return found
