@@ -1,11 +1,17 @@
 """Plates and frames of blind trials against closed forms and published values, and trials made on them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from workbench.cases.case import Case
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all, place_values
+from workbench.rig.actuators import Actuator, piezo_patch
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle
@@ -211,3 +217,24 @@ def test_a_small_blind_trial_is_passed(structure):
     held = hold_trials(3, 271, structure=structure, kinds=[("point_damper",), (), ("actuator_gain", "clearance")])
     assert all(s["kinds"] for s in held.scores.values()), held.tally.counts
     assert held.tally.misplaced == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ground_spring", "point_mass", "coulomb_friction"])
+def test_what_hides_in_a_cantilever_with_patches_is_named(kind):
+    cantilever = {"left": "clamped", "right": "free", "bottom": "free", "top": "free"}
+    plate = _plate(cantilever, length=(1.2, 0.8), bending_stiffness=175.0, damping=ModalDamping(0.005))
+    patches = [piezo_patch(f"P{i}", at, length=(0.2, 0.15)) for i, at in enumerate([(0.5, 0.24), (0.84, 0.52)])]
+    places = [(0.36, 0.56), (0.7, 0.2), (1.1, 0.7), (1.15, 0.1), (0.9, 0.4)]
+    sensors = [Sensor(f"a{i}", at, "acceleration") for i, at in enumerate(places)]
+    rig = Rig(plate.modes(6), (*patches, Actuator("hammer", (0.9, 0.66), direct=True)), sensors, structure=plate)
+    commands = np.zeros((3, 1500))
+    commands[:2] = np.repeat(np.random.default_rng(0).normal(size=(2, 500)), 3, axis=1)
+    dt = 0.1 / rig.modes.frequencies_hz[4]
+    quiet = simulate(rig, commands, sample_time=dt, name="high")
+    noise = 2e-3 * quiet.outputs.std(axis=1)
+    rig = replace(rig, sensors=[replace(s, noise_std=n) for s, n in zip(rig.sensors, noise, strict=True)])
+    like = Case("patches", rig, (quiet,), ())
+    held = hold_trials(1, 3, like=like, kinds=[(kind,)])
+    (score,) = held.scores.values()
+    assert score["kinds"] and score["positions"], held.verdicts
