@@ -37,6 +37,7 @@ class JointSettings:
         credible: times the stated noise that noise found may be; more is a gap.
         surely_late: of a sample: an accelerometer that is later stays on its side of the jumps when an effect is added;
             what was seen of the others may have been the gap.
+        delays: of a sample: what accelerometers are tried to be late or early by, to see which side of jumps they read.
         jump: times the power of the change over the span before a sample that the change after it has at a jump.
     """
 
@@ -69,6 +70,7 @@ class JointSettings:
     last_tolerance: float = 1e-7
     credible: float = 3.0
     surely_late: float = 0.05
+    delays: tuple[float, ...] = (0.1, 0.25, 0.5)
     jump: float = 10.0
 
 
@@ -260,8 +262,13 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
 
     before, at, after = (left(delay) for delay in (-JUST_LATE, 0.0, JUST_LATE))
     step, smooth = (search.data.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
-    gain = (search.data.by_channel(at) - search.data.by_channel(after)).sum(axis=0)
+    # where motion is quick between samples, what a sensor reads a while before a jump is not what it reads at once
+    delays = np.array([*(-delay for delay in SETTINGS.delays), 0.0, JUST_LATE, *SETTINGS.delays])
+    powers = np.array([search.data.by_channel(left(float(delay))).sum(axis=0) for delay in delays])
+    likeliest = {s.name: float(delays[i]) for s, i in zip(search.rig.sensors, powers.argmin(axis=0), strict=True)}
     rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > SETTINGS.jump * smooth[j]]
-    late = (*known, *(search.rig.sensors[j].name for j in rows if gain[j] > 0))
-    early = tuple(search.rig.sensors[j].name for j in rows if gain[j] <= 0)
-    return nominal_errors(search.rig, replace(errors.target, late=late, early=early), errors.values)
+    sided = {search.rig.sensors[j].name: likeliest[search.rig.sensors[j].name] for j in rows}
+    late = (*known, *(name for name, delay in sided.items() if delay > 0))
+    early = tuple(name for name, delay in sided.items() if delay <= 0)
+    starts = {**errors.values, **{f"delay_{name}": delay for name, delay in sided.items()}}
+    return nominal_errors(search.rig, replace(errors.target, late=late, early=early), starts)

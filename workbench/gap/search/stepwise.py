@@ -379,13 +379,19 @@ class Stepwise:
         Where frequencies are off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        none = nominal_errors(search.rig, search.prior)
-        if self.steps:
-            before = surely_late(self.last.errors)
-            known = {name: self.last.errors.values[name] for name in (f"delay_{late}" for late in before.target.late)}
-            none = nominal_errors(search.rig, replace(search.prior, late=before.target.late), known)
-        none = on_their_sides(search, none, effects)
-        ahead = fit(search.rig, (*effects, none), search.ahead, iterations=JOINTLY.iterations, chord=True)
+        sides = [on_their_sides(search, nominal_errors(search.rig, search.prior), effects)]
+        if self.steps:  # what was late before may have been so for want of an effect
+            late = surely_late(self.last.errors).target.late
+            known = {name: self.last.errors.values[name] for name in (f"delay_{sensor}" for sensor in late)}
+            kept = nominal_errors(search.rig, replace(search.prior, late=late), known)
+            sides.append(on_their_sides(search, kept, effects))
+        by_sides = {errors.target.late: errors for errors in sides}
+        started = {
+            late: fit(search.rig, (*effects, errors), search.ahead, iterations=JOINTLY.iterations, chord=True)
+            for late, errors in by_sides.items()
+        }
+        best = min(started, key=lambda late: started[late].cost)
+        ahead, none = started[best], by_sides[best]
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
             return found
