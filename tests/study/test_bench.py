@@ -133,7 +133,7 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"weight": [1.0, 1.0, 1.0, float("nan")]}, "finite numbers; got nan"),
         ({"actuators": [2.0, 2.0, 6.0, 8.0]}, "both stand at x = 2"),
         ({"actuators": [2.0] * 41}, "at most 40"),
-        ({"actuators": ["a"]}, "finite numbers; got 'a'"),
+        ({"actuators": ["a", 2.0, 6.0, 8.0]}, "a position x in m; got 'a'"),
         ({"struck_at": 11.0}, "outside the structure"),
         ({"struck_at": [1.0, 2.0]}, "a place is a position along the structure, m; got"),
         ({"sensors": [[1.0, "b"]]}, "sensors is made of finite numbers; got 'b'"),
