@@ -18,12 +18,11 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import NamedPoints
-from workbench.structure.finite_elements import FiniteElements
+from workbench.trials.plane_frame import Section, plane_frame
 
 WIDTH, STOREY, STOREYS = 0.4, 0.3, 3  # m
-COLUMN = {"ea": 2.1e11 * 0.03 * 0.002, "ei": 2.1e11 * 0.03 * 0.002**3 / 12, "mass": 7850 * 0.03 * 0.002}  # a strip
-FLOOR = {"ea": 2.1e11 * 0.05 * 0.006, "ei": 2.1e11 * 0.05 * 0.006**3 / 12, "mass": 7850 * 0.05 * 0.006}
+COLUMN = Section(2.1e11 * 0.03 * 0.002, 2.1e11 * 0.03 * 0.002**3 / 12, 7850 * 0.03 * 0.002)  # a strip
+FLOOR = Section(2.1e11 * 0.05 * 0.006, 2.1e11 * 0.05 * 0.006**3 / 12, 7850 * 0.05 * 0.006)
 N_MODES, DAMPING = 8, 0.01
 BETWEEN = ("L1.x", "R2.x")
 STIFFNESS, YIELD = 900.0, 1.2e-4  # N/m, m: of the brace along x, until its bolts slip
@@ -47,48 +46,8 @@ def frame():
             chain = (f"{side}{storey - 1}", f"{side.lower()}{storey}", f"{side}{storey}")
             members += [(*ends, COLUMN) for ends in pairwise(chain)]
         members += [(*ends, FLOOR) for ends in pairwise((f"L{storey}", f"C{storey}", f"R{storey}"))]
-    index = {node: 3 * i for i, node in enumerate([*at, *ground])}
-    m, k = np.zeros((2, 3 * len(index), 3 * len(index)))
-    for one, other, strip in members:
-        rows = np.r_[index[one] + np.arange(3), index[other] + np.arange(3)]
-        for matrix, own in zip((m, k), element(np.array((at | ground)[one]), np.array((at | ground)[other]), strip)):
-            matrix[np.ix_(rows, rows)] += own
-    free = 3 * len(at)
-    names = tuple(f"{node}.{direction}" for node in at for direction in ("x", "y", "rz"))
-    positions = np.repeat([(x, y, 0.0) for x, y in at.values()], 3, axis=0)
-    points = NamedPoints(names, positions, ("x", "y", "rz") * len(at), tuple(node for node in at for _ in range(3)))
     lines = [(one, other) for one, other, _ in members]
-    return FiniteElements(m[:free, :free], k[:free, :free], nodes=points, damping=ModalDamping(DAMPING)), lines, at
-
-
-def element(one, other, strip):
-    """Consistent mass and stiffness (6, 6) of a plane beam element (Przemieniecki 1968, sections 5.6 and 11.3)."""
-    along = other - one
-    n = np.linalg.norm(along)
-    c, s = along / n
-    turn = np.kron(np.eye(2), [[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    k, m = np.zeros((6, 6)), np.zeros((6, 6))
-    axial, bent = np.ix_([0, 3], [0, 3]), np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
-    k[axial] = strip["ea"] / n * np.array([[1, -1], [-1, 1]])
-    k[bent] = (
-        strip["ei"]
-        / n**3
-        * np.array(
-            [[12, 6 * n, -12, 6 * n], [6 * n, 4 * n**2, -6 * n, 2 * n**2]]
-            + [[-12, -6 * n, 12, -6 * n], [6 * n, 2 * n**2, -6 * n, 4 * n**2]]
-        )
-    )
-    m[axial] = strip["mass"] * n / 6 * np.array([[2, 1], [1, 2]])
-    m[bent] = (
-        strip["mass"]
-        * n
-        / 420
-        * np.array(
-            [[156, 22 * n, 54, -13 * n], [22 * n, 4 * n**2, 13 * n, -3 * n**2]]
-            + [[54, 13 * n, 156, -22 * n], [-13 * n, -3 * n**2, -22 * n, 4 * n**2]]
-        )
-    )
-    return turn.T @ m @ turn, turn.T @ k @ turn
+    return plane_frame(at | ground, members, fixed=tuple(ground), damping=ModalDamping(DAMPING)), lines, at
 
 
 def measured(modes, name, level, seed):
