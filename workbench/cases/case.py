@@ -26,7 +26,7 @@ from workbench.records.limits import check_size
 from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.rig.actuators import Actuator, piezo_patch
-from workbench.rig.rig import Rig
+from workbench.rig.rig import Rig, derivative_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints, Place, PlaceError
@@ -281,9 +281,8 @@ def _check_ports(
 
 def _check_stands(port: Actuator | Sensor, modes: Modes, where: str) -> None:
     """Refuse a place that the structure does not have, or a direction or an axis that it does not have there."""
-    turning = port.kind == "moment" if isinstance(port, Actuator) else MEASURED[port.quantity][0] == 1
     try:
-        modes.phi_at(port.at, int(turning), direction=port.direction)
+        modes.phi_at(port.at, derivative_of(port), direction=port.direction)
     except PlaceError as error:
         raise CaseError(f"{where}: {error}") from None
 

@@ -14,19 +14,21 @@ from workbench.structure.plate import Membrane, Plate
 from workbench.structure.printed import Printed, counted, place_text
 
 
+def derivative_of(port: Actuator | Sensor) -> int:
+    """0 where a port acts on or measures a displacement, 1 where it does a slope."""
+    return int(port.kind == "moment") if isinstance(port, Actuator) else MEASURED[port.quantity][0]
+
+
 def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
     """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain.
 
     Raises:
         PlaceError: naming the actuator or sensor whose place or direction the structure does not have.
     """
-    if isinstance(port, Actuator):
-        what, derivative = "actuator", int(port.kind == "moment")
-    else:
-        what, derivative = "sensor", MEASURED[port.quantity][0]
     try:
-        return modes.phi_at(port.at, derivative, direction=port.direction)
+        return modes.phi_at(port.at, derivative_of(port), direction=port.direction)
     except PlaceError as error:
+        what = "actuator" if isinstance(port, Actuator) else "sensor"
         raise PlaceError(f"{what} {port.name}: {error}") from None
 
 
