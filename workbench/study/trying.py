@@ -165,13 +165,13 @@ def _share(rig: Rig, share: float) -> Place:
     """A place at that share of the structure; of named points the one that moves most."""
     domain = rig.modes.domain
     if isinstance(domain, NamedPoints):
-        return liveliest(rig)
+        return _liveliest(rig)
     if isinstance(domain, Interval):
         return share * domain.length
     return (share * domain.length[0], share * domain.length[1])
 
 
-def liveliest(rig: Rig) -> str:
+def _liveliest(rig: Rig) -> str:
     """The named point that the first elastic mode moves most."""
     first = int(np.argmax(rig.modes.omega > 0))
     names = rig.modes.domain.grid(1)
