@@ -226,6 +226,19 @@ def test_the_server_answers_its_own_page_and_nobody_else(bench):
     assert request(bench, "POST", "/try", design, **own)[0] == 200, "it lives on"
 
 
+@pytest.fixture
+def opened(look, until):
+    """A page of that width, once the bars of its work are drawn and all of it is within the width."""
+
+    def at(port, width):
+        browser = look(f"http://127.0.0.1:{port}/", width)
+        until(lambda: browser.find_elements("css selector", "#work .marks rect"))
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        return browser
+
+    return at
+
+
 @pytest.mark.parametrize("width", [390, 1200])
 def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
     from selenium.webdriver import ActionChains
@@ -273,14 +286,12 @@ def test_it_can_be_played_on(bench, look, drawn, moves, until, width, tmp_path):
 
 
 @pytest.mark.parametrize("width", [390, 1200])
-def test_actuators_are_dragged_over_a_plate(plate, look, until, width, tmp_path):
+def test_actuators_are_dragged_over_a_plate(plate, opened, until, width, tmp_path):
     from selenium.webdriver import ActionChains, Keys
 
     rig, text = plate
     with serving(rig, text, tmp_path / "studies") as port:
-        browser = look(f"http://127.0.0.1:{port}/", width)
-        until(lambda: browser.find_elements("css selector", "#work .marks rect"))
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        browser = opened(port, width)
         track, pictures = browser.find_element("css selector", ".track"), set()
         until(lambda: pictures.add(track.get_attribute("href")) or len(pictures) > 3)
 
@@ -363,14 +374,12 @@ def test_a_design_saved_on_a_frame_is_a_study_that_runs_and_agrees(frame, tmp_pa
 
 
 @pytest.mark.parametrize("width", [390, 1200])
-def test_actuators_are_dragged_from_point_to_point_of_a_frame(frame, look, until, width, tmp_path):
+def test_actuators_are_dragged_from_point_to_point_of_a_frame(frame, opened, until, width, tmp_path):
     from selenium.webdriver import ActionChains, Keys
 
     rig, text = frame
     with serving(rig, text, tmp_path / "studies") as port:
-        browser = look(f"http://127.0.0.1:{port}/", width)
-        until(lambda: browser.find_elements("css selector", "#work .marks rect"))
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+        browser = opened(port, width)
         track, drawn = browser.find_element("css selector", ".track"), set()
         until(lambda: drawn.add(track.get_attribute("d")) or len(drawn) > 3)
         first = browser.find_elements("css selector", ".handle.actuators")[0]
