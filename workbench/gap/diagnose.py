@@ -136,7 +136,7 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
 def _outcome(rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: Sequence[Record], settle: float) -> str:
     if found.outcome != "explained" or shrinkage is None:
         return found.outcome
-    inputs = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else np.zeros(len(unseen))
+    inputs = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else 0.0
     return "part" if _fails_unseen(found, shrinkage, inputs) else found.outcome
 
 

@@ -118,7 +118,9 @@ def budget_of(
     order = [effects[i] for i in by_size]
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
-    by_inputs = np.minimum(SCATTER * logged**2 * power_of_inputs(rig, records, settle), rest) if logged else 0.0 * left
+    by_inputs = np.zeros_like(left)
+    if logged:
+        by_inputs = np.minimum(SCATTER * logged**2 * power_of_inputs(rig, records, settle), rest)
     rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
     for i, effect in enumerate(order):  # what no model can predict is theirs
         if effect.kind.remainder:

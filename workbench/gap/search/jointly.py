@@ -260,14 +260,14 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
         tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in jumping}})
         return search.data.residual(apply_all(search.rig, (*effects, tried)))
 
-    before, at, after = (left(delay) for delay in (-JUST_LATE, 0.0, JUST_LATE))
-    step, smooth = (search.data.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
     # where motion is quick between samples, what a sensor reads a while before a jump is not what it reads at once
     delays = np.array([*(-delay for delay in SETTINGS.delays), 0.0, JUST_LATE, *SETTINGS.delays])
-    powers = np.array([search.data.by_channel(left(float(delay))).sum(axis=0) for delay in delays])
-    likeliest = {s.name: float(delays[i]) for s, i in zip(search.rig.sensors, powers.argmin(axis=0), strict=True)}
+    residuals = {float(delay): left(float(delay)) for delay in delays}
+    before, at, after = left(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
+    step, smooth = (search.data.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
+    powers = np.array([search.data.by_channel(residual).sum(axis=0) for residual in residuals.values()])
     rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > SETTINGS.jump * smooth[j]]
-    sided = {search.rig.sensors[j].name: likeliest[search.rig.sensors[j].name] for j in rows}
+    sided = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
     late = (*known, *(name for name, delay in sided.items() if delay > 0))
     early = tuple(name for name, delay in sided.items() if delay <= 0)
     starts = {**errors.values, **{f"delay_{name}": delay for name, delay in sided.items()}}

@@ -11,7 +11,8 @@ from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
+from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
+from workbench.gap.search.beside_inputs import beside_inputs
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import SETTINGS as JOINTLY
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened, surely_late
@@ -51,9 +52,7 @@ class StepwiseSettings:
         astray: share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray.
         loud: times the noise of the sensors that a set must leave above it for noise of the inputs to be heard in it;
             less of it does no harm to a mean square.
-        inputs: mean square, white, that a set may leave beside noise of the logged inputs for that to be searched on.
-        too_white: likewise, for less of which that noise was not what was left.
-        hearings: rounds of learning the sensors' noise beside it.
+        too_white: mean square, white, beside noise of the inputs, for less of which that was not what was left.
     """
 
     shorter: float = 30.0
@@ -76,9 +75,7 @@ class StepwiseSettings:
     excluded: float = 1e-3
     astray: float = 0.02
     loud: float = 0.5
-    inputs: float = 2.0
     too_white: float = 0.8
-    hearings: int = 2
 
 
 SETTINGS = StepwiseSettings()
@@ -91,6 +88,7 @@ class Stepwise:
         search: what it works on.
         tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
         singles: the likeliest effects alone, without errors, which the first one is chosen among too.
+        at_first: the search without noise of the logged inputs.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
         is_beyond: whether effects crowd about one place, as they do where a law is beyond the catalogue.
@@ -98,8 +96,8 @@ class Stepwise:
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
-        likeliest = spread_over_kinds(singles, 1)
-        self.singles = [f for f in likeliest if f.effects[0].kind not in COMMON][: SETTINGS.singles]
+        likeliest = [f for f in spread_over_kinds(singles, 1) if f.effects[0].kind not in COMMON]
+        self.singles = likeliest[: SETTINGS.singles]
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
@@ -177,33 +175,11 @@ class Stepwise:
         loud = plain.excess(plain.sensor_noise) > SETTINGS.loud * float(plain.sensor_noise.mean())
         if plain.logged < LEAST_LOGGED or not loud:
             return self._go_on(search, step, plain) if self.search.logged else None
-        beside = self._beside_inputs(step, plain)
+        beside = beside_inputs(search, step.fit, plain.sensor_noise)
         if beside is None:
             return None
         fitted = fit_jointly(beside, step.effects, step.errors)
         return None if fitted.fit.cost < SETTINGS.too_white else self._go_on(beside, step, fitted)
-
-    def _beside_inputs(self, step: Step, plain: Step) -> Search | None:
-        """The search beside noise of the logged inputs as a step shows it; None where that is not what it leaves.
-
-        Args:
-            plain: the step as it leaves the records without that noise.
-        """
-        search = self.at_first
-        rig = apply_all(search.rig, step.fit.effects)
-        left, found = search.data.differences(rig), search.with_noise(np.sqrt(plain.sensor_noise) * search.data.noise)
-        # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
-        heard = [likeliest_share(rig, s.data, left) for s in (search, found)]
-        (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
-        beside = louder.beside_inputs(rig, share)
-        white = measured(beside, step.fit).fit
-        if share < LEAST_LOGGED or white.cost > SETTINGS.inputs:
-            return None
-        for _ in range(SETTINGS.hearings):  # each sensor's noise by the power of its innovations
-            louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
-            beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
-            white = measured(beside, step.fit).fit
-        return beside
 
     def _go_on(self, search: Search, step: Step, fitted: Step) -> Step:
         """The step as it was fitted in another search, which goes on in that."""
@@ -380,8 +356,9 @@ class Stepwise:
         """
         search = self.search
         sides = [on_their_sides(search, nominal_errors(search.rig, search.prior), effects)]
-        if self.steps:  # what was late before may have been so for want of an effect
-            late = surely_late(self.last.errors).target.late
+        # what was late before may have been so for want of an effect
+        late = surely_late(self.last.errors).target.late if self.steps else ()
+        if late:
             known = {name: self.last.errors.values[name] for name in (f"delay_{sensor}" for sensor in late)}
             kept = nominal_errors(search.rig, replace(search.prior, late=late), known)
             sides.append(on_their_sides(search, kept, effects))
@@ -441,7 +418,7 @@ class Stepwise:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         if step.logged > LEAST_LOGGED and not self.search.logged:
-            search = self._beside_inputs(step, step) or search
+            search = beside_inputs(self.at_first, step.fit, step.sensor_noise) or search
         found = in_place_of_errors(search, step.effects, step.errors)
         if found is not None:
             self.search = search

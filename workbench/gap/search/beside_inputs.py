@@ -1,0 +1,36 @@
+"""What holds beside noise of the logged inputs, which is loud at resonances and alike in all sensors."""
+
+import numpy as np
+
+from workbench.gap.effects.effect import apply_all
+from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
+from workbench.gap.search.fit import Fit
+from workbench.gap.search.jointly import measured
+from workbench.gap.search.search import Search
+
+WHITE = 2.0  # mean square, white, that a set may leave beside that noise for a search to go on beside it
+HEARINGS = 2  # rounds of learning the sensors' noise beside it
+
+
+def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
+    """The search beside noise of the logged inputs as a set shows it; None where that is not what the set leaves.
+
+    Args:
+        search: without that noise.
+        fitted: the set, errors of the nominal model among it.
+        sensor_noise: (n_outputs,) mean square of each sensor's noise as found without it, over that of the stated one.
+    """
+    rig = apply_all(search.rig, fitted.effects)
+    left, found = search.data.differences(rig), search.with_noise(np.sqrt(sensor_noise) * search.data.noise)
+    # what is left is loud with noise of the inputs, so the stated noise of the sensors may be the better
+    heard = [likeliest_share(rig, s.data, left) for s in (search, found)]
+    (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
+    beside = louder.beside_inputs(rig, share)
+    white = measured(beside, fitted).fit
+    if share < LEAST_LOGGED or white.cost > WHITE:
+        return None
+    for _ in range(HEARINGS):  # each sensor's noise by the power of its innovations
+        louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
+        beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
+        white = measured(beside, fitted).fit
+    return beside
