@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from workbench.cases.points import write_points
+from workbench.design.estimation.modal_filter import point_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.closed_loop import close_loop, impulse_state
@@ -357,9 +358,14 @@ def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
     at_rest[rig.modes.n_modes + 2 :] = 0.0
     expected = finite_spillover(loop, at_rest, design.final_time).residual_total
     assert shown(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
+    sensors = ["l.x", "R.x", "m.y"]
+    through = close_loop(rig.modes, law, point_filter(rig.modes.select([0, 1]), sensors))
+    expected = finite_spillover(through, at_rest, design.final_time).residual_total
+    seen = shown(rig, asked({**plain(moved), "sensors": sensors}))
+    assert seen["residual"] == pytest.approx(expected, rel=1e-5)
     for change, words in (
         ({"actuators": ["L.x", "Q.x"]}, "there is no point 'Q.x'"),
-        ({"sensors": ["r.x"]}, "leave the sensors out"),
+        ({"sensors": ["r.x"]}, "a filter of 2 modes at named points needs at least as many sensors; got 1"),
     ):
         with pytest.raises(ValueError, match=words):
             shown(rig, asked({**plain(design), **change}))

@@ -186,9 +186,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     """
     modes, domain = rig.modes, _domain(rig)
     if isinstance(domain, NamedPoints):
-        domain.locate([*design.actuators, design.struck_at])
-        if design.sensors:
-            raise StudyError("modal filters from sensors need a structure between them; leave the sensors out")
+        domain.locate([*design.actuators, *design.sensors, design.struck_at])
     for at in () if isinstance(domain, NamedPoints) else (*design.actuators, *design.sensors, design.struck_at):
         if isinstance(at, tuple) != isinstance(domain, Rectangle):
             wanted = "a pair (x, y) on the plate" if isinstance(domain, Rectangle) else "a position along the structure"
@@ -202,7 +200,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     else:
         law = coupled_lqr(modes, design.controlled, actuators, weight=design.weight[0])
     through = None
-    if design.sensors and rig.structure is not None:
+    if design.sensors:
         through = filter_on(rig.structure, modes.select(range(design.controlled)), design.sensors)
     loop = close_loop(modes, law, through)
     fastest = float(loop.poles.real.max())

@@ -1,9 +1,10 @@
-"""Modal filters: from sensors along a structure to modal coordinates, by interpolation; weights computed once.
+"""Modal filters: from sensors to modal coordinates; weights computed once.
 
-Dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors.
+Along a structure, dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors. At
+named points, between which nothing can be interpolated, by least squares.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,6 +18,7 @@ from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 
 GAUSS_POINTS = 24
+BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: below, noise is raised a million times
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +26,7 @@ class ModalFilter:
     """Weights that turn readings into modal coordinates; rates go through the same weights.
 
     Attributes:
-        positions: (n_sensors,) m, increasing; on a plate (n_sensors, 2) m.
+        positions: (n_sensors,) m, increasing; on a plate (n_sensors, 2) m; at named points (n_sensors,) names.
         displacement: (n_modes, n_sensors) weights of the displacements (or velocities).
         slope: (n_modes, n_sensors) weights of the slopes (or angular velocities); no columns where none are read.
         designed_by: designs it anew, with the settings that it has, for other modes.
@@ -36,12 +38,14 @@ class ModalFilter:
     designed_by: Callable[[Modes], "ModalFilter"] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("positions", "displacement", "slope"):
+        named = np.asarray(self.positions).dtype.kind in "OU"
+        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+        for name in ("displacement", "slope"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
     def places(self) -> list[Place]:
-        """The positions as places: floats, or pairs of floats."""
+        """The positions as places: floats, pairs of floats, or names."""
         return [same_place(at) for at in self.positions]
 
     def __call__(self, displacement: ArrayLike, slope: ArrayLike | None = None) -> Floats:
@@ -115,6 +119,42 @@ def displacement_filter(
     weights = _spline_weights(modes, splines, as_profile(mass_per_length))
     again = partial(displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
+
+
+def point_filter(modes: Modes, points: Sequence[str]) -> ModalFilter:
+    """The filter of displacements at named points that fits the readings best: q = Φ⁺ y, Φ⁺ = (ΦᵀΦ)⁻¹ Φᵀ.
+
+    Φ (n_sensors, n_modes) are the shapes at the sensors; the filtered modes are seen exactly, each without the others
+    (Preumont, Vibration Control of Active Structures, spatial filters).
+
+    Args:
+        modes: to be filtered, n_modes of them, at named points.
+        points: of the sensors.
+
+    Raises:
+        ValueError: two sensors at one point, fewer sensors than modes, or modes that they cannot tell apart.
+    """
+    names = list(points)
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"two of the {len(names)} sensors stand at point {twice}; move one")
+    if len(names) < modes.n_modes:
+        raise ValueError(
+            f"a filter of {modes.n_modes} modes at named points needs at least as many sensors; got {len(names)}: add"
+            " sensors, or filter fewer modes"
+        )
+    shapes = modes.phi(names)
+    left, strength, right = np.linalg.svd(shapes, full_matrices=False)
+    if strength[-1] < BLIND * strength[0]:
+        mixed = np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max()) + 1
+        raise ValueError(
+            f"the sensors at {', '.join(names)} cannot tell filtered mode(s) {', '.join(map(str, mixed))} from rest or"
+            " from each other; move or add a sensor"
+        )
+    weights: Floats = (right.T / strength) @ left.T
+    return ModalFilter(
+        np.array(names, object), weights, np.zeros((modes.n_modes, 0)), partial(point_filter, points=names)
+    )
 
 
 def _spline_weights(modes: Modes, splines: BSpline, mass: Profile) -> Floats:

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RBFInterpolator
 
 from workbench.arrays import Floats
-from workbench.design.estimation.modal_filter import ModalFilter, displacement_filter
-from workbench.structure.domain import Rectangle
+from workbench.design.estimation.modal_filter import ModalFilter, displacement_filter, point_filter
+from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.field import FieldLike, as_field
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
@@ -54,13 +54,21 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     return ModalFilter(at, spread, np.zeros((modes.n_modes, 0)), again)
 
 
-def filter_on(structure: Structure | Plate | Membrane, modes: Modes, places: ArrayLike) -> ModalFilter:
-    """The filter of displacements of a structure's own kind: a spline along it, or a thin-plate spline over it.
+def filter_on(structure: Structure | Plate | Membrane | None, modes: Modes, places: ArrayLike) -> ModalFilter:
+    """The filter of displacements of a structure's own kind: along it, over it, or at its named points.
 
     Args:
+        structure: whose mass a filter along or over it needs; None at named points.
         modes: of the structure, to be filtered.
-        places: of the sensors, m, in any order.
+        places: of the sensors, in any order.
+
+    Raises:
+        ValueError: no structure where one is needed, or sensors that make no filter.
     """
+    if isinstance(modes.domain, NamedPoints):
+        return point_filter(modes, [str(name) for name in np.ravel(np.asarray(places, object))])
+    if structure is None:
+        raise ValueError("a modal filter needs the structure between the sensors, for its mass; describe it")
     if isinstance(structure, Plate | Membrane):
         return surface_filter(modes, places, structure.mass_per_area)
     return displacement_filter(modes, np.sort(np.asarray(places, float)), structure.mass_per_length)

@@ -16,7 +16,7 @@ from workbench.design.spillover.explain import Explanation, explain
 from workbench.design.spillover.spillover import Spillover, effort, finite_spillover, quadratic_cost
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
-from workbench.structure.domain import Place
+from workbench.structure.domain import NamedPoints, Place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.plate import Membrane, Plate
@@ -121,19 +121,20 @@ def through_sensors(
         modes: controlled and residual.
         laws: to try.
         places: of the sensors.
-        structure: whose mass the filters need; none are tried where it is not known.
+        structure: whose mass the filters need, but at named points; none are tried where it is needed and not known.
 
     Returns:
         Controller, explanation on the full plant, and where it cannot be, (None, None, why).
     """
     stands = sorted(dict.fromkeys(places))
     tried: list[tuple[Controller | None, Explanation | None, str]] = []
+    ways = (True, False) if structure is not None or isinstance(modes.domain, NamedPoints) else (False,)
     for law in laws:
         own = modes.select(law.controlled)
         sensors = [Sensor(f"y{i + 1}", x) for i, x in enumerate(stands)]
-        for by_filter in (True, False) if structure is not None else (False,):
+        for by_filter in ways:
             try:
-                if by_filter and structure is not None:
+                if by_filter:
                     controller = filtered(law, filter_on(structure, own, stands))
                 else:
                     controller = luenberger(modes, law, sensors, poles=OBSERVER_POLES * own.omega)
