@@ -12,7 +12,7 @@ import skfem
 from scipy.sparse.linalg import eigsh
 from skfem.helpers import dd, ddot, dot, grad
 
-from workbench.draw.distributions import places_found, stiffness_found
+from workbench.draw.identification import places_found, stiffness_found
 from workbench.identification.free_decay.order import identify
 from workbench.identification.signal.synthesis import free_decay
 from workbench.identification.updating.local_loss import LocatedDamage, locate_damage

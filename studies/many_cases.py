@@ -14,7 +14,7 @@ from workbench import study as many
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.spillover.spillover import effort, spillover
-from workbench.draw.many import plot_cases
+from workbench.draw.tables import plot_cases
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
 from workbench.study.engines import packed, unpacked

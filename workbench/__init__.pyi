@@ -65,7 +65,6 @@ from .structure.domain import Between as Between
 from .structure.domain import Interval as Interval
 from .structure.domain import NamedPoints as NamedPoints
 from .structure.domain import Rectangle as Rectangle
-from .structure.field import Field as Field
 from .structure.finite_elements import FiniteElements as FiniteElements
 from .structure.member import Bar as Bar
 from .structure.member import Beam as Beam
@@ -75,6 +74,7 @@ from .structure.modes import mac as mac
 from .structure.modification import attach as attach
 from .structure.plate import Membrane as Membrane
 from .structure.plate import Plate as Plate
+from .structure.profile import Field as Field
 from .structure.profile import Profile as Profile
 from .structure.supports import Edge as Edge
 from .structure.supports import End as End

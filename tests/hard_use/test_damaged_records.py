@@ -9,9 +9,8 @@ from scipy.io import savemat
 from typer.testing import CliRunner
 
 from workbench.cli.app import app
-from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_record, write_record
-from workbench.records.limits import Limits
+from workbench.records.limits import Limits, RecordFileError
 from workbench.records.record import Channel, Record
 
 ENDINGS = (".csv", ".npz", ".mat", ".h5", ".uff")

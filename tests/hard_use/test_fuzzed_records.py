@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from workbench.records.file_error import RecordFileError, unreadable
 from workbench.records.files import read_measured, write_record
-from workbench.records.limits import DEFAULT
+from workbench.records.limits import DEFAULT, RecordFileError, unreadable
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 

@@ -5,9 +5,8 @@ import pytest
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import wavfile
 
-from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_record
-from workbench.records.limits import Limits
+from workbench.records.limits import Limits, RecordFileError
 from workbench.records.units import split_unit, unit_named
 
 G = 9.80665  # m/s^2, by definition

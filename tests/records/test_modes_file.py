@@ -6,7 +6,7 @@ import pytest
 import pyuff
 from scipy.io import savemat
 
-from workbench.records.file_error import RecordFileError
+from workbench.records.limits import RecordFileError
 from workbench.records.modes_file import read_modes
 
 FREQUENCIES, DAMPING, MASSES = np.array([11.5, 23.25]), np.array([0.01, 0.02]), np.array([4.0, 0.25])

@@ -4,8 +4,8 @@ import pytest
 import pyuff
 from scipy.io import savemat
 
-from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_measured, read_record
+from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.resample import decimate
 from workbench.records.transfer_file import impulse_record, read_transfer

@@ -9,9 +9,9 @@ from skfem.helpers import dd, ddot, trace
 from workbench.structure import surface_ritz
 from workbench.structure.damping import ModalDamping, ViscousDamping
 from workbench.structure.domain import Rectangle
-from workbench.structure.field import Field
 from workbench.structure.member import Beam
 from workbench.structure.plate import Membrane, Plate
+from workbench.structure.profile import Field
 from workbench.structure.supports import Edge, End, PointDamper, PointMass, PointSpring
 from workbench.structure.surface_ritz import solve
 

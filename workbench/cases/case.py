@@ -20,9 +20,8 @@ from workbench.cases.tables import (
     tables,
     text,
 )
-from workbench.records.file_error import RecordFileError
 from workbench.records.files import read_record
-from workbench.records.limits import check_size
+from workbench.records.limits import RecordFileError, check_size
 from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.rig.actuators import Actuator, piezo_patch

@@ -16,13 +16,12 @@ from workbench.draw.accuracy import plot_bands
 from workbench.draw.beam import plot_motion
 from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
-from workbench.draw.prediction import plot_prediction
-from workbench.draw.robust import plot_redesign
+from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.spectra import plot_distortion
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.draw.surface import plot_point_modes, plot_surface_modes
 from workbench.gap.report.verdict import Verdict
-from workbench.identification.free_decay.refined import Refined
+from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
 from workbench.identification.signal.modal_estimates import ModalEstimates

@@ -21,11 +21,15 @@ from workbench.identification.input_output.mode_clusters import overlap_remarks
 from workbench.identification.input_output.model_order import DECIDED, Selected, evidence_of, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.subspace_poles import subspace_poles
-from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.modal_estimates import ModalEstimates, credible, normalised_shapes
+from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
+from workbench.identification.signal.modal_estimates import (
+    ModalEstimates,
+    credible,
+    normalised_shapes,
+    time_derivatives,
+)
 from workbench.identification.signal.order_selection import FALSE_ALARM
-from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread

@@ -11,13 +11,11 @@ from workbench.identification.free_decay.drift import HIGHEST_DEGREE, without_dr
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.proportional import ProportionalFit, proportional_fit
-from workbench.identification.free_decay.refined import Identified, Refined, in_coloured_noise, unshaped
-from workbench.identification.free_decay.refinement import refine
-from workbench.identification.free_decay.remarks import SURE, remarks
+from workbench.identification.free_decay.refinement import Identified, Refined, in_coloured_noise, refine, unshaped
 from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
-from workbench.identification.signal.budget import SECONDS, Budget, Progress
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
 from workbench.identification.signal.decay import decay_start
+from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
@@ -37,6 +35,11 @@ UNCORRELATED = 3.0
 LEFT_OVER, MOST_LEFT, STANDS_OUT = 0.1, 0.25, 5.0
 # Bins about a mode, and beside.
 BAND, BESIDE = 6, 60
+SURE = 3.0
+HIGHEST_OVERTONE = 9
+# Amplitude of an overtone, relative to its base, at most.
+OVERTONE_AT_MOST = 0.03
+WITHIN = 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -313,3 +316,41 @@ def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[s
     return (
         f"the residual, {share:.2g} % of the motion, is not white: standard errors by its spectrum about each mode",
     )
+
+
+def remarks(refined: Refined, records: Record | Sequence[Record]) -> tuple[str, ...]:
+    """One remark a mode, empty where there is none.
+
+    Slower than the record is long: a drift. A damping ratio not three standard errors above zero: a hum, if it goes on
+    to the end, or, three below zero, a growth. A whole multiple of the frequency of a mode thirty times as strong:
+    perhaps only the distortion of that one (a mode may stand there too: those of a hinged beam do).
+    """
+    modes, found = refined.modes, []
+    size = np.abs(np.stack(refined.amplitudes) / refined.noise[:, :, None]).max(axis=(0, 1))
+    records = [records] if isinstance(records, Record) else records
+    span = max(record.n_samples * record.sample_time for record in records)
+    for r in range(modes.n_modes):
+        f, zeta, doubt = modes.frequencies_hz[r], modes.zeta[r], SURE * refined.zeta_std[r]
+        base, times = _base(modes.frequencies_hz, size, r)
+        if f * span < 1.0:
+            found.append("slower than the record is long: a drift?")
+        elif zeta < -doubt:
+            found.append("grows")
+        elif base is not None:
+            found.append(f"{times} x mode {base + 1}: its overtone?")
+        elif zeta < doubt:
+            goes_on = zeta * modes.omega[r] * span < 1.0
+            found.append("does not decay: a hum?" if goes_on else "damping no larger than its error")
+        else:
+            found.append("")
+    return tuple(found)
+
+
+def _base(frequencies: np.ndarray, size: np.ndarray, r: int) -> tuple[int | None, int]:
+    """The mode of which r may be an overtone, and which."""
+    for base in np.argsort(-size):
+        times = round(frequencies[r] / frequencies[base])
+        near = abs(frequencies[r] / frequencies[base] - times) < WITHIN * times
+        if 2 <= times <= HIGHEST_OVERTONE and near and size[r] < OVERTONE_AT_MOST * size[base]:
+            return int(base), times
+    return None, 0

@@ -19,10 +19,9 @@ from workbench.identification.input_output.modal_fit import Fit, projected, sett
 from workbench.identification.input_output.mode_clusters import NARROW, overlap_remarks, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
-from workbench.identification.signal.budget import SECONDS, Budget, Progress
-from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes
+from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
+from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes, time_derivatives
 from workbench.identification.signal.order_selection import FALSE_ALARM
-from workbench.identification.signal.synthesis import time_derivatives
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen

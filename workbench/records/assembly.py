@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from workbench.records.checksum import KEY, checksum
-from workbench.records.file_error import RecordFileError
+from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.units import Unit, split_unit, unit_named
 

@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.records.file_error import RecordFileError, unreadable
-from workbench.records.limits import DEFAULT, Limits, check_arrays
+from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_arrays, unreadable
 
 NAMES = "names"
 REFUSED, NO_MEMORY = 3, 4

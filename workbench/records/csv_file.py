@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.records.file_error import RecordFileError
-from workbench.records.limits import DEFAULT, Deadline, Limits, check_counts
+from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import Signals
 from workbench.records.table_layout import LONGEST_LINE, MARK, Layout, check_length, check_row, encoding_of, layout_of
 from workbench.records.units import split_unit, time_factor

@@ -9,8 +9,7 @@ import h5py
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.file_error import RecordFileError
-from workbench.records.limits import BYTES_PER_NUMBER, DEFAULT, Limits, check_counts
+from workbench.records.limits import BYTES_PER_NUMBER, DEFAULT, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, numbered
 
 

@@ -1,4 +1,4 @@
-"""How much a file may hold, and how long it may take to read."""
+"""What a file may hold, how long it may take to read, and the error that every reader and writer raises."""
 
 import time
 from collections.abc import Iterable
@@ -7,12 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.records.file_error import RecordFileError
-
 COPIES = 4  # of a record, at most, in memory while it is read
 BYTES_PER_NUMBER = 8
 MOST_BYTES = 2**30
 MOST_CHANNELS = 10_000
+LONGEST = 200  # of a message that is passed on, characters
+
+
+class RecordFileError(ValueError):
+    """A file that holds no usable record; the message names file, channel and row."""
+
+
+def unreadable(path: Path, error: Exception) -> RecordFileError:
+    """What a reader's failure says of a file: its first line, shortened, and nothing that a terminal would obey."""
+    text = next(iter(str(error).splitlines()), "") or type(error).__name__
+    shown = "".join(c if c.isprintable() else "?" for c in text[:LONGEST]) + ("..." if len(text) > LONGEST else "")
+    return RecordFileError(f"{path} cannot be read as {path.suffix[1:].upper()}: {shown}")
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.records import hdf5_file, mat_file, npz_file, uff_modes
-from workbench.records.file_error import RecordFileError, unreadable
-from workbench.records.limits import check_size
+from workbench.records.limits import RecordFileError, check_size, unreadable
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.records.file_error import RecordFileError
-from workbench.records.limits import check_counts
+from workbench.records.limits import RecordFileError, check_counts
 from workbench.records.transfer_assembly import SURE_RATES
 from workbench.records.units import time_factor
 

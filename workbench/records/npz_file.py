@@ -9,8 +9,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from workbench.records.file_error import RecordFileError, unreadable
-from workbench.records.limits import DEFAULT, Deadline, Limits, check_counts
+from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts, unreadable
 from workbench.records.named_arrays import HEADER
 
 ENDING = ".npy"

@@ -14,7 +14,7 @@ from io import TextIOBase
 from pathlib import Path
 
 from workbench.records.checksum import KEY
-from workbench.records.file_error import RecordFileError
+from workbench.records.limits import RecordFileError
 from workbench.records.units import unit_named
 
 MARK = "# record "

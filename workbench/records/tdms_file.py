@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.file_error import RecordFileError
-from workbench.records.limits import DEFAULT, Limits, check_counts
+from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_counts
 
 
 def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from workbench.records.assembly import legible
-from workbench.records.file_error import RecordFileError
+from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel
 from workbench.records.transfer_functions import TransferFunctions
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.records.confined import load_confined
-from workbench.records.file_error import RecordFileError
+from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pyuff
 
 from workbench.records.confined import load_confined
-from workbench.records.file_error import RecordFileError
-from workbench.records.limits import DEFAULT, Limits
+from workbench.records.limits import DEFAULT, Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_assembly import DESCRIPTION
 

@@ -7,8 +7,7 @@ import numpy as np
 import pyuff
 
 from workbench.records.confined import load_confined
-from workbench.records.file_error import RecordFileError
-from workbench.records.limits import Limits
+from workbench.records.limits import Limits, RecordFileError
 
 NORMAL_MODE = 2  # analysis_type of both formats
 AT_NODES = 1  # dataset_location of 2414

@@ -9,8 +9,8 @@ import numpy as np
 
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import Rectangle
-from workbench.structure.field import Field, FieldLike, as_field
 from workbench.structure.modes import Modes
+from workbench.structure.profile import Field, FieldLike, as_field
 from workbench.structure.supports import HELD, SIDES, Attachment, Edge, PointDamper, PointMass, PointSpring, as_edges
 from workbench.structure.surface_basis import EdgeSpring, PointTerm, Square, SurfaceProblem
 from workbench.structure.surface_ritz import SurfaceModes, solve

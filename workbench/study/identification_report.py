@@ -10,8 +10,8 @@ from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
 from workbench.identification.free_decay.proportional import ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
-from workbench.identification.signal.budget import SECONDS, Progress
 from workbench.identification.signal.data_quality import check_data_quality
+from workbench.identification.signal.least_squares import SECONDS, Progress
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
 from workbench.identification.transfer import TransferModes, identify_transfer
 from workbench.records.record import Channel, Record

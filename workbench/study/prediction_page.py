@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from workbench.draw.prediction import MOST_SENSORS, plot_prediction
+from workbench.draw.robust import MOST_SENSORS, plot_prediction
 from workbench.records.record import Record
 from workbench.robust.check import PredictionCheck
 from workbench.robust.prediction import LEVEL, Prediction

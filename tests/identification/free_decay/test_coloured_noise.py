@@ -10,9 +10,8 @@ from scipy.stats import chi2
 from workbench.identification.driven import identify_driven
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refined import in_coloured_noise
-from workbench.identification.free_decay.refinement import refine
-from workbench.identification.signal.noise import noise_near
+from workbench.identification.free_decay.refinement import in_coloured_noise, refine
+from workbench.identification.signal.projection import noise_near
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes

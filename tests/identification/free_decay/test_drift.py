@@ -6,7 +6,7 @@ import pytest
 from workbench.identification.free_decay.drift import without_drift
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound
-from workbench.identification.free_decay.remarks import remarks
+from workbench.identification.ring_down import remarks
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.modes import SampledModes
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.identification.free_decay.refinement import refine
-from workbench.identification.shapes.bands import eigenfunction_bands
-from workbench.identification.shapes.boundary_check import check_ends
+from workbench.identification.shapes.bands import check_ends, eigenfunction_bands
 from workbench.identification.shapes.eigenfunctions import KnownEnds
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.member import Beam

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from workbench.identification.shapes.bands import peano_kernel
 from workbench.identification.shapes.eigenfunctions import KnownEnds, best_degrees, eigenfunctions, interpolating_spline
-from workbench.identification.shapes.interpolation_error import peano_kernel
 from workbench.identification.signal.synthesis import impulse_response_modes
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import SampledModes

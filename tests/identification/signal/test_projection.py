@@ -1,11 +1,26 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+from scipy.stats import bartlett, chi2
 
-from workbench.identification.free_decay.refinement import refine
+from workbench.identification.driven import identify_driven
+from workbench.identification.free_decay.long_records import identify_long
+from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.signal import projection
-from workbench.identification.signal.projection import power_sums, project
+from workbench.identification.signal.projection import differ, power_sums, project, variances
 from workbench.identification.signal.synthesis import free_decay
+from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
+
+SHAPES = np.random.default_rng(3).standard_normal((3, 3)) + 0.1j
+MODES = SampledModes(2 * np.pi * np.array([3.0, 9.0, 9.4]), [0.01, 0.006, 0.012], SHAPES, np.linspace(0, 1, 3))
+STRUCK = np.array([[1.0, 0.3j, -0.5], [1.2, -1.0, 0.8j]])
+# The second record is louder, and ten times as noisy, but for one sensor.
+NOISE = np.array([[0.01, 0.02, 0.01], [0.1, 0.2, 0.01]])
+DRAWS = 100
 
 
 @pytest.fixture(scope="module")
@@ -50,3 +65,108 @@ def test_refined_by_parts_is_the_same(truth, monkeypatch, noise):
     assert (np.abs(parts.modes.zeta - whole.modes.zeta) < 0.01 * whole.zeta_std + 1e-11).all()
     if noise:
         assert np.allclose(parts.covariance, whole.covariance, rtol=0.01, atol=1e-5 * np.abs(whole.covariance).max())
+
+
+def records(seed, n=(400, 500), noise=NOISE):
+    rng, found = np.random.default_rng(seed), []
+    for struck, n_samples, std in zip(STRUCK, n, noise, strict=True):
+        clean = free_decay(replace(MODES, shapes=SHAPES * struck), sample_time=0.01, n_samples=n_samples)
+        found.append(replace(clean, outputs=clean.outputs + std[:, None] * rng.standard_normal(clean.outputs.shape)))
+    return found
+
+
+def least():
+    """Standard errors of ω and ζ that none can be below."""
+    told = [
+        np.linalg.inv(cramer_rao_bound(replace(MODES, shapes=SHAPES * struck), record, noise_std=std).covariance)
+        for struck, record, std in zip(STRUCK, records(0), NOISE, strict=True)
+    ]
+    return np.sqrt(np.diag(np.linalg.inv(sum(told))))
+
+
+def within(normalised):
+    """Whether the squares of normalised errors may be those of unit normals, to one chance in a thousand each way."""
+    squares, size = float((normalised**2).sum()), normalised.size
+    return chi2.ppf(1e-3, size) < squares < chi2.isf(1e-3, size)
+
+
+def test_errors_are_true_and_at_the_bound_where_one_record_is_ten_times_noisier():
+    truth, limit, figures, own, shapes = np.r_[MODES.omega, MODES.zeta], least(), [], [], []
+    k, each = np.abs(SHAPES).argmax(axis=0), np.arange(3)
+    others = np.arange(3)[:, None] != k
+    for seed in range(DRAWS):
+        found = refine(records(seed), MODES)
+        errors = np.r_[found.modes.omega, found.modes.zeta] - truth
+        figures.append(errors / limit)
+        own.append(errors / np.sqrt(np.diag(found.covariance)))
+        seen = (found.modes.shapes / found.modes.shapes[k, each] - SHAPES / SHAPES[k, each]).real
+        shapes.append(seen[others] / found.shape_std[others])
+    assert within(np.array(figures)) and within(np.array(own)) and within(np.array(shapes))
+    # 600 intervals of 95 %: the share that holds strays by 0.009 (one sigma)
+    assert abs((np.abs(own) < 1.96).mean() - 0.95) < 0.03
+    assert np.allclose(found.noise, NOISE, rtol=0.15)
+
+
+def test_modes_are_counted_by_the_quieter_record():
+    """Both roads find the third mode, which the noisy record hides, and say the errors that the bound allows."""
+    for found in (identify(records(0)).refined, identify_long(records(0), most_modes=20).refined):
+        assert found.modes.n_modes == 3
+        assert np.allclose(np.sqrt(np.diag(found.covariance)), least(), rtol=0.12)
+
+
+def test_shapes_are_those_of_the_record_that_shows_them():
+    """A blow at a node of the first mode is loud, and says nothing of its shape."""
+    loud = free_decay(replace(MODES, shapes=SHAPES * [1e-4, 9.0, 9.0]), sample_time=0.01, n_samples=400)
+    quiet = free_decay(replace(MODES, shapes=SHAPES * [1.0, 0.5, 0.5]), sample_time=0.01, n_samples=400)
+    rng = np.random.default_rng(0)
+    noisy = [replace(r, outputs=r.outputs + 0.02 * rng.standard_normal(r.outputs.shape)) for r in (loud, quiet)]
+    found, alone = refine(noisy, MODES), refine(noisy[1], MODES)
+    assert np.allclose(found.shape_std[:, 0], alone.shape_std[:, 0], rtol=0.1)
+    assert (found.shape_std[:, 1:] <= 0.1 * alone.shape_std[:, 1:]).all()
+
+
+def test_variances_are_pooled_where_records_may_be_alike():
+    squares, free = np.array([[90.0, 90.0], [110.0, 1000.0]]), np.array([100, 100])
+    assert np.array_equal(differ(squares, free), [False, True])
+    assert np.allclose(variances(squares, free), [[1.0, 0.9], [1.0, 10.0]])
+    # Bartlett's statistic against scipy's, of samples
+    samples = [np.random.default_rng(k).standard_normal(n) * s for k, (n, s) in enumerate([(20, 1.0), (30, 1.6)])]
+    squares = np.array([[((x - x.mean()) ** 2).sum()] for x in samples])
+    assert differ(squares, np.array([19, 29]))[0] == (bartlett(*samples).pvalue < 0.05)
+    assert differ(squares * [[1.0], [2.0]], np.array([19, 29]))[0]
+
+
+def driven_records(seed, noise):
+    """Two records of a chain of two modes under forces of their own, held between samples."""
+    rng, found = np.random.default_rng(seed), []
+    for std in noise:
+        u = rng.standard_normal((1, 400))
+        z = [
+            lfilter([0.0, (m - 1.0) / p], [1.0, -m], u[0] + 0j)
+            for p, m in zip(POLES, np.exp(0.02 * POLES), strict=True)
+        ]
+        clean = (SEEN @ np.array(z)).real
+        channels = (Channel("a", "velocity"), Channel("b", "velocity"))
+        y = clean + std[:, None] * rng.standard_normal(clean.shape)
+        found.append(Record(0.02, y, channels, u, (Channel("f", "force"),)))
+    return found
+
+
+POLES = np.array([-0.2 + 12.0j, -0.3 + 31.0j])
+SEEN = np.array([[1.0, 0.8 + 0.1j], [0.5, -1.0]])
+
+
+def test_driven_records_count_by_their_noise():
+    quiet, noisy = np.array([0.02, 0.01]), np.array([0.2, 0.1])
+    own = []
+    for seed in range(3):
+        pair = driven_records(seed, (noisy, quiet))
+        found = identify_driven(pair)
+        assert found.modes.n_modes == 2
+        errors = np.r_[found.modes.omega, found.modes.zeta] - np.r_[np.abs(POLES), -POLES.real / np.abs(POLES)]
+        own.append(errors / np.sqrt(np.diag(found.covariance)))
+    assert within(np.array(own))
+    assert np.allclose(found.noise, [noisy, quiet], rtol=0.15)
+    # The noisy record can add a hundredth to what the quiet one tells, and must not take from it.
+    alone = identify_driven(pair[1])
+    assert (found.omega_std < 1.02 * alone.omega_std).all() and (found.zeta_std < 1.02 * alone.zeta_std).all()

@@ -9,10 +9,10 @@ from scipy.interpolate import RBFInterpolator
 from workbench.arrays import Floats
 from workbench.design.estimation.modal_filter import ModalFilter, displacement_filter, point_filter
 from workbench.structure.domain import NamedPoints, Rectangle
-from workbench.structure.field import FieldLike, as_field
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
+from workbench.structure.profile import FieldLike, as_field
 
 READINGS = 3  # not on one line: what a plane through them needs
 PER_SIDE = 24  # readings of zero along a held edge of the longer side

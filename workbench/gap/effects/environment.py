@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Evidence, Kind, Parameter, place_of, place_parameters, place_values
+from workbench.gap.effects.effect import Evidence, Kind, Parameter, Scales, place_of, place_parameters, place_values
 from workbench.gap.effects.nonlinear import with_element
-from workbench.gap.effects.scales import Scales
-from workbench.identification.signal.periodicity import period_of
+from workbench.identification.signal.distortion import period_of
 from workbench.records.record import Record
 from workbench.rig.elements import PeriodicForce, RandomForce
 from workbench.rig.rig import Rig

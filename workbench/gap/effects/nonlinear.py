@@ -7,8 +7,16 @@ from typing import Any
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.effect import Effect, Evidence, Kind, Parameter, place_of, place_parameters, place_values
-from workbench.gap.effects.scales import Scales
+from workbench.gap.effects.effect import (
+    Effect,
+    Evidence,
+    Kind,
+    Parameter,
+    Scales,
+    place_of,
+    place_parameters,
+    place_values,
+)
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import (
     AirDrag,

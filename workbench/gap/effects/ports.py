@@ -13,11 +13,11 @@ from workbench.gap.effects.effect import (
     Evidence,
     Kind,
     Parameter,
+    Scales,
     place_of,
     place_parameters,
     place_values,
 )
-from workbench.gap.effects.scales import Scales
 from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach

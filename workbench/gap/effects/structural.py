@@ -13,19 +13,19 @@ from workbench.gap.effects.effect import (
     Kind,
     Moved,
     Parameter,
+    Scales,
     place_of,
     place_parameters,
     place_values,
 )
-from workbench.gap.effects.scales import Scales
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping, ViscousDamping
 from workbench.structure.domain import Between
-from workbench.structure.field import Field
 from workbench.structure.member import Beam, Structure
 from workbench.structure.modes import Modes
 from workbench.structure.modification import attach
 from workbench.structure.plate import Membrane, Plate
+from workbench.structure.profile import Field
 from workbench.structure.supports import HELD, Attachment, End, PointDamper, PointMass, PointSpring
 
 RESOLUTION, ROUGHLY = 1e-6, 1e-4  # of a frequency; of the highest of many

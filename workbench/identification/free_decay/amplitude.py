@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refined import Refined, in_coloured_noise
-from workbench.identification.free_decay.refinement import refine
+from workbench.identification.free_decay.refinement import Refined, in_coloured_noise, refine
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread

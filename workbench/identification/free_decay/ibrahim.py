@@ -16,8 +16,7 @@ import numpy as np
 from scipy.linalg import lstsq, svd
 
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.modal_estimates import normalised_shapes
-from workbench.identification.signal.synthesis import time_derivatives
+from workbench.identification.signal.modal_estimates import normalised_shapes, time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
 

@@ -22,9 +22,16 @@ from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refined import Identified, as_refined, in_coloured_noise, unshaped
-from workbench.identification.free_decay.refinement import MOST_STEPS, noise_level, search
-from workbench.identification.signal.budget import Budget
+from workbench.identification.free_decay.refinement import (
+    MOST_STEPS,
+    Identified,
+    as_refined,
+    in_coloured_noise,
+    noise_level,
+    search,
+    unshaped,
+)
+from workbench.identification.signal.least_squares import Budget
 from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, spurious_modes
 from workbench.identification.signal.projection import Projection
 from workbench.records.record import Record

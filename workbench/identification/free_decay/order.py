@@ -20,13 +20,18 @@ from scipy.stats import chi2
 from workbench.arrays import Complexes
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
-from workbench.identification.free_decay.refined import Identified, in_coloured_noise, unshaped
-from workbench.identification.free_decay.refinement import MOST_STEPS, refine, search
-from workbench.identification.signal.budget import SEARCH, SECONDS, Budget, Progress
+from workbench.identification.free_decay.refinement import (
+    MOST_STEPS,
+    Identified,
+    in_coloured_noise,
+    refine,
+    search,
+    unshaped,
+)
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
-from workbench.identification.signal.noise import differ, variances, whitened
+from workbench.identification.signal.least_squares import SEARCH, SECONDS, Budget, Progress
 from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, Stepwise, spurious_modes
-from workbench.identification.signal.projection import project
+from workbench.identification.signal.projection import differ, project, variances, whitened
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refined import Refined
+from workbench.identification.free_decay.refinement import Refined
 from workbench.structure.damping import ProportionalDamping
 from workbench.structure.modes import frozen
 

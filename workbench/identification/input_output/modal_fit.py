@@ -17,8 +17,7 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from workbench.identification.signal.budget import Budget
-from workbench.identification.signal.least_squares import minimise
+from workbench.identification.signal.least_squares import Budget, minimise
 
 MOST_STEPS = 60
 # A step is negligible once it moves the estimate by less than a thousandth of its standard error, squared.

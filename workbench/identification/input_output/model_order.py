@@ -16,7 +16,7 @@ from workbench.identification.input_output.modal_fit import (
     search,
     settled,
 )
-from workbench.identification.signal.budget import Budget
+from workbench.identification.signal.least_squares import Budget
 from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Stepwise
 from workbench.structure.modes import mac
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.fft import dct, idct
 
-from workbench.identification.signal.noise import ORDER, ROUNDING, SAMPLES_EACH, differ, variances, white
+from workbench.identification.signal.projection import ORDER, ROUNDING, SAMPLES_EACH, differ, variances, white
 
 # Root mean square of log ratios below which two spectra are the same.
 ALIKE = 0.1

@@ -1,28 +1,48 @@
-"""Confidence bands of eigenfunctions: the sensors' noise carried along the structure, and the interpolation error.
+"""Confidence bands of eigenfunctions, from noise and interpolation error; the boundary condition check.
 
 With values v at the sensors, a spline W(x) v and the scale q = v^T M v, M = ∫ m W^T W dx, the eigenfunction is
 φ(x) = W(x) v / √q, and an error dv of the values and the interpolation error e(x) move it by
 
     dφ(x) = J(x) dv + e(x) / √q - φ(x) ∫ m W v e dx / q,     J(x) = W(x) / √q - φ(x) (M v)^T / q
 
-so that its covariance along the structure is J C J^T plus that of e, from `interpolation_error`. A band that holds the
-whole
-curve, not each point by itself, is wider: its width is the quantile of the largest |dφ(x)| / std(x) along the
-structure, drawn from that covariance.
+so that its covariance along the structure is J C J^T plus that of e. A band that holds the whole curve, not each point
+by itself, is wider: its width is the quantile of the largest |dφ(x)| / std(x) along the structure, drawn from that
+covariance.
+
+Interpolation error. A linear rule S that is exact for polynomials of degree below p has for any function f the error
+(Peano)
+
+    f(x) - S f(x) = ∫ K(x, u) f^(p)(u) du,     K(x, u) = [(x - u)_+^(p-1) - S (· - u)_+^(p-1)] / (p - 1)!
+
+and p = 4 suits a beam: a point mass or a spring is an impulse in φ''''. Taken as white of strength τ² along the
+structure, φ'''' gives S the mean square error τ² ∫ K² du at x, nothing at a sensor and most beyond the last. τ² is the
+upper limit of what the errors of splines through the other sensors allow, beside that sensor's and their noise.
+
+Boundary condition check. Splines that do not assume the boundary condition extrapolate the derivatives t that it sets
+to zero. Their covariance is that of the sensors' noise and of the interpolation error, τ² at its upper limit. Over all
+modes and all conditions of one end, Σ t^T Cov^-1 t is chi-square where the end is as stated.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import factorial
 from typing import Any
 from warnings import warn
 
 import numpy as np
+from scipy.optimize import brentq, minimize_scalar
 from scipy.special import ndtri
+from scipy.stats import chi2
 
-from workbench.identification.free_decay.refined import Refined
-from workbench.identification.shapes.boundary_check import check_ends
-from workbench.identification.shapes.eigenfunctions import KnownEnds, Splines, inertia_of, mass_matrix
-from workbench.identification.shapes.interpolation_error import LeaveOneOut, peano_kernel
+from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.shapes.eigenfunctions import (
+    KnownEnds,
+    Spline,
+    Splines,
+    inertia_of,
+    interpolating_spline,
+    mass_matrix,
+)
 from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.structure.modes import frozen
 from workbench.structure.profile import ProfileLike
@@ -32,6 +52,152 @@ from workbench.threads import one_blas_thread
 DRAWS = 4000
 # Of the largest standard error; below it an end holds the curve and there is nothing to be unsure of.
 HELD = 1e-6
+ORDER, CELLS = 4, 400
+# Chance that noise alone is taken for interpolation error, and that τ² is larger than its limit.
+UNLIKELY = 0.05
+# Splines of higher degree extrapolate further from fewer sensors, and err more where a mode is short for its sensors.
+DEGREES = (5, 3)
+# Share of the variance of each derivative that is independent of the others: K knows their ratio no better.
+OF_ITS_OWN = 0.01
+# Chance that a correct end is refused.
+REFUSED = 1e-4
+DERIVATIVES = ("value", "slope", "curvature", "change of curvature")
+
+
+def peano_kernel(
+    spline: Spline, x: np.ndarray, positions: np.ndarray, length: float, derivative: int = 0
+) -> np.ndarray:
+    """K(x, u) √du on a grid of u, (n_points, n_cells): the squares of a row add up to the mean square error for τ² = 1.
+
+    Args:
+        spline: through the sensors at `positions`.
+        x: (n_points,) m.
+        positions: (n_sensors,) m.
+        length: m.
+        derivative: of K by x.
+    """
+    order = min(ORDER, spline.degree + 1)
+    u = (np.arange(CELLS) + 0.5) * length / CELLS
+    held = [_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions]
+    along = spline.matrix(x, derivative) @ _power(positions, u, order)
+    if held:
+        along = along + spline.of_held(x, derivative) @ np.array(held)
+    return np.asarray((_power(x, u, order, derivative) - along) * np.sqrt(length / CELLS))
+
+
+class LeaveOneOut:
+    """How splines of one degree through the other sensors predict each sensor."""
+
+    def __init__(self, positions: np.ndarray, *, length: float, ends: KnownEnds, degree: int) -> None:
+        n = positions.size
+        self.rule, kernels = np.zeros((n, n)), []
+        for j in range(n):
+            others = np.arange(n) != j
+            try:
+                spline = interpolating_spline(positions[others], length=length, ends=ends, degree=degree)
+            except ValueError as error:
+                raise ValueError(f"{n} sensors leave none to judge a spline of degree {degree} by: {error}") from error
+            self.rule[j, j] = 1.0
+            self.rule[j, others] = -spline.matrix(positions[j])[0]
+            kernels.append(peano_kernel(spline, positions[j : j + 1], positions[others], length)[0])
+        self.kernel = np.array(kernels)
+
+    def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
+        """τ² of a shape (n_sensors,) of known covariance, the upper end of its interval; 0 where it may be noise."""
+        error, noise, _ = self._errors(values, covariance)
+        by_noise = np.diag(noise)
+        together = np.sum(noise**2 / np.outer(by_noise, by_noise)) / error.size  # χ² of size / together, stretched
+        if (error**2 / by_noise).sum() < together * chi2.isf(UNLIKELY, error.size / together):
+            return 0.0
+        return self.roughest(values, covariance)
+
+    def roughest(self, values: np.ndarray, covariance: np.ndarray) -> float:
+        """The upper end of the interval of τ², noise or not."""
+        error, noise, by_rough = self._errors(values, covariance)
+        by_noise = np.diag(noise)
+
+        def unlikely(log_strength: float) -> float:
+            power = by_noise + np.exp(log_strength) * by_rough
+            return float((np.log(power) + error**2 / power).sum())
+
+        highest = np.log((np.maximum(error**2, by_noise) / by_rough).max())
+        best = minimize_scalar(unlikely, bounds=(highest - 20.0, highest), method="bounded")
+        limit = best.fun + chi2.isf(2.0 * UNLIKELY, 1)
+        return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, highest + 20.0)))
+
+    def _errors(self, values: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The prediction error of each sensor, the covariance of its noise, and its mean square for τ² = 1."""
+        error = self.rule @ values
+        noise = self.rule @ covariance @ self.rule.T + 1e-30 * (values**2).max() * np.eye(values.size)
+        by_rough = (self.kernel**2).sum(axis=1)
+        tested = by_rough > 1e-12 * by_rough.max()  # a fixed end predicts the sensor on it
+        return error[tested], noise[np.ix_(tested, tested)], by_rough[tested]
+
+
+def _power(x: np.ndarray, u: np.ndarray, order: int, derivative: int = 0) -> np.ndarray:
+    """(x - u)_+^k / k! with k = order - 1 - derivative, (n_points, n_cells)."""
+    k, apart = order - 1 - derivative, x[:, None] - u
+    return np.where(apart > 0, np.abs(apart) ** k / factorial(k), 0.0)
+
+
+def check_ends(refined: Refined, ends: KnownEnds, *, length: float) -> None:
+    """Refuse an end that the shapes contradict; of fewer than five sensors or so none is.
+
+    Args:
+        refined: shapes at placed sensors, with their covariance.
+        ends: as stated.
+        length: m.
+
+    Raises:
+        ValueError: a boundary condition that the shapes contradict.
+    """
+    values, positions = normalised_shapes(refined.modes.shapes).real, refined.modes.positions
+    for name, at in (("left", 0.0), ("right", length)):
+        conditions = [d for x, d in ends.zeros if abs(x - at) <= 1e-9 * length]
+        others = KnownEnds(tuple(zero for zero in ends.zeros if abs(zero[0] - at) > 1e-9 * length))
+        extrapolated = _extrapolated(positions, others, at, conditions, length) if conditions else None
+        if extrapolated is None:
+            continue
+        rows, error, leave_one_out = extrapolated
+        away, std, against = np.zeros((3, values.shape[1], len(conditions)))
+        for r, (v, noise) in enumerate(zip(values.T, refined.shape_covariance, strict=True)):
+            covariance = rows @ noise @ rows.T + leave_one_out.roughest(v, noise) * error @ error.T
+            known = np.linalg.inv(covariance + OF_ITS_OWN * np.diag(np.diag(covariance)))
+            # Each conditional on the others.
+            std[r] = 1.0 / np.sqrt(np.diag(known))
+            away[r] = known @ rows @ v * std[r] ** 2
+            against[r] = rows @ v * (known @ rows @ v)
+        chance = float(chi2.sf(against.sum(), against.size))
+        if chance < REFUSED:
+            r, k = divmod(int(np.argmax(np.abs(away / std))), len(conditions))
+            rest = ", given the rest" if len(conditions) > 1 else ""
+            zero = " and ".join(DERIVATIVES[d] for d in conditions)
+            raise ValueError(
+                f"the {name} end is stated to have zero {zero}, and the shapes contradict it"
+                f" (p = {max(chance, 1e-99):.1g}): of its largest entry, along the length, mode {r + 1} has a"
+                f" {DERIVATIVES[conditions[k]]} of {away[r, k]:.3g} ± {std[r, k]:.2g} there{rest}; correct the end, or"
+                " leave it out"
+            )
+
+
+def _extrapolated(
+    positions: np.ndarray, others: KnownEnds, at: float, conditions: list[int], length: float
+) -> tuple[np.ndarray, np.ndarray, LeaveOneOut] | None:
+    """The derivatives stated to be zero by the sensors, (n_conditions, n_sensors), and their interpolation error,
+    (n_conditions, n_cells), the length as unit; and how such splines predict the sensors. None where sensors are too
+    few."""
+    where: dict[str, Any] = {"length": length, "ends": others}
+    x = np.array([at])
+    for degree in DEGREES:
+        try:
+            spline = interpolating_spline(positions, degree=degree, **where)
+            leave_one_out = LeaveOneOut(positions, degree=degree, **where)
+        except ValueError:
+            continue
+        rows = [spline.matrix(x, d) * length**d for d in conditions]
+        error = [peano_kernel(spline, x, positions, length, d) * length**d for d in conditions]
+        return np.vstack(rows), np.vstack(error), leave_one_out
+    return None
 
 
 @dataclass(frozen=True, eq=False)

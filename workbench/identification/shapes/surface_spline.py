@@ -19,8 +19,8 @@ from scipy.stats import chi2
 from workbench.identification.shapes.bands import DRAWS, HELD, Bands
 from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.structure.domain import Rectangle
-from workbench.structure.field import FieldLike, as_field
 from workbench.structure.modes import Modes, SampledModes, frozen
+from workbench.structure.profile import FieldLike, as_field
 from workbench.structure.supports import SIDES
 from workbench.threads import one_blas_thread
 

@@ -1,4 +1,4 @@
-"""Nonlinear distortion and noise seen in periodic excitation, before any model.
+"""Nonlinear distortion and noise seen in periodic excitation, before any model; its period.
 
 The response of a linear structure stands on the lines that are excited. The mean over periods on the other lines is
 distortion: of an even law on even multiples of 1/T, where only odd ones are excited, and of an odd law on odd ones.
@@ -11,12 +11,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.identification.signal.periodicity import period_of
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import frozen
 
 EXCITED = 0.05  # of the largest line of the inputs: the least that counts as excited
 SETTLING = 1  # periods at the start that a structure takes to settle
+ALIKE = 0.9  # correlation of the inputs with themselves a period later; that of other lags is far less
+APART = 0.5  # correlation that comes in between: below it the inputs are no slow drift
+LEAST = 8  # samples of a period
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,3 +101,38 @@ def distortion_of(record: Record) -> Distortion:
         n_periods=n_periods,
         input_rms=float(np.sqrt((record.inputs**2).mean())),
     )
+
+
+def period_of(inputs: np.ndarray) -> int | None:
+    """Samples after which inputs repeat: the lag L of the first peak above 0.9 of their correlation with themselves.
+
+        ρ(L) = Σ_k u(k)·u(k + L) / √(Σ_k |u(k)|² Σ_k |u(k + L)|²)      over k = 0 ... n - L - 1
+
+    Args:
+        inputs: (n_inputs, n_samples); at least two periods long.
+
+    Returns:
+        The period, or None where the inputs do not repeat.
+    """
+    u = np.asarray(inputs, float)
+    n = u.shape[1]
+    most = n // 2
+    if most < 2 * LEAST or not np.any(u):
+        return None
+    spectrum = np.fft.rfft(u, 2 * n, axis=1)
+    product = np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=0))[: most + 1]
+    sums = np.r_[0.0, np.cumsum((u**2).sum(axis=0))]
+    lags = np.arange(most + 1)
+    scale = np.sqrt(sums[n - lags] * (sums[n] - sums[lags]))
+    alike = product / np.where(scale > 0, scale, np.inf)
+    apart = np.flatnonzero(alike[:most] < APART)
+    if apart.size == 0:
+        return None
+    start = max(int(apart[0]), LEAST)
+    beside = np.r_[alike, -np.inf]
+    peaks = start + np.flatnonzero(
+        (beside[start:-1] > ALIKE)
+        & (beside[start:-1] >= beside[start - 1 : -2])
+        & (beside[start:-1] >= beside[start + 1 :])
+    )
+    return int(peaks[0]) if peaks.size else None

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on whatever gives normal equations: the one nonlinear least-squares engine.
+"""Levenberg-Marquardt on whatever gives normal equations, the one nonlinear least-squares engine, and its time.
 
 Problems differ in what they linearise: squares with the linear unknowns projected out (variable projection, Golub &
 Pereyra 1973), or a likelihood (Fisher scoring). All give, at a state, a matrix N and a right-hand side g, and share the
@@ -7,15 +7,67 @@ damped step (Marquardt 1963), which does not depend on the units of the unknowns
     (D N D + μ I) D⁻¹ s = D g,     D = diag(N)^-½
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from time import thread_time
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from workbench.identification.signal.budget import Budget
-
 State = TypeVar("State")
+SECONDS = 30.0  # of processor time
+# Share of the time in which modes are searched; the rest is for refinement, standard errors and remarks.
+SEARCH = 0.6
+
+# (the search under way, the share of the time that is spent)
+Progress = Callable[[str, float], None]
+
+
+class Budget:
+    """Processor time left for an identification; searches that find it spent return the best they have.
+
+    Not time by the clock: a machine that others load gives the same result.
+
+    Attributes:
+        seconds: of processor time of this thread allowed, from the construction on.
+        progress: called as the searches go on.
+        unfinished: the searches that were ended early, each once.
+    """
+
+    def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
+        if seconds is not None and not seconds > 0:
+            raise ValueError(f"identification needs time: seconds must be positive; got {seconds:g}")
+        self.seconds, self.progress = seconds, progress
+        self.unfinished: list[str] = []
+        self._begun = thread_time()
+        self._end = self._whole = float("inf") if seconds is None else self._begun + seconds
+
+    def spent(self, search: str) -> bool:
+        """Whether the time is up; the search that asks is then noted as unfinished."""
+        now = thread_time()
+        if self.progress is not None:
+            self.progress(search, min((now - self._begun) / (self._whole - self._begun), 1.0))
+        if now < self._end:
+            return False
+        if search not in self.unfinished:
+            self.unfinished.append(search)
+        return True
+
+    def share(self, share: float) -> "Budget":
+        """A share of the time left, in (0, 1]; what it leaves unfinished counts here."""
+        part = Budget(None if self.seconds is None else share * max(self._end - thread_time(), 1e-3))
+        part.unfinished, part.progress = self.unfinished, self.progress
+        part._begun, part._whole = self._begun, self._whole
+        return part
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was left undone, in one sentence; empty where all was finished."""
+        if not self.unfinished:
+            return ()
+        what = ", ".join(self.unfinished)
+        return (f"stopped after {self.seconds:g} s, unfinished: {what}; allow more time by `seconds`",)
 
 
 @dataclass(frozen=True)

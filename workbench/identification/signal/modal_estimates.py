@@ -1,12 +1,14 @@
 """Estimates of frequencies, damping ratios and shapes: their standard errors, and how they are printed."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from html import escape
 
 import numpy as np
 from scipy.special import ndtri
 
+from workbench.records.record import Channel
+from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes
 
 # Standard errors below zero from which on a damping ratio is negative.
@@ -112,3 +114,8 @@ def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     turned = turned / np.abs(turned).max(axis=0)
     clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)
     return np.asarray(turned * np.where(turned.real[clear, np.arange(turned.shape[1])] < 0, -1.0, 1.0))
+
+
+def time_derivatives(channels: Sequence[Channel]) -> np.ndarray:
+    """Order of the time derivative each channel measures, (n_channels,); 0 where its quantity is not a motion."""
+    return np.array([MEASURED.get(channel.quantity, (0, 0))[1] for channel in channels])

@@ -12,7 +12,7 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
-from workbench.identification.signal.budget import Budget
+from workbench.identification.signal.least_squares import Budget
 from workbench.structure.modes import mac
 
 # Chance that a record of nothing but noise yields a mode.

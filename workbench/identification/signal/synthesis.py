@@ -9,11 +9,6 @@ from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import Modes, SampledModes
 
 
-def time_derivatives(channels: Sequence[Channel]) -> np.ndarray:
-    """Order of the time derivative each channel measures, (n_channels,); 0 where its quantity is not a motion."""
-    return np.array([MEASURED.get(channel.quantity, (0, 0))[1] for channel in channels])
-
-
 def impulse_response_modes(
     modes: Modes, *, at: float, positions: Sequence[float], impulse: float = 1.0
 ) -> SampledModes:

@@ -19,13 +19,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.identification.free_decay.refined import Refined
+from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.updating.distributions import Basis
-from workbench.identification.updating.fitted_structure import FittedStructure
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.identification.updating.structure_fit import MOST_TERMS, choose, with_spare_terms
 from workbench.identification.updating.structure_problem import Problem
-from workbench.identification.updating.structure_task import Task
+from workbench.identification.updating.structure_task import FittedStructure, Task
 from workbench.structure.member import Bar, Beam
 from workbench.threads import one_blas_thread
 

@@ -9,11 +9,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from workbench.identification.free_decay.refined import Refined
+from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.updating.distributions import Basis
-from workbench.identification.updating.fitted_structure import FittedStructure
 from workbench.identification.updating.structure_problem import Problem
-from workbench.identification.updating.structure_task import GaussianPrior, Task
+from workbench.identification.updating.structure_task import FittedStructure, GaussianPrior, Task
 from workbench.structure.member import Bar, Beam
 from workbench.threads import one_blas_thread
 

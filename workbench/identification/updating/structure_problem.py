@@ -21,10 +21,9 @@ from scipy.stats import chi2 as chi2_distribution
 
 from workbench.arrays import Floats
 from workbench.identification.updating.distributions import KNOWN_TOLERANCE, Basis
-from workbench.identification.updating.fitted_structure import UNLIKELY, FittedStructure, UncertainProfile
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
-from workbench.identification.updating.structure_task import Task
+from workbench.identification.updating.structure_task import UNLIKELY, FittedStructure, Task, UncertainProfile
 from workbench.structure.member import Beam
 from workbench.structure.modes import frozen, mac
 from workbench.structure.profile import Profile

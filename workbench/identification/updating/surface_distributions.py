@@ -19,9 +19,9 @@ from workbench.identification.shapes.mode_pairing import subspace_mac
 from workbench.identification.updating.distributions import mass_series, stiffness_series
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.structure.domain import Rectangle
-from workbench.structure.field import Field, FieldLike, as_field
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.plate import Plate, bending_squares
+from workbench.structure.profile import Field, FieldLike, as_field
 from workbench.structure.supports import Edge
 from workbench.threads import one_blas_thread
 

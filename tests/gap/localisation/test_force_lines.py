@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from workbench.gap.localisation.receptance import CoupledReceptances, UncoupledReceptances, receptances_of
+from workbench.gap.localisation.force_lines import CoupledReceptances, UncoupledReceptances, receptances_of
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
