@@ -54,6 +54,16 @@ def test_only_what_keeps_its_level_looks_random(rig, records):
     assert not looks_random(evidence(told, records(stiffer, 0.0)))
 
 
+def test_what_drifts_below_the_first_mode_is_not_the_forces_level(rig, records):
+    # accelerometers hardly see it: what an estimate of the force does there is chance
+    seen = evidence(replace(rig, actuators=rig.actuators[:1]), records(rig, 0.05))
+    (place, *_), n = seen.at_peaks, seen.data.counted[0].n_samples
+    slow = np.sin(2.0 * np.pi * np.arange(n) / n)
+    drifting = replace(place, force=place.force + np.concatenate([0.0 * slow, 0.2 * slow, 0.1 * slow]))
+    vars(seen)["at_peaks"] = (drifting,)
+    assert looks_random(seen)
+
+
 @pytest.mark.parametrize("law", [OneSidedStop(0.9, 80.0, 0.002), AirDrag(10.0), CoulombFriction(0.9, 0.05, 0.02)])
 def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig, records, law):
     told, real = (replace(r, elements=(law,)) for r in (replace(rig, actuators=rig.actuators[:1]), rig))

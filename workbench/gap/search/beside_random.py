@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import nominal_errors
@@ -35,7 +36,10 @@ def looks_random(evidence: Evidence) -> bool:
     """Whether the unmodelled force is as strong in every record, follows little that the rig does, and is no tone."""
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
-    levels = np.array([np.sqrt(np.mean(force**2)) for force in forces])
+    # sensors of rates hardly see a force below the first mode, and its estimate drifts there
+    elastic = evidence.rig.modes.omega[evidence.rig.modes.omega > 0] / (2.0 * np.pi)
+    slowest = float(elastic[0]) if elastic.size else 0.0
+    levels = np.array([_rms_above(slowest, force, records[0].sample_time) for force in forces])
     if len(forces) < 2 or np.ptp(levels) > SPREAD * levels.mean():
         return False
     if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
@@ -44,6 +48,13 @@ def looks_random(evidence: Evidence) -> bool:
     motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in evidence.motions]
     each = zip(forces, records, motions, strict=True)
     return max(followed(force, record.inputs, motion) for force, record, motion in each) < FOLLOWS
+
+
+def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
+    """Rms of the part of a series (n_samples,) at and above a frequency, Hz."""
+    spectrum = np.fft.rfft(force)
+    spectrum[np.fft.rfftfreq(force.size, sample_time) < frequency] = 0.0
+    return float(np.sqrt(np.mean(np.fft.irfft(spectrum, force.size) ** 2)))
 
 
 def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | None, list[Fit]]:
