@@ -14,6 +14,7 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.rig.sensors import Sensor
 from workbench.robust.posterior import UncertainRig
+from workbench.robust.proof import Proof
 from workbench.robust.redesign import redesign
 
 DT = 0.01
@@ -58,6 +59,40 @@ def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
     found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=8, placement=False)
     assert found.present_proof.share_stable == 0.0 and found.proof.share_stable == 1.0
     assert "the present controller is unstable on 8 of 8 draws" in found.sentence
+
+
+def told(stable, vibration, work):
+    """A proof with these figures of each draw, and nothing else of interest."""
+    n = len(stable)
+    none = {name: np.ones(n) for name in ("peak_force", "stroke", "settling", "effort")}
+    return Proof(
+        stable=stable, damping=np.ones((n, 2)), work=np.array(work)[:, None], controlled=(0,), vibration=vibration,
+        energy=np.ones((3, 2)), margin=1.0, margin_frequency_hz=1.0, **none,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("stable", "vibration", "work", "pays"),
+    [
+        ([True, True], [0.8, 0.9], [1.0, 1.0], True),
+        ([True, True], [0.8, 0.9], [1.02, 1.01], True),  # J by a tenth less for 1.5 % more work
+        ([True, True], [0.98, 0.97], [1.4, 1.4], False),
+        ([True, True], [1.1, 1.1], [0.7, 0.7], False),  # less work, but it costs more
+        ([True, True], [1.0, 1.0], [1.0, 1.0], False),
+        ([True, False], [0.1, np.inf], [0.5, np.inf], False),  # it may be unstable
+    ],
+)
+def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
+    rig, controller, stable, vibration, work, pays
+):
+    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    present = told([True, True], [1.0, 1.0], [-1.0, -1.0])  # damping takes energy out
+    found = replace(sure, present_proof=present, proof=told(stable, vibration, np.negative(work)), weight=0.5)
+    assert found.pays is pays
+    assert found.controller is (found.redesigned if pays else found.present)
+    assert ("Keep the present controller" in found.sentence) is not pays
+    back = replace(sure, present_proof=found.proof, proof=present, weight=0.5)
+    assert back.pays or pays or stable == [True, True], "more stable draws come first"
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):

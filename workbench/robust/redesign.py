@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,8 @@ class Redesign:
         test: what the loops were put through.
         before, after: the present and the redesigned controller on the corrected rig under test.
         present_proof, proof: both on the same draws.
+        weight: ρ of the cost J = 2 ∫ energy dt + ρ ∫ FᵀF dt, whose terms are equal over the controlled modes where
+            actuators and sensors are perfect.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
         notes: what else a reader should know.
     """
@@ -82,8 +85,36 @@ class Redesign:
     after: LoopRun
     present_proof: Proof
     proof: Proof
+    weight: float
     relocation: Relocation | None = None
     notes: tuple[str, ...] = ()
+
+    @cached_property
+    def pays(self) -> bool:
+        """Whether the redesigned controller does better than the present one, draw by draw.
+
+        It is stable on more of the draws; or on as many, and on those that both keep stable it costs less, by a larger
+        factor than it does more work: by the means of log J and log W, W = Σ_r |W_r|.
+        """
+        old, new = self.present_proof, self.proof
+        if new.stable.sum() != old.stable.sum():
+            return bool(new.stable.sum() > old.stable.sum())
+        both = old.stable & new.stable
+        if not both.any():
+            return False
+        cost_old, cost_new = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (old, new))
+        work_old, work_new = (np.abs(p.work[both]).sum(axis=1) for p in (old, new))
+        gain, dearer = float(np.log(cost_old / cost_new).mean()), float(np.log(work_new / work_old).mean())
+        return gain > max(dearer, 0.0)
+
+    @property
+    def controller(self) -> DigitalController:
+        """The one to use: the redesigned where it pays, else the present one."""
+        return self.redesigned if self.pays else self.present
+
+    @property
+    def _used(self) -> Proof:
+        return self.proof if self.pays else self.present_proof
 
     @property
     def mode(self) -> int:
@@ -105,7 +136,16 @@ class Redesign:
             text += f", unstable on {unstable} draws" if unstable else ""
             text += f"; redesigned: {self._does(new, '', named=False)}, {effort:.2g} times the effort"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
+        text += "" if self.pays else f" {self._kept}"
         return text if self.possible.explained else f"{text} {self._promise}"
+
+    @property
+    def _kept(self) -> str:
+        """Why the present controller stays."""
+        fewer = self.proof.stable.sum() < self.present_proof.stable.sum()
+        return (
+            f"Keep the present controller: {'it is stable on more draws' if fewer else 'the new one does no better'}."
+        )
 
     def _does(self, proof: Proof, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
@@ -117,14 +157,15 @@ class Redesign:
 
     @property
     def safe(self) -> bool:
-        """Whether every draw is stable, and the error that the loop bears for sure exceeds what is unexplained."""
-        holds = self.proof.margin > self.possible.unexplained or np.isnan(self.proof.margin)
-        return bool(self.proof.stable.all() and (self.possible.explained or holds))
+        """Whether the controller to use is stable on every draw, and bears an error as large as is unexplained."""
+        margin = self._used.margin
+        holds = margin > self.possible.unexplained or np.isnan(margin)
+        return bool(self._used.stable.all() and (self.possible.explained or holds))
 
     @property
     def _promise(self) -> str:
         """What can be promised where the gap is not explained."""
-        share, margin = self.possible.unexplained, self.proof.margin
+        share, margin = self.possible.unexplained, self._used.margin
         error = f"the model's readings are off by {_percent(share)} that nothing explains"
         if np.isnan(margin):
             return f"No promise: {error}, and on-off control has no linear bound."
@@ -142,6 +183,7 @@ class Redesign:
         return {
             "sentence": self.sentence,
             "safe": self.safe,
+            "pays": self.pays,
             "controlled": [r + 1 for r in self.controlled],
             "steps": [asdict(s) for s in self.steps],
             "present": self.present_proof.to_json(),
@@ -208,7 +250,7 @@ def redesign(
     steps: tuple[Step, ...]
     for _ in range(2):  # elements are worth another stiffness in the smaller motion of the redesigned loop
         anew = designed_anew(loop, corrected, modes)
-        redesigned, steps, anew = _compensated(corrected, anew, test, present)
+        redesigned, steps, anew, weight = _compensated(corrected, anew, test, present)
         after = run_loop(corrected, redesigned, test)
         if not corrected.elements or not after.bounded:
             break
@@ -222,7 +264,7 @@ def redesign(
     moved = relocated(anew, test) if placement else None
     report("done", 1.0)
     return Redesign(
-        possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, moved,
+        possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight, moved,
         _notes(possible, corrected),
     )  # fmt: skip
 
@@ -257,8 +299,11 @@ def _silent(controller: DigitalController) -> DigitalController:
 
 def _compensated(
     rig: Rig, loop: Loop, test: LoopTest, present: DigitalController
-) -> tuple[DigitalController, tuple[Step, ...], Loop]:
-    """The redesigned controller: compensations one after the other, each kept where it pays; then sensors left out."""
+) -> tuple[DigitalController, tuple[Step, ...], Loop, float]:
+    """The redesigned controller: compensations one after the other, each kept where it pays; then sensors left out.
+
+    The last that is returned is ρ of the cost, see `Redesign`.
+    """
     perfect = replace(
         rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
     )
@@ -322,7 +367,7 @@ def _compensated(
         if pays:
             removed.append(name)
             best, least = trial, step.loss
-    return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop
+    return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight
 
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
