@@ -17,7 +17,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import LAWS, simulate
-from workbench.rig.stepping import element_force
+from workbench.rig.stepping import USER, element_force
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 
@@ -223,11 +223,14 @@ def test_the_law_that_is_drawn_is_the_law_that_acts(kind):
     code, numbers = LAWS[type(one)]
     row = np.zeros((1, 3))
     row[0, : len(numbers(one))] = numbers(one)
+
+    def acting(w, v):
+        return one.law(w, v, one.parameters) if code == USER else element_force(code, row, 0, w, v, 0.0, 0.0)[0]
+
     grid = np.linspace(-0.1, 0.1, 41)
     for motion, law in kind.force_laws.items():
         paths = [(x, 0.0) if motion == "displacement" else (0.0, x) for x in grid]
-        acting = [element_force(code, row, 0, w, v, 0.0, 0.0)[0] for w, v in paths]
-        np.testing.assert_allclose(law(values, grid), acting, atol=1e-12)
+        np.testing.assert_allclose(law(values, grid), [acting(*path) for path in paths], atol=1e-12)
 
 
 @pytest.mark.parametrize(
