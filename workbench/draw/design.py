@@ -195,13 +195,13 @@ def plot_sensor_counts(margins: dict[str, np.ndarray], counts: dict[str, int | N
 
 
 def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figure:
-    """Energy left of each disturbance when the lowest n modes are controlled, uncontrolled and spilled, as shares."""
+    """Energy left of each disturbance when the lowest n modes are controlled: in modes not controlled, and by spillover."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
         total = result.energy.sum()
         ax.bar(result.counts, result.untouched / total, color=COLOURS[0], label="in modes not controlled")
         ax.bar(
-            result.counts, result.spilled / total, bottom=result.untouched / total, color=COLOURS[1], label="spilled"
+            result.counts, result.spilled / total, bottom=result.untouched / total, color=COLOURS[1], label="spillover"
         )
         if share is not None:
             ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")

@@ -74,7 +74,7 @@ def plot_dirt(scores: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 def plot_reliability(points: Sequence[Reliability]) -> Figure:
-    """Reliability diagram: the share of claims that are right against the probability that they were told with."""
+    """Reliability diagram: the share of verdicts that are right against the probability that they state."""
     figure, ax = new_figure(width=5.5, height=5)
     ax.fill_between([0, 1], [-0.1, 0.9], [0.1, 1.1], color=GREY, alpha=0.25, linewidth=0, label="within 0.1")
     ax.plot([0, 1], [0, 1], color=GREY, linewidth=1)
@@ -85,7 +85,7 @@ def plot_reliability(points: Sequence[Reliability]) -> Figure:
     for point in points:
         beside = (8, -12) if point.probability < 0.7 else (-60, -12)
         ax.annotate(f"{point.claims} claims", (point.probability, point.right), beside, textcoords="offset points")
-    ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="probability told", ylabel="share right")
+    ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="share right")
     ax.legend(loc="upper left", fontsize=8)
     return figure
 

@@ -141,7 +141,7 @@ def _outcome(rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: 
 def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, inputs: float | Floats = 0.0) -> bool:
     """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
 
-    Enough effects of the wrong kind bend to the records that they are fitted to, not to others.
+    Enough effects of the wrong kind over-fit the records: they do not predict others.
 
     Args:
         inputs: (n_records,) what noise of the logged inputs leaves of them, which no set closes.

@@ -123,7 +123,7 @@ class UncertainRig:
 
     @cached_property
     def _root(self) -> np.ndarray:
-        """R with R Rᵀ the covariance, no deviation wider than a fit tells."""
+        """R with R Rᵀ the covariance, no deviation wider than a fit can state."""
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         deviations = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))

@@ -1,4 +1,4 @@
-"""Modes: what a structure's own computation and its measurement agree to speak of."""
+"""Modes: frequencies, damping and shapes, computed or identified, in one type."""
 
 import warnings
 from collections.abc import Callable, Sequence

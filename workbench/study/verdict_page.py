@@ -151,7 +151,8 @@ def case_inputs(folder: Path) -> dict[str, str]:
 def _could_show(verdict: Verdict) -> str:
     """What the records can and cannot show, in a line."""
     hidden, alike = verdict.readiness.invisible, verdict.readiness.alike
-    text = f"Before any fit: these records can show all but {len(hidden)} of {len(verdict.readiness.strengths)} effects"
+    count = len(verdict.readiness.strengths)
+    text = f"Before any fit: these records can show {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
     if hidden:
         named = ", ".join(label.replace("_", " ") for label in hidden[:6])
         text += f" (not {named}{', …' if len(hidden) > 6 else ''})"

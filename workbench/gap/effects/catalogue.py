@@ -45,7 +45,7 @@ from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
 CATALOGUE: tuple[Kind, ...] = (*STRUCTURAL, *NONLINEAR, *OF_PORTS, *OF_THE_ENVIRONMENT)
 EXPONENTS = (1.5, 2.0, 4.0, 6.0)  # of laws beyond the catalogue, to start from
-SAME_POWER = 0.05  # nearer to that of a kind of the catalogue, an exponent tells of small errors and of no other law
+SAME_POWER = 0.05  # nearer to that of a kind of the catalogue, an exponent differs by small errors, not by another law
 
 
 def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:

@@ -298,7 +298,7 @@ class _FreeDecay:
     def _gain_of_two(self, poles: np.ndarray, r: int, s: int) -> float:
         """Twice the log likelihood ratio of both modes over one on a backbone.
 
-        In the record as measured: a filter that whitens the residual of one mode takes most of what speaks for it.
+        In the record as measured: a filter that whitens the residual of one mode removes most of its evidence.
         """
         [record] = self.measured
         poles, [fit], *_ = search([record], poles, np.ones((1, 1)), True, FEW_STEPS, budget=self.budget)

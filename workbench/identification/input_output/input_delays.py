@@ -38,7 +38,7 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
     """
     m, q = records[0].n_outputs, records[0].n_inputs
     rows = sum(record.n_samples for record in records)
-    moved = n_moving(records)  # blows are too short to tell lags by
+    moved = n_moving(records)  # impulses are too short to show lags
     shortest = min(record.n_samples for record in records)
     lags = min(MOST_LAGS, rows // (ROWS_EACH * (m + q)), moved // ROWS_EACH, shortest // 4)
     if lags < 3:
