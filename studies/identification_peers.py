@@ -36,7 +36,7 @@ from workbench.identification.signal.projection import project
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Record
 from workbench.records.resample import decimate
-from workbench.records.transfer_file import read_transfer
+from workbench.records.transfer_functions import read_transfer
 from workbench.structure.modes import SampledModes
 
 STRUCTURES, FIRST_SEED = 50, 200  # settings were chosen on seeds below 110

@@ -16,12 +16,12 @@ from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import nodes_of_mode, place, placement_task
 from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
 from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.free_decay.refinement import modal_amplitudes
-from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
 from workbench.identification.shapes.eigenfunctions import KnownEnds, eigenfunctions
 from workbench.identification.shapes.mode_pairing import pair_modes
 from workbench.records.resample import decimate
-from workbench.records.transfer_file import read_transfer
+from workbench.records.transfer_functions import read_transfer
 from workbench.rig.rig import Rig
 from workbench.structure.member import Beam
 

@@ -79,7 +79,7 @@ RENAMED = {
     "free_decay": "identification.signal.synthesis.free_decay",
     "hermite_filter": "design.estimation.modal_filter.hermite_filter",
     "how_many_modes": "design.placement.how_many.how_many_modes",
-    "impulse_record": "records.transfer_file.impulse_record",
+    "impulse_record": "records.transfer_functions.impulse_record",
     "judge": "design.spillover.performance.performance",
     "judge_on_off": "design.spillover.performance.on_off_performance",
     "modal_cost": "design.spillover.spillover.modal_cost",

@@ -8,7 +8,7 @@ from workbench.records.files import read_measured, read_record
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.resample import decimate
-from workbench.records.transfer_file import impulse_record, read_transfer
+from workbench.records.transfer_functions import impulse_record, read_transfer
 
 
 def test_transfer_function_of_an_oscillator_is_its_impulse_response():

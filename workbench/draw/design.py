@@ -195,7 +195,7 @@ def plot_sensor_counts(margins: dict[str, np.ndarray], counts: dict[str, int | N
 
 
 def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figure:
-    """Energy left of each disturbance when the lowest n modes are controlled: in modes not controlled, and by spillover."""
+    """Energy left of each disturbance when the lowest n modes are controlled: in the others, and by spillover."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
         total = result.energy.sum()

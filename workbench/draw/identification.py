@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.identification.free_decay.stabilisation import Stabilisation
+from workbench.identification.free_decay.ibrahim import Stabilisation
 from workbench.identification.shapes.mode_pairing import ModePairing
 from workbench.identification.updating.local_loss import LocatedDamage
 from workbench.structure.modes import Modes, SampledModes

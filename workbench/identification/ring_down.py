@@ -8,11 +8,10 @@ from numpy.polynomial.legendre import legvander
 
 from workbench.identification.free_decay.amplitude import AmplitudeDependence, amplitude_dependence
 from workbench.identification.free_decay.drift import HIGHEST_DEGREE, without_drift
-from workbench.identification.free_decay.ibrahim import stacked_delays
+from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.proportional import ProportionalFit, proportional_fit
 from workbench.identification.free_decay.refinement import Identified, Refined, in_coloured_noise, refine, unshaped
-from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
 from workbench.identification.signal.decay import decay_start
 from workbench.identification.signal.least_squares import SECONDS, Budget, Progress

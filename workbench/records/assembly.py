@@ -9,10 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
-from workbench.records.checksum import KEY, checksum
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
 from workbench.records.units import Unit, split_unit, unit_named
@@ -23,6 +23,16 @@ SHORTEST, LONGEST = 0.5, 2.0
 FINEST_ROUNDING = 10  # decimals of a second
 FEWEST_ODD = 3  # steps that differ from the others, where instants were rounded
 KINDS = ("input", "output")
+KEY = "crc32"  # of the checksum by which a file written here is known to be as it was written
+
+
+def checksum(description: Mapping[str, Any], signals: Iterable[np.ndarray]) -> int:
+    """CRC-32 of a record's description, without the sum itself, and of its signals."""
+    text = json.dumps({key: value for key, value in description.items() if key != KEY}, sort_keys=True)
+    total = crc32(text.encode())
+    for values in signals:
+        total = crc32(np.ascontiguousarray(values, "<f8").tobytes(), total)
+    return total
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,13 +11,11 @@ from types import ModuleType
 
 from workbench.arrays import Floats
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
-from workbench.records.assembly import legible, record_of
-from workbench.records.checksum import KEY, checksum
+from workbench.records.assembly import KEY, checksum, legible, record_of
 from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_size, unreadable
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Channel, Record
-from workbench.records.transfer_assembly import complex_columns, holds_transfer, transfer_of
-from workbench.records.transfer_functions import TransferFunctions
+from workbench.records.transfer_functions import TransferFunctions, complex_columns, holds_transfer, transfer_of
 
 FORMATS = {
     ".csv": csv_file,

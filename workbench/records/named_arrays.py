@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from workbench.records.limits import RecordFileError, check_counts
-from workbench.records.transfer_assembly import SURE_RATES
+from workbench.records.transfer_functions import SURE_RATES
 from workbench.records.units import time_factor
 
 HEADER = "record_header"

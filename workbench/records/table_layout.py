@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from io import TextIOBase
 from pathlib import Path
 
-from workbench.records.checksum import KEY
+from workbench.records.assembly import KEY
 from workbench.records.limits import RecordFileError
 from workbench.records.units import unit_named
 

@@ -1,13 +1,32 @@
-"""Transfer functions: named, placed spectra of outputs per unit input."""
+"""Transfer functions: named, placed spectra of outputs per unit input; read from arrays; their impulse responses."""
 
-from collections.abc import Sequence
+import json
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from workbench.records.record import Channel
+from workbench.records.assembly import legible
+from workbench.records.confined import load_confined
+from workbench.records.limits import RecordFileError
+from workbench.records.record import Channel, Record
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted, place_text
+
+# Names, in small letters, under which programs keep the lines, the sample rate, and where the points are.
+HERTZ = ("f", "freq", "freqs", "frequency", "frequencies", "hz", "f_hz", "freq_hz", "frequency_hz", "frequencies_hz",
+         "frequency [hz]", "f [hz]")  # fmt: skip
+RADIANS = ("w", "omega", "frequency [rad/s]", "omega [rad/s]")
+SURE_RATES = ("fs", "sample_rate", "sample_rate_hz")
+LIKELY_RATES = ("freq", "frequency", "rate")  # where the number of samples stands beside it
+SAMPLES = ("npts", "nfft", "n_samples")
+PLACES = ("positions", "at")
+COLUMN = re.compile(r"(.+?)[ ._]+(?:(re|real)|im|imag|imaginary)", re.IGNORECASE)
+DESCRIPTION = "transfer_header"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,3 +92,194 @@ class TransferFunctions(Printed):
         rows = [self.output_names.index(name) for name in outputs]
         channels = tuple(self.output_channels[row] for row in rows)
         return TransferFunctions(self.values[rows], self.frequencies_hz, channels, self.references, self.name)
+
+
+def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether any array is complex, as no record is."""
+    return any(values.dtype.kind == "c" and values.size > 1 for values in arrays.values())
+
+
+def complex_columns(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns of a table that begins with frequencies, real and imaginary parts put together; else none."""
+    names = list(signals)
+    if not names or names[0].lower() not in (*HERTZ, *RADIANS):
+        return {}
+    parts: dict[str, dict[bool, np.ndarray]] = {}
+    for name in names[1:]:
+        column = COLUMN.fullmatch(name)
+        if column:
+            parts.setdefault(column[1], {})[column[2] is not None] = signals[name]
+    both = {name: part[True] + 1j * part[False] for name, part in parts.items() if len(part) == 2}
+    return {names[0]: signals[names[0]], **both} if 2 * len(both) == len(names) - 1 else {}
+
+
+def transfer_of(
+    path: Path, arrays: Mapping[str, np.ndarray], *, sample_rate_hz: float | None = None
+) -> TransferFunctions:
+    """The transfer functions that a file held.
+
+    Args:
+        path: of the file, for messages.
+        arrays: complex ones, one axis of each as long as there are lines, the others its points (and references); the
+            lines under a name of `HERTZ` or `RADIANS`, or a sample rate.
+        sample_rate_hz: where the file has neither; its lines then go from zero to half of it.
+
+    Raises:
+        RecordFileError: naming the file and the array, and what would be right.
+    """
+    found = {name: np.squeeze(v) for name, v in arrays.items() if v.dtype.kind == "c" and v.size > 1}
+    lines = _lines(path, arrays, found, sample_rate_hz)
+    spectra = {name: _frequency_last(path, name, values, lines.size) for name, values in found.items()}
+    if len(spectra) > 1 and any(values.ndim > 1 for values in spectra.values()):
+        shapes = ", ".join(f"{name} {values.shape}" for name, values in found.items())
+        raise RecordFileError(f"{path} holds several complex arrays, {shapes}: keep one, or a vector for each point")
+    name, values = next(iter(spectra.items()))
+    if values.ndim < 3:
+        values = np.array([*spectra.values()]).reshape(-1, 1, lines.size)
+    points = list(spectra) if len(spectra) > 1 else [f"{name} {i + 1}" for i in range(len(values))]
+    channels, references = _points(path, arrays, points, values.shape[1])
+    try:
+        return TransferFunctions(values, lines, channels, references, path.stem)
+    except ValueError as error:
+        raise RecordFileError(f"{path}: {error}") from error
+
+
+def _lines(path: Path, arrays: Mapping[str, Any], found: Mapping[str, Any], sample_rate_hz: float | None) -> np.ndarray:
+    """Hz."""
+    real = {
+        name: np.ravel(v) for name, v in arrays.items() if v.dtype.kind in "fiu" and max(v.shape, default=1) == v.size
+    }
+    vectors = [
+        (name, values.astype(float) / (2.0 * np.pi if name.lower() in RADIANS else 1.0))
+        for name, values in real.items()
+        if name.lower() in (*HERTZ, *RADIANS) and values.size > 1
+    ]
+    if len(vectors) > 1:
+        names = " and ".join(name for name, _ in vectors)
+        raise RecordFileError(f"{path} holds two arrays of frequencies, {names}; leave one out")
+    if vectors and sample_rate_hz is not None:
+        raise RecordFileError(f"{path} holds its frequencies, {vectors[0][0]!r}; leave the sample rate out")
+    if vectors:
+        return vectors[0][1]
+    scalars = {name.lower(): float(values[0]) for name, values in real.items() if values.size == 1}
+    longest = max(max(values.shape) for values in found.values())
+    whole = any(scalars.get(name) in (2 * longest - 2, 2 * longest - 1) for name in SAMPLES)
+    rates = [scalars[name] for name in (*SURE_RATES, *(LIKELY_RATES if whole else ())) if name in scalars]
+    rate = sample_rate_hz if sample_rate_hz is not None else rates[0] if rates else None
+    if rate is None:
+        name = next(iter(found))
+        raise RecordFileError(
+            f"{path}, {name!r} is complex: transfer functions? No lines stand beside it; add them as an array"
+            " 'frequency_hz', or give the sample rate if they go from zero to half of it"
+        )
+    if not 0 < rate < np.inf:
+        raise RecordFileError(f"{path}: the sample rate must be positive; got {rate:g}")
+    return np.linspace(0.0, 0.5 * rate, longest)
+
+
+def _frequency_last(path: Path, name: str, values: np.ndarray, n_lines: int) -> np.ndarray:
+    along = [axis for axis, size in enumerate(values.shape) if size == n_lines]
+    if len(along) != 1 or values.ndim > 3:
+        which = "which axis they run along is not clear" if along else "no axis is as long"
+        raise RecordFileError(
+            f"{path}, {name!r} has shape {values.shape} for {n_lines} lines: {which}; give (n_outputs, n_frequencies)"
+            " or (n_outputs, n_references, n_frequencies)"
+        )
+    return np.moveaxis(values, along[0], -1)
+
+
+def _points(
+    path: Path, arrays: Mapping[str, Any], names: list[str], n_references: int
+) -> tuple[tuple[Channel, ...], tuple[str, ...]]:
+    """Channels and references: as the file names them, else numbered."""
+    if DESCRIPTION in arrays:
+        try:
+            described = json.loads(str(arrays[DESCRIPTION]))
+            channels = tuple(Channel(legible(path, str(c["name"])), str(c["quantity"])) for c in described["outputs"])
+            return channels, tuple(legible(path, str(name)) for name in described["references"])
+        except RecordFileError:
+            raise
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise RecordFileError(f"{path}: its description of the points is damaged: {error}") from error
+    at = [np.ravel(arrays[name]) for name in PLACES if name in arrays]
+    if at and at[0].shape != (len(names),):
+        raise RecordFileError(f"{path} gives {at[0].size} places of {len(names)} points; give each its own")
+    if at and at[0].dtype.kind not in "fiu":
+        text = str(at[0][0])[:40]
+        raise RecordFileError(f"{path} gives places that are no numbers, {text!r} among them; give metres")
+    places = [float(x) for x in at[0]] if at else [None] * len(names)
+    channels = tuple(Channel(legible(path, name), at=x) for name, x in zip(names, places, strict=True))
+    return channels, tuple(f"input {i + 1}" for i in range(n_references))
+
+
+def read_transfer(
+    path: str | Path,
+    *,
+    positions: Sequence[float],
+    quantity: str,
+    matrix: str = "yspec",
+    sample_rate: str = "freq",
+) -> Record:
+    """Impulse responses from the transfer functions of a MAT file, one column a point.
+
+    Args:
+        path: of the file.
+        positions: (n_points,) of the columns, m.
+        quantity: measured, per N of force.
+        matrix: name of the (n_frequencies, n_points) complex array, first row at 0 Hz, last at Nyquist.
+        sample_rate: name of the sample rate behind it, Hz.
+
+    Raises:
+        RecordFileError: a file that cannot be read, lacks an array, or has another number of columns.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise RecordFileError(f"{path}: there is no such file")
+    arrays = load_confined("workbench.records.mat_file", path)
+    for name in (matrix, sample_rate):
+        if name not in arrays:
+            raise RecordFileError(f"{path} holds no array {name!r}; name the right one by `matrix` or `sample_rate`")
+    transfer, rate = arrays[matrix], np.ravel(arrays[sample_rate])
+    if transfer.ndim != 2 or transfer.shape[1] != len(positions) or transfer.dtype.kind not in "fiuc":
+        raise RecordFileError(
+            f"{path}, {matrix}: {len(positions)} positions need (n_frequencies, {len(positions)}) columns; got"
+            f" {transfer.shape}"
+        )
+    if rate.size != 1 or rate.dtype.kind not in "fiu" or not 0 < rate[0] < np.inf:
+        raise RecordFileError(f"{path}, {sample_rate}: the sample rate is one positive number; got {rate[:3]}")
+    channels = tuple(Channel(f"point {i + 1}", quantity, at=float(x)) for i, x in enumerate(positions))
+    return impulse_record(transfer.T, sample_rate_hz=float(rate[0]), channels=channels, name=path.stem)
+
+
+def impulse_record(
+    transfer: ArrayLike, *, sample_rate_hz: float, channels: tuple[Channel, ...], name: str = "impulse responses"
+) -> Record:
+    """The impulse responses of transfer functions on a grid from zero to half the sample rate.
+
+    h = irfft(H) · rate: the response to a unit impulse (N s), in the outputs' unit per N s.
+
+    Args:
+        transfer: (n_outputs, n_frequencies) complex, per unit input, first column at 0 Hz, last at Nyquist.
+        sample_rate_hz: of the time signals behind it.
+        channels: one an output.
+
+    Raises:
+        ValueError: shapes that do not fit, or non-finite values (channel and line named).
+    """
+    transfer = np.atleast_2d(np.asarray(transfer, complex))
+    if transfer.shape[0] != len(channels) or transfer.shape[1] < 3:
+        raise ValueError(
+            f"transfer functions must have shape ({len(channels)} outputs, n_frequencies); got {transfer.shape}."
+            " Is frequency the last axis?"
+        )
+    for channel, row in zip(channels, transfer, strict=True):
+        bad = ~np.isfinite(row)
+        if bad.any():
+            raise ValueError(f"{name}, channel {channel.name!r}: line {int(np.argmax(bad))} is not a number")
+    n_samples = 2 * (transfer.shape[1] - 1)
+    return Record(
+        sample_time=1.0 / sample_rate_hz,
+        outputs=np.fft.irfft(transfer, n=n_samples, axis=1) * sample_rate_hz,
+        output_channels=channels,
+        name=name,
+    )

@@ -10,7 +10,7 @@ import pyuff
 from workbench.records.confined import load_confined
 from workbench.records.limits import DEFAULT, Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
-from workbench.records.transfer_assembly import DESCRIPTION
+from workbench.records.transfer_functions import DESCRIPTION
 
 # ordinate_spec_data_type of the format
 TYPES = {"displacement": 8, "velocity": 11, "acceleration": 12, "force": 13}

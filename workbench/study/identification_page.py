@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.draw.identification import stabilisation_diagram
 from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
-from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
+from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.study.identification_report import IdentificationReport

@@ -1,6 +1,6 @@
 import numpy as np
 
-from workbench.identification.free_decay.stabilisation import stabilise, stable_modes
+from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.identification.shapes.mode_pairing import pair_modes
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.member import Beam
