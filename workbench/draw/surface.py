@@ -7,6 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch as Swatch
+from matplotlib.ticker import MaxNLocator
 
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
@@ -15,19 +18,21 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.structure.domain import TRANSLATIONS, NamedPoints, Patch, Rectangle
 from workbench.structure.modes import Modes
 
-PER_SIDE = 61  # of the longer one: points where a shape is drawn
+PER_SIDE = 121  # of the longer one: points where a shape is drawn
 SHOWN_WORK = 1e-8  # of the largest work in one mode: what is less is not drawn
 LEVELS = 12  # of colour on each side of zero
 COLUMNS = 4
 HELD = 1e-6  # of a shape's largest value: less all along an edge is held
 CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, one after another
+RED, BLUE = "#b2182b", "#2166ac"  # of the map of colours, up and down
+DOT: Any = {"color": "none", "marker": "o", "markeredgecolor": "black", "markerfacecolor": "none", "markersize": 7}
 SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 
 def plot_surface_modes(
     modes: Modes, *, count: int | None = None, places: np.ndarray | None = None, values: np.ndarray | None = None
 ) -> Figure:
-    """Shapes over a rectangle, a panel a mode: red up, blue down, the nodal line black.
+    """Shapes over a rectangle, a panel a mode: red up, blue down, nodal lines black, edges that are held thick.
 
     Args:
         count: of the lowest modes; all where not given.
@@ -46,8 +51,22 @@ def plot_surface_modes(
             dots: Any = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit, "edgecolors": "black"}
             ax.scatter(places[:, 0], places[:, 1], s=46, c=values[:, r], linewidths=0.9, **dots)
         elif places is not None:
-            ax.plot(*places.T, "o", color="black", markerfacecolor="none", markersize=7)
+            ax.plot(*places.T, **DOT)
+        for along in _held_edges(x, y, fields):
+            ax.plot(*along, color=COLOURS[6], linewidth=4, solid_capstyle="butt", clip_on=False)
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
+    _sides(axes[columns * ((count - 1) // columns)], modes)
+    handles = [
+        Swatch(facecolor=RED, label="up"),
+        Swatch(facecolor=BLUE, label="down"),
+        Line2D([], [], color="black", linewidth=1.2, label="nodal line: at rest"),
+    ]
+    if _held_edges(x, y, fields):
+        handles.append(Line2D([], [], color=COLOURS[6], linewidth=4, label="edge that is held"))
+    if places is not None:
+        told = "sensor" if values is None else "sensor, in the colour of what was found there"
+        handles.append(Line2D([], [], **DOT, label=told))
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9)
     return figure
 
 
@@ -67,7 +86,7 @@ def plot_surface_motion(
     """
     first = next(iter(responses.values()))
     figure, grid = new_figure(
-        len(responses), len(times), width=2.6 * len(times), height=2.1 * len(responses), squeeze=False
+        len(responses), len(times), width=2.6 * len(times), height=2.1 * len(responses) + 0.3, squeeze=False
     )
     drawn, instants = {}, {}
     for name, response in responses.items():
@@ -79,14 +98,18 @@ def plot_surface_motion(
         for ax, time, field in zip(row, instants[name], fields):
             image = _coloured(ax, x, y, field, limit)
             if actuators is not None:
-                ax.plot(*actuators.T, "x", color="black", markersize=6)
+                ax.plot(*actuators.T, "x", color="black", markersize=6, label="actuator")
             if struck is not None:
-                ax.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=11)
+                ax.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=11, label="struck here")
             ax.set_title(f"{time:.3g} s", fontsize=10)
         row[0].set_ylabel(name, fontsize=11)
     for ax in grid.flat:
         _bare(ax, first.modes)
-    figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8)
+    ticks = [tick for tick in MaxNLocator(5).tick_values(-limit, limit) if abs(tick) <= limit]
+    figure.colorbar(image, ax=grid, label="displacement [m]", shrink=0.8, ticks=ticks)
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 
@@ -181,6 +204,18 @@ def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, widt
     ax.contour(x[i], y[j], field[i, j].T, levels=[0.0], colors="black", linewidths=width)
 
 
+def _held_edges(x: np.ndarray, y: np.ndarray, fields: np.ndarray) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """The edges along which no field moves, each as its ends: (x, x), (y, y)."""
+    nothing, (a, b) = HELD * np.abs(fields).max(), (x[-1], y[-1])
+    edges = (
+        (fields[:, 0], ((0.0, 0.0), (0.0, b))),
+        (fields[:, -1], ((a, a), (0.0, b))),
+        (fields[:, :, 0], ((0.0, a), (0.0, 0.0))),
+        (fields[:, :, -1], ((0.0, a), (b, b))),
+    )
+    return [ends for along, ends in edges if np.abs(along).max() < nothing]
+
+
 def _over(modes: Modes, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Coordinates x, y and fields (n_columns, n_x, n_y) of modal coordinates (n_modes, n_columns)."""
     if not isinstance(modes.domain, Rectangle):
@@ -201,13 +236,20 @@ def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]
     assert isinstance(modes.domain, Rectangle)
     rows, (a, b) = -(-count // columns), modes.domain.length
     figure, grid = new_figure(
-        rows, columns, width=2.7 * columns, height=rows * (2.7 * min(b / a, 1.6) + 0.4), squeeze=False
+        rows, columns, width=2.7 * columns, height=rows * (2.7 * min(b / a, 1.6) + 0.45) + 0.9, squeeze=False
     )
     for ax in grid.flat:
         _bare(ax, modes)
     for ax in grid.flat[count:]:
         ax.set_visible(False)
     return figure, list(grid.flat[:count])
+
+
+def _sides(ax: Axes, modes: Modes) -> None:
+    """The lengths of the sides, m."""
+    assert isinstance(modes.domain, Rectangle)
+    a, b = modes.domain.length
+    ax.set(xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
 
 
 def _bare(ax: Axes, modes: Modes) -> None:
