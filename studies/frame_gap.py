@@ -121,9 +121,9 @@ def study(outcome, data=None):
     outcome.figure(
         "joint",
         plot_joint(at, lines, effect, loop),
-        "Left, the frame with its two shakers and six accelerometers, the real brace, and the joint that the diagnosis"
-        " found: along x all points of a floor move as one, so it may end at any of them. Right, the force of the real"
-        " joint over its stretch in the high record, and the law that was found.",
+        "Left, the frame with its two shakers and six accelerometers, the real brace, and between which floors the"
+        " diagnosis found it: along x all points of a floor move as one. Right, the force of the real joint over its"
+        " stretch in the high record, and the law that was found.",
     )
     outcome.figure(
         "responses",
@@ -144,13 +144,17 @@ def plot_joint(at, lines, effect, loop):
         spots = np.array([places[name.split(".")[0]] for name in names])
         shift = (-0.03, 0.0) if marker == ">" else (0.0, 0.0)
         left.plot(*(spots + shift).T, marker, color=colour, markersize=10, label=label, zorder=3)
-    for names, style, colour, width, label in (
-        (BETWEEN, "-", COLOURS[6], 7, "real brace"),
-        (effect.at, "--", COLOURS[2], 3, f"found: {effect.kind.words}"),
-    ):
-        ends = np.array([places[name.split(".")[0]] for name in names])
-        left.plot(*ends.T, style, color=colour, linewidth=width, alpha=0.35 if style == "-" else 1.0, label=label)
-    left.set(aspect="equal", title="where")
+    brace = np.array([places[name.split(".")[0]] for name in BETWEEN])
+    left.plot(*brace.T, color=COLOURS[6], linewidth=7, alpha=0.35, label="real brace")
+    # along x a floor moves as one: what was found acts between two floors, whichever of their points it names
+    low, high = sorted(places[name.split(".")[0]][1] for name in effect.at)
+    for y in (low, high):
+        left.plot([0.0, WIDTH], [y, y], color=COLOURS[2], linewidth=7, alpha=0.6, zorder=2.5)
+    arrow = {"arrowstyle": "<->", "color": COLOURS[2], "linewidth": 2.5}
+    left.annotate("", (1.12 * WIDTH, low), (1.12 * WIDTH, high), arrowprops=arrow)
+    label = f"found: {effect.kind.words}\nbetween these floors, sideways"
+    left.plot([], [], color=COLOURS[2], linewidth=7, alpha=0.6, label=label)
+    left.set(aspect="equal", title="where", xlim=(-0.08, 1.2 * WIDTH))
     left.axis("off")
     left.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), fontsize=9)
     values = effect.values
