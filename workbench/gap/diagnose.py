@@ -13,7 +13,8 @@ from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
-from workbench.gap.report.shrinkage import Budget, Shrinkage, budget_of, measure, power_of_inputs
+from workbench.gap.report.record_to_record import with_unseen
+from workbench.gap.report.shrinkage import Budget, Shrinkage, budget_of, mean_square, measure, power_of_inputs
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, opened
@@ -92,9 +93,10 @@ def diagnose(
         )
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
-        outcome = _outcome(rig, attribution, shrinkage, validation, settle)
-        errors = next((e for e in attribution.best.effects if e.kind is NOMINAL_ERRORS), None)
-        named = tuple(e for e in attribution.best.effects if e is not errors)
+        accounted = with_unseen(rig, attribution.best.effects, validation, settle=settle)
+        outcome = _outcome(rig, attribution, shrinkage, validation, settle, accounted)
+        errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
+        named = tuple(e for e in accounted if e is not errors)
         effects = named if outcome in ("none", "explained") else ()
         faulty = _faulty(attribution.best.effects)
         as_seen = faulty == _faulty(found.seen)
@@ -131,27 +133,39 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
     return {name for target in targets for name in (target if isinstance(target, tuple) else (target,))}
 
 
-def _outcome(rig: Rig, found: Attribution, shrinkage: Shrinkage | None, unseen: Sequence[Record], settle: float) -> str:
+def _outcome(
+    rig: Rig,
+    found: Attribution,
+    shrinkage: Shrinkage | None,
+    unseen: Sequence[Record],
+    settle: float,
+    accounted: Sequence[Effect],
+) -> str:
     if found.outcome != "explained" or shrinkage is None:
         return found.outcome
-    inputs = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else 0.0
-    return "part" if _fails_unseen(found, shrinkage, inputs) else found.outcome
+    beyond: float | Floats = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else 0.0
+    if any(effect not in found.best.effects for effect in accounted):
+        rigs = [apply_all(rig, effects) for effects in (found.best.effects, accounted)]
+        common, own = (np.array([mean_square(r, record, settle, 8) for record in unseen]) for r in rigs)
+        beyond = beyond + common - own
+    return "part" if _fails_unseen(found, shrinkage, beyond) else found.outcome
 
 
-def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, inputs: float | Floats = 0.0) -> bool:
+def _fails_unseen(found: Attribution, shrinkage: Shrinkage | None, beyond: float | Floats = 0.0) -> bool:
     """Whether the set leaves much of a gap that it should close on records that it was not fitted to.
 
     Enough effects of the wrong kind over-fit the records: they do not predict others.
 
     Args:
-        inputs: (n_records,) what noise of the logged inputs leaves of them, which no set closes.
+        beyond: (n_records,) what noise of the logged inputs, and a figure's own value in a record, leave of them, which
+            no set closes.
     """
     if shrinkage is None or _remainders(found):
         return False
     before, after, floor = (
         np.array([*by_name.values()]) ** 2 for by_name in (shrinkage.before, shrinkage.after, shrinkage.floor)
     )
-    floor = max(found.noise_ratio, 1.0) ** 2 * floor + inputs
+    floor = max(found.noise_ratio, 1.0) ** 2 * floor + beyond
     left, closable = (np.maximum(power - floor, 0.0).sum() for power in (after, before))
     closed = max(shrinkage.overall, 1.0 - float(np.sqrt(left / max(closable, 1e-300))))
     beside = any(effect.kind is NOMINAL_ERRORS for effect in found.best.effects)

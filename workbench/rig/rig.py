@@ -1,7 +1,7 @@
 """A rig: what stands in the laboratory."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
@@ -44,6 +44,7 @@ class Rig(Printed):
         stiffness_rate: the stiffness is 1 + rate t times itself, 1/s; t from the start of a record.
         structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved
             anew on it.
+        by_record: (name, change) of records in which the rig is another one; see `in_record`.
     """
 
     modes: Modes
@@ -52,6 +53,7 @@ class Rig(Printed):
     elements: tuple[Element, ...] = ()
     stiffness_rate: float = 0.0
     structure: Structure | Plate | Membrane | None = None
+    by_record: tuple[tuple[str, "Callable[[Rig], Rig]"], ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("actuators", "sensors", "elements"):
@@ -60,6 +62,14 @@ class Rig(Printed):
             names = [part.name for part in parts]
             if len(set(names)) != len(names):
                 raise ValueError(f"the {name} of a rig must have different names; got {names}")
+
+    def in_record(self, name: str) -> "Rig":
+        """The rig as it is in a record of that name: itself, but for what differs from record to record."""
+        if not self.by_record:
+            return self
+        rig = replace(self, by_record=())
+        change = dict(self.by_record).get(name)
+        return rig if change is None else change(rig)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         rows = [(a.name, "actuator", a.kind, place_text(a.at)) for a in self.actuators]

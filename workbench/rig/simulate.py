@@ -151,6 +151,7 @@ def simulate(
 
 def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
     """What a rig's sensors read (n_sensors, n_samples) under the inputs of a record, noise apart; see `simulate`."""
+    rig = rig.in_record(record.name)
     found = simulate(
         rig, record.inputs, sample_time=record.sample_time, substeps=substeps, input_hold=record.input_hold
     )

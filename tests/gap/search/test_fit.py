@@ -141,4 +141,4 @@ def test_a_set_must_hold_on_records_it_has_not_seen():
     assert not _fails_unseen(Found("cubic_spring"), unseen(0.0102, 0.8)), "what is left is noise"
     assert not _fails_unseen(Found("random_disturbance"), unseen(0.3, 0.1)), "no prediction can hold it"
     assert not _fails_unseen(Found("cubic_spring"), None)
-    assert not _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77), inputs=0.12**2), "noise of the inputs is"
+    assert not _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"

@@ -9,6 +9,7 @@ from scipy.linalg import block_diag
 
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter
+from workbench.gap.effects.record_to_record import STIFFNESS, differing
 from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
@@ -35,10 +36,12 @@ class NominalPrior:
         frequency: relative, of each natural frequency by itself.
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
+        record: of a figure that differs from record to record, about a common value; see `record_to_record`.
         sample_time: s.
         late, early: names of the sensors whose delay is positive, or at most zero: where inputs are held, acceleration
             jumps at each sample, and no small step leads from one side to the other.
         waves: cosines of a smooth variation along the structure, the constant among them.
+        records, figure: names of the records between which a figure differs, and which.
     """
 
     stiffness: float = 0.0
@@ -46,10 +49,13 @@ class NominalPrior:
     frequency: float = 0.0
     damping: float = 0.0
     delay: float = 0.0
+    record: float = 0.0
     sample_time: float = 1.0
     late: tuple[str, ...] = ()
     early: tuple[str, ...] = ()
     waves: int = 9
+    records: tuple[str, ...] = ()
+    figure: str = STIFFNESS
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -57,7 +63,8 @@ class NominalPrior:
         return tuple(name for name in GROUPS if getattr(self, name) > 0)
 
 
-GROUPS = ("stiffness", "mass", "frequency", "damping", "delay")
+GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "record")
+OUTSIDE = ("delay", "record")  # groups that leave the modes as they are
 
 
 def group_of(parameter: str) -> str:
@@ -139,6 +146,8 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
             low = JUST_LATE if sensor.name in prior.late else -MOST_AHEAD
             high = 0.0 if sensor.name in prior.early else MOST_AHEAD
             yield believed(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high)
+    if prior.record:
+        yield from (believed(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
 
 
 def _varied(profile: Profile, amplitudes: np.ndarray, length: float) -> Profile:
@@ -204,16 +213,36 @@ _solved = solved_once(_off_structure)
 
 
 def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, float]) -> Rig:
-    """The rig with the errors in its structure, modes and sensors."""
+    """The rig with the errors in its structure, modes and sensors, and between records."""
     if isinstance(prior, IdentifiedPrior):
         made = prior.make(prior.root @ np.array(list(values.values())))
         return replace(rig, modes=made.modes, structure=made.structure, actuators=made.actuators)
-    rig = _solved(rig, prior, values)
+    rig = _solved(rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE})
+    rig = differing(rig, prior.figure, deviations_of(values))
     late = {f"delay_{s.name}": s for s in rig.sensors if values.get(f"delay_{s.name}")}
     if not late:
         return rig
     delays = {s: s.delay + values[name] * prior.sample_time for name, s in late.items()}
     return replace(rig, sensors=tuple(replace(s, delay=delays[s]) if s in delays else s for s in rig.sensors))
+
+
+def parted(errors: Effect) -> tuple[Effect, Effect | None]:
+    """Errors of the nominal model in every record alike, and what differs from record to record; None for nothing."""
+    prior = errors.target
+    if not isinstance(prior, NominalPrior) or not prior.record:
+        return errors, None
+    between = {name: value for name, value in errors.values.items() if group_of(name) == "record"}
+    alike = {name: value for name, value in errors.values.items() if name not in between}
+    others: dict[str, Any] = {group: 0.0 for group in prior.groups if group != "record"}
+    return (
+        replace(errors, target=replace(prior, record=0.0), values=alike),
+        replace(errors, target=replace(prior, **others), values=between),
+    )
+
+
+def deviations_of(values: Mapping[str, float]) -> dict[str, float]:
+    """By name of record, what a figure deviates by in it."""
+    return {name.split("_", 1)[1]: value for name, value in values.items() if group_of(name) == "record"}
 
 
 def _padded(values: Floats, size: int) -> Floats:

@@ -380,7 +380,8 @@ SUPPORT_ROTATION = Kind(
 # --- axial_load
 
 
-def _buckling(rig: Rig) -> float:
+def buckling_load(rig: Rig) -> float:
+    """Roughly the compression, N, that buckles a beam: that of one as stiff as the softest section."""
     beam = _beam(rig)
     x = (np.arange(40) + 0.5) / 40 * beam.length
     held = sum(end.rotation == HELD for end in (beam.left, beam.right))
@@ -397,12 +398,17 @@ AXIAL_LOAD = Kind(
     path="structure",
     parameters=lambda rig, _: (
         Parameter(
-            "tension", "N", -4.0 * _buckling(rig), 200.0 * _buckling(rig), scale=0.05 * _buckling(rig), neutral=0.0
+            "tension",
+            "N",
+            -4.0 * buckling_load(rig),
+            200.0 * buckling_load(rig),
+            scale=0.05 * buckling_load(rig),
+            neutral=0.0,
         ),
     ),
     apply=solved_once(_pulled),
     starts=lambda evidence, _: [
-        {"tension": share * _buckling(evidence.rig)}
+        {"tension": share * buckling_load(evidence.rig)}
         for share in (
             -0.9,
             -0.6,

@@ -58,7 +58,7 @@ class FitData:
     given_way: tuple[np.ndarray, np.ndarray] | None = None
     follower: Follower | None = None
     heat: float = 1.0
-    _memory: OrderedDict[Any, tuple[Modes, tuple[Motion, ...]]] = field(
+    _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(
         default_factory=OrderedDict, repr=False, init=False
     )
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
@@ -134,31 +134,31 @@ class FitData:
 
     def motions(self, rig: Rig) -> tuple[Motion, ...]:
         """The rig's motion on each record; the last few are remembered, since a sensor's fault does not change it."""
-        key = (id(rig.modes), rig.actuators, rig.elements, rig.stiffness_rate)
+        return tuple(self._motion(rig.in_record(record.name), record) for record in self.records)
+
+    def _motion(self, rig: Rig, record: Record) -> Motion:
+        key = (id(record), id(rig.modes), rig.actuators, rig.elements, rig.stiffness_rate)
         with self._lock:
             if key in self._memory:
                 self._memory.move_to_end(key)
                 return self._memory[key][1]
-        motions = tuple(
-            move(
-                rig,
-                record.inputs,
-                sample_time=record.sample_time,
-                substeps=self.substeps,
-                input_hold=record.input_hold,
-            ).after(self.lead)
-            for record in self.records
-        )
+        motion = move(
+            rig,
+            record.inputs,
+            sample_time=record.sample_time,
+            substeps=self.substeps,
+            input_hold=record.input_hold,
+        ).after(self.lead)
         with self._lock:
-            self._memory[key] = (rig.modes, motions)
-            while len(self._memory) > REMEMBERED:
+            self._memory[key] = (rig.modes, motion)
+            while len(self._memory) > REMEMBERED * len(self.records):
                 self._memory.popitem(last=False)
-        return motions
+        return motion
 
     def predictions(self, rig: Rig) -> tuple[np.ndarray, ...]:
         """(n_outputs, n_samples) a record."""
         return tuple(
-            read(rig, motion, sample_time=record.sample_time)
+            read(rig.in_record(record.name), motion, sample_time=record.sample_time)
             for record, motion in zip(self.counted, self.motions(rig), strict=True)
         )
 
@@ -179,10 +179,13 @@ class FitData:
             return np.concatenate([(r / self.noise[:, None]).ravel() for r in self.differences(rig)])
         if is_stepped(rig) or steps_exactly(rig):
             substeps = self.substeps if is_stepped(rig) else 1
-            ahead = [follower.errors(rig, record, substeps) for record in self.records]
+            ahead = [follower.errors(rig.in_record(record.name), record, substeps) for record in self.records]
         else:
-            dt, whole = self.records[0].sample_time, self._from_the_first_sample.differences(rig)
-            ahead = [follower.errors_of_linear(rig, left, dt, self.substeps) for left in whole]
+            whole = zip(self.records, self._from_the_first_sample.differences(rig), strict=True)
+            ahead = [
+                follower.errors_of_linear(rig.in_record(record.name), left, record.sample_time, self.substeps)
+                for record, left in whole
+            ]
         return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
 
     @cached_property
@@ -193,7 +196,9 @@ class FitData:
         """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
         if follower is None or not is_stepped(rig) or rig.stiffness_rate:
             return self.differences(rig)
-        return [follower.left(rig, record, self.substeps)[:, self.lead :] for record in self.records]
+        return [
+            follower.left(rig.in_record(record.name), record, self.substeps)[:, self.lead :] for record in self.records
+        ]
 
     def differences(self, rig: Rig) -> list[np.ndarray]:
         """Measured less predicted on whole records (n_outputs, n_samples), one a record, in the sensors' units."""

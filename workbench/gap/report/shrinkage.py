@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import group_of
+from workbench.gap.effects.nominal import group_of, parted
+from workbench.gap.effects.record_to_record import label_of
 from workbench.gap.prediction.logged_inputs import logging_noise_power
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
@@ -96,7 +97,8 @@ class Budget:
     """Shares of the mean square of the nominal residual, which sum to one.
 
     Attributes:
-        effects: share that each named effect takes away, by label, in the order in which they count.
+        effects: share that each named effect takes away, by label, in the order in which they count; a figure that
+            differs from record to record stands among them, as "stiffness_record_to_record".
         nominal: share that small errors of the nominal model take away beyond them, and that noise of the logged inputs
             leaves.
         unexplained: share that is left and is not noise.
@@ -164,7 +166,7 @@ def budget_of(
     Args:
         rig: nominal.
         effects: that were named.
-        errors: of the nominal model, where they were fitted.
+        errors: of the nominal model, where they were fitted; see `with_unseen` for what differs from record to record.
         records: held out of the fit, or those fitted where none were.
         noise_found: (n_outputs,).
         logged: noise of the logged inputs, as a share of their rms.
@@ -175,44 +177,49 @@ def budget_of(
     def squares(chosen: Sequence[Effect]) -> np.ndarray:
         """Mean square (n_records,) of what is left with these effects."""
         real = apply_all(rig, chosen)
-        return np.array([_mean_square(real, record, settle, substeps) for record in records])
+        return np.array([mean_square(real, record, settle, substeps) for record in records])
 
-    causes = [*effects, *([] if errors is None else [errors])]
+    labels, causes = [effect.label for effect in effects], list(effects)
+    alike, between = (None, None) if errors is None else parted(errors)
+    if between is not None:
+        labels.append(label_of(between.target.figure))
+        causes.append(between)
+    causes += [] if alike is None else [alike]
     nominal, left = squares(()), squares(causes)
     without = [squares([c for c in causes if c is not cause]) for cause in causes]
     weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
     total = weights.sum(axis=0)
     taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
-    by_size = sorted(range(len(effects)), key=lambda i: -taken[i].sum())
-    rows = [*taken[by_size], taken[-1] if errors is not None else np.zeros_like(left)]
-    order = [effects[i] for i in by_size]
+    by_size = sorted(range(len(labels)), key=lambda i: -taken[i].sum())
+    rows = [*taken[by_size], taken[-1] if alike is not None else np.zeros_like(left)]
     noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
     rest = left - noise
     by_inputs = np.zeros_like(left)
     if logged:
         by_inputs = np.minimum(SCATTER * logged**2 * power_of_inputs(rig, records, settle), rest)
     rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
-    for i, effect in enumerate(order):  # what no model can predict is theirs
-        if effect.kind.remainder:
-            rows[i], rest = rows[i] + rest, np.zeros_like(rest)
+    for row, i in enumerate(by_size):  # what no model can predict is theirs
+        if causes[i].kind.remainder:
+            rows[row], rest = rows[row] + rest, np.zeros_like(rest)
     shares = np.array([*rows, rest, noise])
     whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)
     whole = whole / max(whole.sum(), 1e-300)
     by_record = {r.name: shares[:, i] / max(nominal[i], 1e-300) for i, r in enumerate(records)}
     return Budget(
-        effects={effect.label: float(share) for effect, share in zip(order, whole, strict=False)},
+        effects={labels[i]: float(share) for i, share in zip(by_size, whole, strict=False)},
         nominal=float(whole[-3]),
         unexplained=float(whole[-2]),
         noise=float(whole[-1]),
         by_record=by_record,
-        errors={**sizes_of(errors), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
+        errors={**sizes_of(alike), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
         noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
         noise_found=tuple(noise_found.tolist()),
         sensors=tuple(s.name for s in rig.sensors),
     )
 
 
-def _mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> float:
+def mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> float:
+    """Mean square of what a rig leaves of a record, each sensor by the standard deviation of its readings."""
     lead = round(settle / record.sample_time)
     measured = record.outputs[:, lead:]
     with np.errstate(over="ignore", invalid="ignore"):  # one effect of two that balance each other may run away

@@ -12,6 +12,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
+from workbench.gap.report.record_to_record import RecordToRecord
 from workbench.gap.report.shrinkage import Budget, Shrinkage
 from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
@@ -90,6 +91,11 @@ class Verdict:
         return next((effect for effect in self.effects if effect.kind is NOMINAL_ERRORS), None)
 
     @property
+    def record_to_record(self) -> RecordToRecord | None:
+        """A figure of the nominal model that differs from record to record; None where none does."""
+        return RecordToRecord.of(self.nominal, self.effects)
+
+    @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
         named = [_described(effect, self.nominal) for effect in self._told]
@@ -100,6 +106,8 @@ class Verdict:
             if self.nominal_errors is None:
                 below = f", below the tolerance of {100.0 * self.tolerance:g} %" if self.tolerance else ""
                 return f"The gap beyond the noise is {_percent(self.where.beyond_noise)} of the signal{below}."
+            if self.record_to_record is not None:
+                return self._differing(self.record_to_record)
             return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if any(effect.kind.remainder for effect in self.effects):
@@ -133,7 +141,10 @@ class Verdict:
     @property
     def _rest(self) -> str:
         """What the effects do not cause, in words."""
-        parts = []
+        parts, differs = [], self.record_to_record
+        if differs is not None and self.outcome != "none":
+            share = _percent(self.budget.effects.get(differs.label, 0.0))
+            parts.append(f"{share} are {differs.figure} that differs {differs.words}")
         if self.nominal_errors is not None and self.budget.nominal >= SHOWN:
             parts.append(f"{_percent(self.budget.nominal)} are small errors of the model{self._errors_in_words}")
         if self.budget.unexplained >= SHOWN:
@@ -141,6 +152,11 @@ class Verdict:
         if self.budget.noise >= SHOWN:
             parts.append(f"{_percent(self.budget.noise)} is noise")
         return "; " + ", ".join(parts) if parts else ""
+
+    def _differing(self, differs: RecordToRecord) -> str:
+        """The sentence where nothing is hidden but a figure that differs from record to record."""
+        share = _percent(self.budget.effects.get(differs.label, 0.0))
+        return f"The {differs.figure} differs {differs.words}, which causes {share} of the gap{self._rest}."
 
     @property
     def _errors_in_words(self) -> str:
@@ -194,6 +210,7 @@ class Verdict:
             "next_experiment": None if self.experiment is None else self.experiment.sentence,
             "budget": self.budget.to_json(),
             "nominal": _rounded_all(dict(self.budget.errors)),
+            "record_to_record": None if self.record_to_record is None else self.record_to_record.to_json(),
             "noise": {
                 "stated": [_rounded(v) for v in self.budget.noise_stated],
                 "found": [_rounded(v) for v in self.budget.noise_found],

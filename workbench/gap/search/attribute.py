@@ -26,6 +26,7 @@ from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors
 from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
+from workbench.gap.search.record_to_record import beside_records
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
 from workbench.gap.search.stepwise import Stepwise
@@ -295,6 +296,9 @@ def _with_a_second(
     if beside.is_enough or beside.by_singles():
         beside.run()
         return beside.decision()
+    varied = beside_records(beside)
+    if varied is not None:
+        return varied.decision()
     law = one_law(search, evidence)
     if law is None and beside.last.fit.cost < min(f.cost for f in (start, *singles)):
         beside.run()
@@ -344,5 +348,8 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
 def _beside_nominal_errors(search: Search, tolerance: float) -> Decision:
     """What holds beside errors of the nominal model."""
     beside = Stepwise(search, tolerance)
+    varied = None if beside.is_enough else beside_records(beside)
+    if varied is not None:
+        return varied.decision()
     beside.run()
     return beside.decision()

@@ -47,6 +47,7 @@ class JointSettings:
         ("frequency", 0.01),
         ("damping", 0.25),
         ("delay", 0.5),
+        ("record", 0.02),
     )
     plausible: float = 0.95
     small: tuple[tuple[str, float], ...] = (
@@ -55,6 +56,7 @@ class JointSettings:
         ("frequency", 0.001),
         ("damping", 0.1),
         ("delay", 0.1),
+        ("record", 0.001),
     )
     decisive: float = 300.0
     last_waves: int = 13

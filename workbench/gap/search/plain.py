@@ -76,6 +76,8 @@ def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effe
         effects: that were found beside the errors.
         errors: of the nominal model; sensors stay as late as they make them.
     """
+    if errors.target.record:  # no effect differs from record to record
+        return None
     named = {effect.kind for effect in effects}
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
     late = _late(search, errors)

@@ -10,6 +10,7 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, Kind
 from workbench.gap.effects.nominal import NominalPrior
+from workbench.gap.effects.record_to_record import STIFFNESS
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.logged_inputs import input_filters, logging_noise_power
@@ -48,6 +49,7 @@ class Search:
         nominal: (n_records, n_outputs) mean squares that the nominal rig leaves, in noise units.
         held: effects that every candidate stands beside, as they are.
         logged: noise of the logged inputs, as a share of their rms, beside which residuals are seen.
+        differs: the figure of the nominal model that may differ from record to record; empty for none.
     """
 
     rig: Rig
@@ -60,6 +62,7 @@ class Search:
     nominal: np.ndarray
     held: tuple[Effect, ...] = ()
     logged: float = 0.0
+    differs: str = ""
 
     def explains(self, candidate: Fit) -> bool:
         """Whether what is left is noise, in every record, up to the error of integration.
@@ -160,7 +163,10 @@ class Search:
             frequency=0.0 if structured else 0.005,
             damping=0.2,
             delay=0.1,
+            record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,
+            records=tuple(record.name for record in self.data.records) if self.differs else (),
+            figure=self.differs or STIFFNESS,
         )
 
     @cached_property

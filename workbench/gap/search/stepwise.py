@@ -116,6 +116,11 @@ class Stepwise:
     def last(self) -> Step:
         return self.steps[-1]
 
+    @property
+    def nearest(self) -> Step:
+        """The last set, or the likeliest single effect beside errors, whichever leaves less."""
+        return min((self.last, *self._alone), key=lambda s: s.fit.cost)
+
     @cached_property
     def _alone(self) -> list[Step]:
         """The likeliest single effects beside errors that start from none, best first."""

@@ -1,0 +1,130 @@
+"""Records of trial plants, another numerical route, whose stiffness or axial load differs from record to record."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.effects.structural import buckling_load
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE
+from workbench.gap.report.record_to_record import RecordToRecord, with_unseen
+from workbench.gap.search.record_to_record import deviations
+from workbench.gap.search.search import Search
+from workbench.records.record import Channel, Record
+from workbench.rig.rig import Rig
+from workbench.trials.hidden import hide
+from workbench.trials.plant import Plant
+
+NOISE = 1e-5
+LEVELS = {"low": 0.1, "mid": 0.5, "high": 1.0, "other": 0.7}
+STIFFNESS = {"low": 0.004, "mid": -0.006, "high": 0.003, "other": -0.001}  # relative, of each record
+FITTED = ("low", "mid", "high")
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(n_modes=4)
+
+
+def measured(rig: Rig, plant: Plant, name: str) -> Record:
+    rng = np.random.default_rng(list(LEVELS).index(name))
+    inputs = LEVELS[name] * np.repeat(rng.normal(size=300), 5)[None]
+    real = plant.solved()
+    outputs = real.readings(real.move(inputs, 0.01)[0], 0.01, rng)
+    return Record(
+        sample_time=0.01,
+        outputs=outputs,
+        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
+        inputs=inputs,
+        input_channels=tuple(Channel(a.name, "force", at=a.at) for a in rig.actuators),
+        name=name,
+    )
+
+
+def of_stiffness(rig: Rig, name: str, effects=()) -> Record:
+    plant = Plant.of(rig)
+    plant = replace(plant, altered=replace(plant.altered, stiffness_factor=1.0 + STIFFNESS[name]))
+    return measured(rig, hide(plant, list(effects)), name)
+
+
+def search_of(rig: Rig, records) -> Search:
+    data = FitData(tuple(records), np.full(len(rig.sensors), NOISE))
+    return Search(
+        rig, data, data, data, CATALOGUE, lambda text, share: None, ALONE, data.by_channel(data.residual(rig))
+    )
+
+
+def about_their_mean(values) -> np.ndarray:
+    found = np.array([*values])
+    return found - found.mean()
+
+
+def test_each_record_tells_its_own_stiffness(rig):
+    search = search_of(rig, [of_stiffness(rig, name) for name in FITTED])
+    found = deviations(search, (), "stiffness")
+    expected = about_their_mean(STIFFNESS[name] for name in FITTED)
+    np.testing.assert_allclose(found.values, expected, atol=3e-4)
+    assert found.is_sure and found.left < 0.02 * found.in_common
+
+
+def test_each_record_tells_its_own_axial_load(rig):
+    """And all stiffness stands for it badly: tension raises low frequencies more than high ones."""
+    share = {"low": 0.012, "mid": -0.008, "high": 0.0}
+    records = []
+    for name in FITTED:
+        plant = Plant.of(rig)
+        tension = share[name] * buckling_load(rig)
+        records.append(measured(rig, replace(plant, altered=replace(plant.altered, tension=tension)), name))
+    search = search_of(rig, records)
+    found = deviations(search, (), "axial load")
+    np.testing.assert_allclose(found.values, about_their_mean(share.values()), atol=8e-4)
+    assert found.left < 0.1 * deviations(search, (), "stiffness").left
+
+
+def test_records_alike_do_not_ask_for_a_stiffness_each(rig):
+    plant = Plant.of(rig)
+    plant = replace(plant, altered=replace(plant.altered, stiffness_factor=1.01))
+    found = deviations(search_of(rig, [measured(rig, plant, name) for name in FITTED]), (), "stiffness")
+    assert np.abs(found.values).max() < 3e-4
+    assert found.in_common - found.left < 0.3 * found.in_common
+
+
+def test_a_record_that_no_fit_has_seen_is_accounted_for_and_not_predicted(rig):
+    prior = NominalPrior(record=0.005, records=FITTED)
+    errors = nominal_errors(rig, prior, {f"record_{name}": STIFFNESS[name] for name in FITTED})
+    (found,) = with_unseen(rig, (errors,), [of_stiffness(rig, name) for name in LEVELS])
+    assert found.values["record_other"] == pytest.approx(STIFFNESS["other"], abs=5e-5)
+    assert {name: found.values[name] for name in errors.values} == errors.values
+    other = of_stiffness(rig, "other")
+    assert errors.apply(rig).in_record(other.name).modes.omega == pytest.approx(rig.modes.omega)
+    stiffer = found.apply(rig).in_record(other.name).modes.omega / rig.modes.omega
+    assert stiffer == pytest.approx(np.sqrt(1.0 + STIFFNESS["other"]), abs=5e-5)
+
+
+def test_words_say_by_how_much_records_differ_and_which_two_most():
+    found = RecordToRecord("stiffness", {"low": 0.004, "mid": -0.006, "high": 0.002})
+    assert found.spread == pytest.approx(np.std([0.004, -0.006, 0.002], ddof=1))
+    assert found.words == "from record to record by 0.53 % (1 % more in record low than in record mid)"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at", [None, 0.55])
+def test_a_hidden_effect_is_named_beside_a_stiffness_that_differs(rig, at):
+    """And none where none is hidden; the budget gives the difference between records a share of its own."""
+    hidden = [] if at is None else [{"kind": "cubic_spring", "at": at, "stiffness": 30.0}]
+    records = [of_stiffness(rig, name, hidden) for name in LEVELS]
+    verdict = diagnose(rig, records[:3], validation=records[3:])
+    assert [e["kind"] for e in verdict.to_json()["effects"]] == [e["kind"] for e in hidden]
+    assert "tiffness" in verdict.sentence and "from record to record by 0.5" in verdict.sentence
+    budget = verdict.budget
+    assert sum(budget.effects.values()) + budget.nominal + budget.unexplained + budget.noise == pytest.approx(1.0)
+    assert budget.unexplained < 0.01 and budget.effects["stiffness_record_to_record"] > 0.001
+    found = verdict.record_to_record.values
+    expected = about_their_mean(STIFFNESS[name] for name in FITTED)
+    np.testing.assert_allclose(about_their_mean(found[name] for name in FITTED), expected, atol=2e-4)
+    if at is not None:
+        assert verdict.effects[0].at == pytest.approx(at, abs=0.03)
