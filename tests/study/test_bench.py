@@ -359,7 +359,7 @@ def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
     expected = finite_spillover(loop, at_rest, design.final_time).residual_total
     assert shown(rig, moved)["residual"] == pytest.approx(expected, rel=1e-5)
     sensors = ["l.x", "R.x", "m.y"]
-    through = close_loop(rig.modes, law, point_filter(rig.modes.select([0, 1]), sensors))
+    through = close_loop(rig.modes, law, point_filter(rig.modes, sensors, [0, 1]))
     expected = finite_spillover(through, at_rest, design.final_time).residual_total
     seen = shown(rig, asked({**plain(moved), "sensors": sensors}))
     assert seen["residual"] == pytest.approx(expected, rel=1e-5)

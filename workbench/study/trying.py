@@ -201,7 +201,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
         law = coupled_lqr(modes, design.controlled, actuators, weight=design.weight[0])
     through = None
     if design.sensors:
-        through = filter_on(rig.structure, modes.select(range(design.controlled)), design.sensors)
+        through = filter_on(rig.structure, modes, range(design.controlled), design.sensors)
     loop = close_loop(modes, law, through)
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:

@@ -1,7 +1,8 @@
-"""Modal filters at named points: the discrete orthogonality of sines, least squares, and sensors that cannot do it."""
+"""Modal filters at named points: against splines, least squares and sines, and sensors that cannot do it."""
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from workbench.design.estimation.controller import filtered
 from workbench.design.estimation.modal_filter import point_filter
@@ -14,39 +15,58 @@ from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 
 N = 11  # points of a simply supported beam of unit mass and length, at equal distances
+ALONG = np.arange(1, N + 1) / (N + 1)
 NAMES = [f"P{i + 1}" for i in range(N)]
 
 
-def modes(n=6):
-    r, at = np.arange(1, n + 1), np.arange(1, N + 1) / (N + 1)
-    shapes = np.sqrt(2.0) * np.sin(np.pi * np.outer(at, r))
-    return Modes((np.pi * r) ** 2, np.full(n, 0.01), lambda index, _: shapes[index], NamedPoints(tuple(NAMES)))
+def modes(n=6, points=ALONG):
+    r, names = np.arange(1, n + 1), tuple(NAMES[: len(points)])
+    shapes = np.sqrt(2.0) * np.sin(np.pi * np.outer(points, r))
+    return Modes((np.pi * r) ** 2, np.full(n, 0.01), lambda index, _: shapes[index], NamedPoints(names))
 
 
 def test_at_equal_distances_the_weights_are_the_shapes_themselves():
     # Σ_i sin(r π i/(N+1)) sin(s π i/(N+1)) = (N+1)/2 δ_rs
-    found = point_filter(modes(4), NAMES)
-    np.testing.assert_allclose(found.displacement, modes(4).phi(NAMES).T / (N + 1), atol=1e-14)
+    found = point_filter(modes(8), NAMES, [0, 2])
+    np.testing.assert_allclose(found.displacement, modes(8).phi(NAMES)[:, [0, 2]].T / (N + 1), atol=1e-14)
     assert found.places == NAMES
 
 
-def test_it_is_the_least_squares_fit_of_noisy_readings():
+def test_more_sensors_than_modes_are_fitted_by_least_squares():
     rng = np.random.default_rng(5)
     own, at = modes(3), ["P2", "P9", "P4", "P5", "P10"]
     readings = rng.standard_normal((5, 20))
     best, *_ = np.linalg.lstsq(own.phi(at), readings)
-    np.testing.assert_allclose(filter_on(None, own, at)(readings), best, rtol=1e-12)
+    np.testing.assert_allclose(filter_on(None, own, range(3), at)(readings), best, rtol=1e-12)
+
+
+def test_many_modes_make_it_the_spline_that_bends_least():
+    # of a simply supported beam that is the cubic spline through the sensors and the supports, w'' = 0 there
+    known, at = modes(400, points=np.array([0.15, 0.4, 0.65, 0.8])), ["P1", "P2", "P3", "P4"]
+    readings, r = np.array([0.3, 1.0, -0.2, 0.5]), np.arange(1, 4)
+    spline = CubicSpline([0.0, 0.15, 0.4, 0.65, 0.8, 1.0], np.r_[0.0, readings, 0.0], bc_type="natural")
+    x = (np.arange(20000) + 0.5) / 20000
+    expected = np.sqrt(2.0) * np.sin(np.pi * np.outer(r, x)) @ spline(x) / x.size
+    np.testing.assert_allclose(point_filter(known, at, range(3))(readings), expected, rtol=1e-5)
+
+
+def test_rigid_motions_are_seen_exactly():
+    # a free bar of which four of its modes are known: it moves as one, turns, and bends in two shapes
+    x = np.linspace(-1.0, 1.0, 5)
+    shapes = np.column_stack([np.ones(5), x, x**2 - 0.5, x**4 - x**2])
+    names = [f"P{i}" for i in range(5)]
+    free = Modes([0.0, 0.0, 3.0, 9.0], np.zeros(4), lambda index, _: shapes[index], NamedPoints(tuple(names)))
+    seen = point_filter(free, ["P0", "P2", "P3"], [0, 1, 2]).seen(free)
+    np.testing.assert_allclose(seen[:, :2], np.eye(3, 2), atol=1e-6)
 
 
 def test_a_law_through_it_leaves_the_controlled_modes_as_they_were_designed():
     law = imsc(modes(), 2, [Actuator("F1", "P3"), Actuator("F2", "P7")], weight=1e-4)
-    own = modes().select(law.controlled)
-    exact, through = close_loop(modes(2), law), close_loop(modes(2), law, point_filter(own, ["P2", "P6", "P9"]))
-    np.testing.assert_allclose(through.matrix, exact.matrix, rtol=1e-11, atol=1e-9)
-    whole = point_filter(own, ["P2", "P6", "P9"])  # the same law meets the residual modes too
-    np.testing.assert_allclose(
-        close_with(modes(), filtered(law, whole)).matrix, close_loop(modes(), law, whole).matrix, atol=1e-9
-    )
+    # as many sensors as modes see each of them without the others
+    filter_ = point_filter(modes(), [f"P{i}" for i in (1, 3, 4, 6, 8, 11)], law.controlled)
+    exact = close_loop(modes(), law)
+    np.testing.assert_allclose(close_loop(modes(), law, filter_).matrix, exact.matrix, rtol=1e-9, atol=1e-7)
+    np.testing.assert_allclose(close_with(modes(), filtered(law, filter_)).matrix, exact.matrix, rtol=1e-9, atol=1e-7)
 
 
 def test_a_filter_is_tried_where_only_points_are_known():
@@ -66,12 +86,12 @@ def test_a_filter_is_tried_where_only_points_are_known():
 )
 def test_sensors_that_make_no_filter_are_refused(points, words):
     with pytest.raises(ValueError, match=words):
-        point_filter(modes(3), points)
+        point_filter(modes(3), points, range(3))
 
 
 def test_modes_that_sensors_cannot_tell_apart_are_named():
     # at quarters of the length sin 3 π x and sin 5 π x are alike but for their sign
-    with pytest.raises(ValueError, match=r"P3, P6, P9 cannot tell filtered mode\(s\) 2, 3 from rest or from each"):
-        point_filter(modes(5).select([0, 2, 4]), ["P3", "P6", "P9"])
-    with pytest.raises(ValueError, match=r"filtered mode\(s\) 2 from rest"):
-        point_filter(modes(4).select([0, 3]), ["P3", "P6", "P9"])
+    with pytest.raises(ValueError, match=r"P3, P6, P9 cannot tell filtered mode\(s\) 3, 5 from rest or from each"):
+        point_filter(modes(5), ["P3", "P6", "P9"], [0, 2, 4])
+    with pytest.raises(ValueError, match=r"filtered mode\(s\) 4 from rest"):
+        point_filter(modes(5), ["P3", "P6", "P9"], [0, 3])

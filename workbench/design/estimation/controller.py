@@ -96,7 +96,7 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
 
 
 def _filtered_anew(
-    design: Callable[[Modes], ModalFilter], modes: Modes, law: Law, sensors: Sequence[Sensor]
+    design: Callable[[Modes, Sequence[int]], ModalFilter], modes: Modes, law: Law, sensors: Sequence[Sensor]
 ) -> Controller:
     """The law through the same filter of other modes; its sensors stand where the filter has them."""
-    return filtered(law, design(modes.select(law.controlled)))
+    return filtered(law, design(modes, law.controlled))

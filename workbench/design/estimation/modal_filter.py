@@ -1,12 +1,13 @@
 """Modal filters: from sensors to modal coordinates; weights computed once.
 
 Along a structure, dissertation sections 5.3-5.4: q_r = ∫ m φ_r w dx (5.4) with w interpolated between the sensors. At
-named points, between which nothing can be interpolated, by least squares.
+named points, between which there is nothing, w is what bends the structure least.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +20,7 @@ from workbench.structure.profile import Profile, ProfileLike, as_profile
 
 GAUSS_POINTS = 24
 BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: below, noise is raised a million times
+RIGID = 1e-4  # of the slowest elastic frequency: a rigid mode counts as one so slow, which costs next to no energy
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +31,13 @@ class ModalFilter:
         positions: (n_sensors,) m, increasing; on a plate (n_sensors, 2) m; at named points (n_sensors,) names.
         displacement: (n_modes, n_sensors) weights of the displacements (or velocities).
         slope: (n_modes, n_sensors) weights of the slopes (or angular velocities); no columns where none are read.
-        designed_by: designs it anew, with the settings that it has, for other modes.
+        designed_by: designs it anew, with the settings that it has, from modes and the indices of the filtered ones.
     """
 
     positions: np.ndarray
     displacement: Floats
     slope: Floats
-    designed_by: Callable[[Modes], "ModalFilter"] | None = None
+    designed_by: Callable[[Modes, Sequence[int]], "ModalFilter"] | None = None
 
     def __post_init__(self) -> None:
         named = np.asarray(self.positions).dtype.kind in "OU"
@@ -91,7 +93,7 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         displacement[:, i + 1] += right
         slope[:, i] += left_slope
         slope[:, i + 1] += right_slope
-    again = partial(hermite_filter, positions=x, mass_per_length=mass_per_length)
+    again = partial(anew, hermite_filter, positions=x, mass_per_length=mass_per_length)
     return ModalFilter(x, displacement, slope, again)
 
 
@@ -117,44 +119,52 @@ def displacement_filter(
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
     weights = _spline_weights(modes, splines, as_profile(mass_per_length))
-    again = partial(displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
+    again = partial(anew, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
 
-def point_filter(modes: Modes, points: Sequence[str]) -> ModalFilter:
-    """The filter of displacements at named points that fits the readings best: q = Φ⁺ y, Φ⁺ = (ΦᵀΦ)⁻¹ Φᵀ.
+def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -> ModalFilter:
+    """The filter of displacements at named points: w of least strain energy through the readings.
 
-    Φ (n_sensors, n_modes) are the shapes at the sensors; the filtered modes are seen exactly, each without the others
-    (Preumont, Vibration Control of Active Structures, spatial filters).
+    Minimise ½ Σ ω_k² η_k² over all modes k under Φ η = y, Φ (n_sensors, n_modes) the shapes at the sensors, and take
+    q_r = η_r. It is the spline of a structure that is known at points alone: what bends least. From as many sensors as
+    modes on, it is the least-squares fit.
 
     Args:
-        modes: to be filtered, n_modes of them, at named points.
+        modes: all that are known, at named points.
         points: of the sensors.
+        filtered: indices of the modes to be filtered, from 0.
 
     Raises:
-        ValueError: two sensors at one point, fewer sensors than modes, or modes that they cannot tell apart.
+        ValueError: two sensors at one point, fewer sensors than filtered modes, or modes that they cannot tell apart.
     """
-    names = list(points)
+    names, index = list(points), list(filtered)
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise ValueError(f"two of the {len(names)} sensors stand at point {twice}; move one")
-    if len(names) < modes.n_modes:
+    if len(names) < len(index):
         raise ValueError(
-            f"a filter of {modes.n_modes} modes at named points needs at least as many sensors; got {len(names)}: add"
+            f"a filter of {len(index)} modes at named points needs at least as many sensors; got {len(names)}: add"
             " sensors, or filter fewer modes"
         )
     shapes = modes.phi(names)
-    left, strength, right = np.linalg.svd(shapes, full_matrices=False)
+    _, strength, right = np.linalg.svd(shapes[:, index], full_matrices=False)
     if strength[-1] < BLIND * strength[0]:
-        mixed = np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max()) + 1
+        mixed = [str(index[i] + 1) for i in np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max())]
         raise ValueError(
-            f"the sensors at {', '.join(names)} cannot tell filtered mode(s) {', '.join(map(str, mixed))} from rest or"
-            " from each other; move or add a sensor"
+            f"the sensors at {', '.join(names)} cannot tell filtered mode(s) {', '.join(mixed)} from rest or from each"
+            " other; move or add a sensor"
         )
-    weights: Floats = (right.T / strength) @ left.T
-    return ModalFilter(
-        np.array(names, object), weights, np.zeros((modes.n_modes, 0)), partial(point_filter, points=names)
-    )
+    slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
+    softness = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)
+    weights: Floats = (softness[:, None] * np.linalg.pinv(shapes * softness))[index]
+    again = partial(point_filter, points=names)
+    return ModalFilter(np.array(names, object), weights, np.zeros((len(index), 0)), again)
+
+
+def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[int], **settings: Any) -> ModalFilter:
+    """A filter between whose sensors w is interpolated, of other modes: the filtered ones are all that it asks of."""
+    return design(modes.select(list(filtered)), **settings)
 
 
 def _spline_weights(modes: Modes, splines: BSpline, mass: Profile) -> Floats:

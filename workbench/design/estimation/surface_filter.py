@@ -1,5 +1,6 @@
 """Modal filters over a rectangle: thin-plate splines through sensors that stand anywhere on it."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
@@ -7,7 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import RBFInterpolator
 
 from workbench.arrays import Floats
-from workbench.design.estimation.modal_filter import ModalFilter, displacement_filter, point_filter
+from workbench.design.estimation.modal_filter import ModalFilter, anew, displacement_filter, point_filter
 from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
@@ -50,28 +51,32 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     density = weights * as_field(mass_per_area)(points[:, 0], points[:, 1])
     splines = RBFInterpolator(nodes, np.eye(len(nodes)), kernel="thin_plate_spline", degree=1)
     spread: Floats = (modes.phi(points) * density[:, None]).T @ splines(points)[:, : len(at)]
-    again = partial(surface_filter, places=at, mass_per_area=mass_per_area)
+    again = partial(anew, surface_filter, places=at, mass_per_area=mass_per_area)
     return ModalFilter(at, spread, np.zeros((modes.n_modes, 0)), again)
 
 
-def filter_on(structure: Structure | Plate | Membrane | None, modes: Modes, places: ArrayLike) -> ModalFilter:
+def filter_on(
+    structure: Structure | Plate | Membrane | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
+) -> ModalFilter:
     """The filter of displacements of a structure's own kind: along it, over it, or at its named points.
 
     Args:
         structure: whose mass a filter along or over it needs; None at named points.
-        modes: of the structure, to be filtered.
+        modes: of the structure, all that are known.
+        filtered: indices of the modes to be filtered, from 0.
         places: of the sensors, in any order.
 
     Raises:
         ValueError: no structure where one is needed, or sensors that make no filter.
     """
     if isinstance(modes.domain, NamedPoints):
-        return point_filter(modes, [str(name) for name in np.ravel(np.asarray(places, object))])
+        return point_filter(modes, [str(name) for name in np.ravel(np.asarray(places, object))], filtered)
+    own = modes.select(list(filtered))
     if structure is None:
         raise ValueError("a modal filter needs the structure between the sensors, for its mass; describe it")
     if isinstance(structure, Plate | Membrane):
-        return surface_filter(modes, places, structure.mass_per_area)
-    return displacement_filter(modes, np.sort(np.asarray(places, float)), structure.mass_per_length)
+        return surface_filter(own, places, structure.mass_per_area)
+    return displacement_filter(own, np.sort(np.asarray(places, float)), structure.mass_per_length)
 
 
 def _held(modes: Modes, domain: Rectangle, at: np.ndarray) -> Floats:

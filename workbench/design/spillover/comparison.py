@@ -135,7 +135,7 @@ def through_sensors(
         for by_filter in ways:
             try:
                 if by_filter:
-                    controller = filtered(law, filter_on(structure, own, stands))
+                    controller = filtered(law, filter_on(structure, modes, law.controlled, stands))
                 else:
                     controller = luenberger(modes, law, sensors, poles=OBSERVER_POLES * own.omega)
                 tried.append((controller, explain(modes, controller), ""))
