@@ -153,8 +153,18 @@ def test_what_cannot_be_attached_is_refused_with_the_remedy():
     ):
         with pytest.raises(ValueError, match=message):
             model.attached([part])
-    with pytest.raises(ValueError, match="from 1 to 2 modes"):
-        model.modes(3)
+    with pytest.raises(ValueError, match="from 1 to 3 modes"):
+        model.modes(4)
+
+
+def test_a_lumped_model_has_as_many_modes_as_it_has_masses():
+    model, stiffness = row_of_masses()
+    np.testing.assert_allclose(model.modes(3).omega, np.sqrt(eigh(stiffness, eigvals_only=True)), rtol=1e-12)
+    free = FiniteElements(np.eye(2), [[1.0, -1.0], [-1.0, 1.0]], nodes=NamedPoints(("a", "b")))
+    np.testing.assert_allclose(free.modes(2).omega, [0.0, np.sqrt(2.0)], atol=1e-9)
+    light = FiniteElements(np.diag([1.0, 0.0]), [[2.0, -1.0], [-1.0, 1.0]], nodes=NamedPoints(("a", "b")))
+    with pytest.raises(ValueError, match="some motion has no mass"):
+        light.modes(2)
 
 
 def test_nodes_given_by_their_coordinates_have_points_in_every_direction():

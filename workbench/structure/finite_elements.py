@@ -6,9 +6,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import LinAlgError, eigh
 from scipy.sparse import coo_array, csc_array, sparray, spmatrix
 from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
 
+from workbench.arrays import Floats
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import ROTATIONS, Between, NamedPoints, Where
 from workbench.structure.modes import Modes
@@ -72,20 +74,23 @@ class FiniteElements:
         return self.nodes
 
     def modes(self, n_modes: int) -> Modes:
-        """The lowest `n_modes` modes, mass-normalised, by shift-invert Lanczos (ARPACK).
+        """The lowest `n_modes` modes, mass-normalised, by shift-invert Lanczos (ARPACK); all of them by LAPACK.
 
         Raises:
-            ValueError: more modes than degrees of freedom, or matrices that are not positive.
+            ValueError: more modes than degrees of freedom that have mass, or matrices that are not positive.
         """
         n = len(self.nodes.names)
-        if not 1 <= n_modes < n:
-            raise ValueError(f"from 1 to {n - 1} modes can be asked of {n} degrees of freedom; got {n_modes}")
+        if not 1 <= n_modes <= n:
+            raise ValueError(f"from 1 to {n} modes can be asked of {n} degrees of freedom; got {n_modes}")
         if _negative_pivots(self.mass):
             raise ValueError("the mass matrix is not positive: some motion would have negative kinetic energy")
         shift, factor = self._factor()
-        inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
-        start = np.random.default_rng(0).standard_normal(n)
-        _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
+        if n_modes < n:
+            inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
+            start = np.random.default_rng(0).standard_normal(n)
+            _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
+        else:
+            shapes = self._all_shapes()
         sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
         if (sizes <= 0).any():
             raise ValueError("the mass matrix is not positive: a mode has no kinetic energy")
@@ -108,6 +113,13 @@ class FiniteElements:
         else:
             damping = self.damping.matrix(omega)  # type: ignore[union-attr]
         return Modes(omega=omega, damping=damping, shapes=lambda index, _: shapes[index], domain=self.nodes)
+
+    def _all_shapes(self) -> Floats:
+        try:
+            shapes: Floats = eigh(self.stiffness.toarray(), self.mass.toarray())[1]
+        except LinAlgError as error:
+            raise ValueError("some motion has no mass, so there are fewer modes; ask for fewer") from error
+        return shapes
 
     def attached(self, parts: Sequence[Attachment]) -> "FiniteElements":
         """The structure with masses, springs and dampers at its points, or between two of them, in its matrices.

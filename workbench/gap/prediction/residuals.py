@@ -58,9 +58,7 @@ class FitData:
     given_way: tuple[np.ndarray, np.ndarray] | None = None
     follower: Follower | None = None
     heat: float = 1.0
-    _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(
-        default_factory=OrderedDict, repr=False, init=False
-    )
+    _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(default_factory=OrderedDict, repr=False, init=False)
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 
     @property
