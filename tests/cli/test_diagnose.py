@@ -3,15 +3,20 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from workbench.cases.writing import write_case
 from workbench.rig.simulate import simulate
 from workbench.trials.make import make_trial
 
 
-def write_exchanged(folder):
-    """A case that hides nothing, with its first two inputs exchanged."""
-    case, _ = make_trial(2)
+@pytest.fixture(scope="module")
+def nothing_hidden():
+    return make_trial(2)[0]
+
+
+def write_exchanged(case, folder):
+    """The case with its first two inputs exchanged."""
     order = np.arange(len(case.rig.actuators))
     order[:2] = 1, 0
 
@@ -21,13 +26,12 @@ def write_exchanged(folder):
     return write_case(replace(case, fit=wired(case.fit[:2]), validation=wired(case.validation[:1])), folder)
 
 
-def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_path, monkeypatch):
-    write_exchanged(tmp_path / "crossed")
+def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_path, monkeypatch, nothing_hidden):
+    write_exchanged(nothing_hidden, tmp_path / "crossed")
     stopped = run("diagnose", tmp_path / "crossed", "--page", tmp_path / "p.html")
     assert stopped.exit_code == 2 and "The inputs F1 and F2 are exchanged: swap them in case.toml." in stopped.output
     assert "--mend" in stopped.output and not (tmp_path / "p.html").exists()
-    seen = []
-    real, _ = make_trial(2)
+    seen, real = [], nothing_hidden
 
     def search(rig, records, *, validation, **options):
         seen.extend([*records, *validation])
@@ -41,16 +45,15 @@ def test_exchanged_inputs_stop_a_diagnosis_and_are_mended_on_request(run, tmp_pa
             np.testing.assert_array_equal(record.inputs[:2], exact.inputs[order])
 
 
-def test_a_validation_record_that_repeats_a_fit_record_is_refused(run, tmp_path):
-    case, _ = make_trial(2)
+def test_a_validation_record_that_repeats_a_fit_record_is_refused(run, tmp_path, nothing_hidden):
+    case = nothing_hidden
     write_case(replace(case, fit=case.fit[:1], validation=(replace(case.fit[0], name="again"),)), tmp_path / "same")
     refused = run("diagnose", tmp_path / "same")
     assert refused.exit_code == 2 and "repeats the fit record" in refused.output
 
 
-def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, monkeypatch):
-    real, _ = make_trial(2)
-    rng, seen = np.random.default_rng(0), []
+def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, monkeypatch, nothing_hidden):
+    rng, seen, real = np.random.default_rng(0), [], nothing_hidden
     dt = real.fit[0].sample_time
     rig = replace(real.rig, modes=real.rig.modes.select(range(2)), actuators=real.rig.actuators[:1], structure=None)
     for name, level in (("low", 1.0), ("high", 10.0)):

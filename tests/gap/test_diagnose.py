@@ -31,7 +31,7 @@ def test_the_verdict_does_not_depend_on_how_many_share_the_work(hinged_rig, reco
 
 
 def test_a_hidden_contact_is_named_placed_and_closed():
-    case, label = make_trial(11, kinds=("one_sided_stop",))
+    case, label = make_trial(3, kinds=("one_sided_stop",))
     verdict, hidden = verdict_on(case), label["effects"][0]
     shown = verdict.to_json()
     assert [e["kind"] for e in shown["effects"]] == ["one_sided_stop"] and verdict.outcome == "explained"
@@ -86,9 +86,13 @@ def test_a_weak_law_beyond_the_catalogue_does_not_pass_for_one_of_it():
     assert verdict.alternatives[0][0] == "clearance"
 
 
-def test_nothing_hidden_nothing_told():
-    case, _ = make_trial(12)
-    verdict = verdict_on(case)
+@pytest.fixture(scope="module")
+def nothing_hidden():
+    return make_trial(3)[0]
+
+
+def test_nothing_hidden_nothing_told(nothing_hidden):
+    verdict = verdict_on(nothing_hidden)
     assert verdict.outcome == "none" and verdict.to_json()["effects"] == []
 
 
@@ -162,8 +166,8 @@ def test_validation_records_never_reach_the_search(hinged_rig, record_of):
     assert honest.shrinkage.overall > other.shrinkage.overall
 
 
-def test_records_that_cannot_be_of_the_rig_are_refused():
-    case, _ = make_trial(12)
+def test_records_that_cannot_be_of_the_rig_are_refused(nothing_hidden):
+    case = nothing_hidden
     turned = [replace(r, outputs=r.outputs * np.r_[-1.0, np.ones(r.n_outputs - 1)][:, None]) for r in case.fit]
     with pytest.raises(RecordsError, match="wrong sign"):
         diagnose(case.rig, turned)

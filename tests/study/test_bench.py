@@ -100,7 +100,7 @@ def request(port, method, path, content=None, **headers):
 
 def test_it_begins_with_the_design_of_section_5_8():
     design = start(RIG)
-    assert design.actuators == (2.0, 4.0, 6.0, 8.0) and design.struck_at == 6.3 and design.controlled == 4
+    assert design.actuators == (2.0, 4.0, 6.0, 8.0) and design.impulse_at == 6.3 and design.controlled == 4
     found = shown(RIG, replace(design, final_time=3000.0))
     expected = [0.0, 1.213865e-3, 5.203347e-5, 1.294254e-4, 1.037589e-4]
     np.testing.assert_allclose(found["by_mode"][4:], expected, rtol=1e-5, atol=1e-12)
@@ -135,8 +135,8 @@ def test_sensors_close_the_loop_through_modal_filters():
         ({"actuators": [2.0, 2.0, 6.0, 8.0]}, "both stand at x = 2"),
         ({"actuators": [2.0] * 41}, "at most 40"),
         ({"actuators": ["a", 2.0, 6.0, 8.0]}, "a position x in m; got 'a'"),
-        ({"struck_at": 11.0}, "outside the structure"),
-        ({"struck_at": [1.0, 2.0]}, "a place is a position along the structure, m; got"),
+        ({"impulse_at": 11.0}, "outside the structure"),
+        ({"impulse_at": [1.0, 2.0]}, "a place is a position along the structure, m; got"),
         ({"sensors": [[1.0, "b"]]}, "sensors is made of finite numbers; got 'b'"),
         ({"sensors": [3.0, 3.0]}, "increasing"),
         ({"law": "bang"}, "law is one of"),
@@ -153,7 +153,7 @@ def test_what_makes_no_design_is_refused(change, words):
 def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     rig, _ = plate
     design = start(rig)
-    assert design.actuators == ((0.3, 0.24), (0.84, 0.52)) and design.struck_at == (0.5, 0.46)
+    assert design.actuators == ((0.3, 0.24), (0.84, 0.52)) and design.impulse_at == (0.5, 0.46)
     moved = replace(design, actuators=((0.35, 0.3), (0.8, 0.5)))
     found = shown(rig, asked(plain(moved)))
     sizes = {"length": (0.2, 0.12)} if rig.actuators[0].kind == "moment" else None
@@ -171,7 +171,7 @@ def test_a_design_on_a_plate_is_what_the_library_makes_of_it(plate):
     [
         ({"actuators": [[0.3, 0.24], [1.3, 0.5]]}, "1.3.* 0 to 1.2 by 0 to 0.8"),
         ({"actuators": [0.3, [0.8, 0.5]]}, "a place is a pair .* m; got 0.3"),
-        ({"struck_at": 0.3}, "a place is a pair .* m; got 0.3"),
+        ({"impulse_at": 0.3}, "a place is a pair .* m; got 0.3"),
         ({"sensors": [[0.3, 0.2], [0.3, 0.2]]}, "two of the 2 sensors stand at one place"),
     ],
 )
@@ -349,7 +349,7 @@ def frame(tmp_path):
 def test_a_design_on_a_frame_is_what_the_library_makes_of_it(frame):
     rig, _ = frame
     design = start(rig)
-    assert design.actuators == ("R.x", "l.x") and design.struck_at == "m.y"
+    assert design.actuators == ("R.x", "l.x") and design.impulse_at == "m.y"
     moved = asked({**plain(design), "actuators": ["L.x", "m.y"]})
     actuators = [Actuator("F1", "L.x"), Actuator("F2", "m.y")]
     law = imsc(rig.modes, 2, actuators, weight=design.weight)

@@ -23,9 +23,9 @@ from workbench.trials.make import KINDS, OUTSIDE_KINDS, draw_kinds, make_trial, 
 from workbench.trials.scoring import score, tally
 
 QUICK = (
-    ("clearance",),
-    ("stiffness_drift", "sensor_gain"),
-    (),
+    (11, ("clearance",)),  # on a beam
+    (3, ("stiffness_drift", "sensor_gain")),  # on a rod, whose motion takes fewer steps
+    (3, ()),
 )
 CHANNELS = ("kind", "input", "output", "with", "from")
 BY_NAME = {kind.name: kind for kind in CATALOGUE}
@@ -63,9 +63,9 @@ def _check_against_predictor(kinds: tuple[str, ...], seed: int) -> None:
         assert max(f["gap"] / f["noise_floor"] for f in label["records"].values()) > 2.0
 
 
-@pytest.mark.parametrize("kinds", QUICK, ids=lambda kinds: "+".join(kinds) or "none")
-def test_two_numerical_routes_agree(kinds):
-    _check_against_predictor(kinds, seed=11)
+@pytest.mark.parametrize(("seed", "kinds"), QUICK)
+def test_two_numerical_routes_agree(seed, kinds):
+    _check_against_predictor(kinds, seed)
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_what_is_outside_the_vocabulary_is_labelled_unknown(kind):
 
 
 def test_a_seed_makes_a_case():
-    first, again, other = (make_trial(seed, kinds=("sensor_bias",)) for seed in (3, 3, 4))
+    first, again, other = (make_trial(seed, kinds=("sensor_bias",)) for seed in (3, 3, 7))
     assert first[1] == again[1] != other[1]
     np.testing.assert_array_equal(first[0].fit[0].outputs, again[0].fit[0].outputs)
 

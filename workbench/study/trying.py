@@ -46,7 +46,7 @@ class Design:
         controlled: how many of the lowest modes.
         weight: R of force against motion, one for each controlled mode; coupled LQR takes the first.
         law: one of LAWS.
-        struck_at: place of a unit impulse.
+        impulse_at: place of a unit impulse.
         final_time: until which the work is counted, s.
     """
 
@@ -55,7 +55,7 @@ class Design:
     controlled: int
     weight: tuple[float, ...]
     law: str
-    struck_at: Place
+    impulse_at: Place
     final_time: float
 
 
@@ -104,7 +104,7 @@ def asked(content: Mapping[str, Any]) -> Design:
         raise StudyError(f"final_time must be positive; got {final_time:g}")
     return Design(
         **places, controlled=count, weight=weight, law=content["law"],
-        struck_at=_place(content["struck_at"], "struck_at"), final_time=final_time,
+        impulse_at=_place(content["impulse_at"], "impulse_at"), final_time=final_time,
     )  # fmt: skip
 
 
@@ -186,14 +186,14 @@ def try_out(rig: Rig, design: Design) -> Tried:
     """
     modes, domain = rig.modes, _domain(rig)
     if isinstance(domain, NamedPoints):
-        domain.locate([*design.actuators, *design.sensors, design.struck_at])
-    for at in () if isinstance(domain, NamedPoints) else (*design.actuators, *design.sensors, design.struck_at):
+        domain.locate([*design.actuators, *design.sensors, design.impulse_at])
+    for at in () if isinstance(domain, NamedPoints) else (*design.actuators, *design.sensors, design.impulse_at):
         if isinstance(at, tuple) != isinstance(domain, Rectangle):
             wanted = "a pair (x, y) on the plate" if isinstance(domain, Rectangle) else "a position along the structure"
             raise StudyError(f"a place is {wanted}, m; got {at}")
     if design.controlled > modes.n_modes:
         raise DesignError(f"{design.controlled} modes controlled of {modes.n_modes} at hand; control fewer")
-    kind = patch_of(rig) or Actuator("F", design.struck_at)
+    kind = patch_of(rig) or Actuator("F", design.impulse_at)
     actuators = [replace(kind, name=f"F{i + 1}", at=centred_at(kind.at, at)) for i, at in enumerate(design.actuators)]
     if design.law == "IMSC":
         law = imsc(modes, design.controlled, actuators, weight=design.weight)
@@ -209,7 +209,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
             f"the loop runs away: a pole at {fastest:+.3g} rad/s, because the sensors mistake residual modes for"
             " controlled ones; move or add sensors, or raise R"
         )
-    state = impulse_state(modes, design.struck_at)
+    state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()
     at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is what control puts there
     response = respond(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
@@ -236,7 +236,7 @@ def shown(rig: Rig, design: Design) -> dict[str, Any]:
         "modal": _plain(tried.response.modal[: rig.modes.n_modes, ::step]),
         "energy": _plain(energy),
         "forces": _plain(tried.response.forces[:, ::step]),
-        "struck": _plain(rig.modes.phi(design.struck_at)[0]),
+        "struck": _plain(rig.modes.phi(design.impulse_at)[0]),
     }
 
 

@@ -161,7 +161,7 @@ def test_faults_that_hide_one_another_are_found_one_after_the_other(case):
     "kinds", [("sensor_misplacement",), ("actuator_gain",), ("sensor_gain",), ("one_sided_stop",), ("modal_damping",)]
 )
 def test_an_effect_is_not_taken_for_a_fault_of_wiring(kinds):
-    case, _ = make_trial(21, kinds=kinds)
+    case, _ = make_trial(3, kinds=kinds)
     assert wiring(case.rig, case.fit) == ()
 
 

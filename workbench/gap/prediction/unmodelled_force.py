@@ -75,7 +75,6 @@ class ForceFilter:
         covariance: (n_states, n_states) of the predicted state.
         gain: (n_states, n_sensors), predictor form.
         innovation: (n_sensors, n_sensors) covariance S.
-        n_forces: m.
     """
 
     a: np.ndarray
@@ -83,7 +82,6 @@ class ForceFilter:
     covariance: np.ndarray
     gain: np.ndarray
     innovation: np.ndarray
-    n_forces: int
 
 
 def force_filter(
@@ -103,7 +101,7 @@ def force_filter(
     h = np.hstack([model.output, model.feedthrough @ patterns, np.zeros((model.output.shape[0], (stages - 1) * m))])
     q = np.zeros_like(a)
     q[-m:, -m:] = np.diag(variances)
-    return _steady(a, h, q, model.noise_variance, m)
+    return _steady(a, h, q, model.noise_variance)
 
 
 def wandering_force_filter(
@@ -144,14 +142,14 @@ def wandering_force_filter(
     transition = transition / scale[:, None] * scale
     noise = 0.5 * (noise + noise.T) / scale[:, None] / scale
     h = np.hstack([model.output, model.feedthrough @ shape[:, None]])
-    return _steady(transition, h, noise, model.noise_variance, 1)
+    return _steady(transition, h, noise, model.noise_variance)
 
 
-def _steady(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray, n_forces: int) -> ForceFilter:
+def _steady(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> ForceFilter:
     covariance = steady_covariance(a, h, q, noise_variance)
     s = h @ covariance @ h.T + np.diag(noise_variance)
     gain = np.linalg.solve(s, h @ covariance @ a.T).T
-    return ForceFilter(a, h, covariance, gain, s, n_forces)
+    return ForceFilter(a, h, covariance, gain, s)
 
 
 def steady_covariance(a: np.ndarray, h: np.ndarray, q: np.ndarray, noise_variance: np.ndarray) -> np.ndarray:

@@ -200,7 +200,7 @@
     free.textContent = "";
     design.actuators.forEach(function (_, i) { handle("actuators", i, stand.viewBox.baseVal.height - 42, "M0,-10L8,6H-8Z", "var(--bad)", "actuator " + (i + 1)); });
     design.sensors.forEach(function (_, i) { handle("sensors", i, beamY, "M0,-6A6,6 0 1 1 -0.01,-6Z", "var(--paper)", "sensor " + (i + 1)); });
-    handle("struck_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", flat ? "var(--ink)" : "var(--soft)", "hammer");
+    handle("impulse_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", flat ? "var(--ink)" : "var(--soft)", "hammer");
   }
   // a place inside, all of a patch on the structure
   function held(kind, place) {
@@ -219,7 +219,7 @@
     }
     svg("circle", { class: "halo", r: 20 }, g);
     svg("path", { d: path, fill: fill, stroke: flat && kind !== "sensors" ? "var(--paper)" : "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : flat ? 1 : 0 }, g);
-    var beside = kind === "struck_at" && !flat;
+    var beside = kind === "impulse_at" && !flat;
     var label = svg("text", { y: beside ? 5 : 20, x: beside ? 14 : 0, "text-anchor": beside ? "start" : "middle" }, g);
     function at() { return i === null ? design[kind] : design[kind][i]; }
     function put() {
