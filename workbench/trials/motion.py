@@ -172,7 +172,8 @@ def interval(
             t = (k + start) * dt + step * h
             _rates(t, y, k1, system, (targets, before, begun[0]), held)
             if step == 0:
-                out[0, piece], out[1, piece], out[2, piece] = y[:n], y[n : 2 * n], k1[n : 2 * n]
+                for i in range(n):
+                    out[0, piece, i], out[1, piece, i], out[2, piece, i] = y[i], y[n + i], k1[n + i]
             for i in range(size):
                 trial[i] = y[i] + 0.5 * h * k1[i]
             _rates(t + 0.5 * h, trial, k2, system, (targets, before, begun[0]), held)
@@ -244,6 +245,7 @@ def integrate(
             for i in range(n):
                 commands[j, k] -= feedback[j, i] * y[n + i]
         aim(commands[:, k], drive, earlier, z, now)
-        aims[:, k] = now
+        for j in range(m):
+            aims[j, k] = now[j]
         interval(k, y, system, drive[1][:, 3], aims, headed_for, held[k], dt, edges, steps, work, out[:, :, k], none)
     return out
