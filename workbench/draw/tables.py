@@ -23,12 +23,12 @@ def plot_poles(poles: Mapping[str, np.ndarray]) -> Figure:
 
 
 def plot_deviations(names: Sequence[str], values: Sequence[float], deviations: Sequence[float], label: str) -> Figure:
-    """Figures, each with a bar of two standard deviations either way."""
+    """Estimates, each with a bar of two standard errors either way."""
     figure, ax = new_figure(width=9, height=3.5)
     at = np.arange(len(values))
     ax.vlines(at, np.subtract(values, 2 * np.asarray(deviations)), np.add(values, 2 * np.asarray(deviations)),
-              color=COLOURS[1], label="± 2 standard deviations")  # fmt: skip
-    ax.plot(at, values, "o", color=COLOURS[0], label="found")
+              color=COLOURS[1], label="± 2 standard errors")  # fmt: skip
+    ax.plot(at, values, "o", color=COLOURS[0], label="estimate")
     ax.set_xticks(at, list(names))
     ax.set(ylabel=label)
     ax.legend()

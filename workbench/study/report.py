@@ -135,7 +135,7 @@ def _verdict(content: dict[str, Any]) -> dict[str, Any]:
     gaps = [[record, *(gap[name].get(record) for name in ("before", "after", "floor"))] for record in gap["before"]]
     tables = [
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]"), effects),
-        ("Gap on records kept out of the fit", ("record", "before", "after", "floor"), gaps),
+        ("Gap on held-out records", ("record", "before", "after", "floor"), gaps),
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
     return {
@@ -160,10 +160,11 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     names = [f"mode {r + 1}" for r in range(hertz.size)]
     damping = plot_deviations(names, columns[2], columns[3], "damping ratio")
     heads = ("mode", "frequency [Hz]", "standard error", "damping ratio", "standard error ")
-    blocks = [block(damping, "Damping ratio of each mode with its standard error.")]
+    blocks = [block(damping, "Damping ratio of each mode, ± 2 standard errors.")]
     if len(shapes) > 1:  # one sensor knows no shape
         moving = mode_motion({"identified": modes})
-        blocks.insert(0, block(moving, "The shapes identified, at the sensors, with the phase of each."))
+        numbered = "" if np.isfinite(places).all() else ", numbered as in the record"
+        blocks.insert(0, block(moving, f"The shapes identified, at the sensors{numbered}, with the phase of each."))
     if len(shapes) > 1 and hertz.size > 1:
         blocks.append(
             block(plot_mac(mac(modes.shapes, modes.shapes)), "Modal assurance criterion of each pair of modes.")

@@ -98,7 +98,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     ]
     rivals = [(r["kind"].replace("_", " "), r["probability"]) for r in shown["alternatives"]]
     tables: list[Table] = [
-        ("Gap on records kept out of the fit", ("record", "before", "after", "floor", "share closed"), gaps),
+        ("Gap on held-out records", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
