@@ -108,7 +108,7 @@ def test_a_record_that_no_fit_has_seen_is_accounted_for_and_not_predicted(rig):
 def test_words_say_by_how_much_records_differ_and_which_two_most():
     found = RecordToRecord("stiffness", {"low": 0.004, "mid": -0.006, "high": 0.002})
     assert found.spread == pytest.approx(np.std([0.004, -0.006, 0.002], ddof=1))
-    assert found.words == "from record to record by 0.53 % (1 % more in record low than in record mid)"
+    assert found.words == "0.53 %: record low is 1 % stiffer than record mid"
 
 
 @pytest.mark.slow
@@ -119,7 +119,8 @@ def test_a_hidden_effect_is_named_beside_a_stiffness_that_differs(rig, at):
     records = [of_stiffness(rig, name, hidden) for name in LEVELS]
     verdict = diagnose(rig, records[:3], validation=records[3:])
     assert [e["kind"] for e in verdict.to_json()["effects"]] == [e["kind"] for e in hidden]
-    assert "tiffness" in verdict.sentence and "from record to record by 0.5" in verdict.sentence
+    assert "from record to record" in verdict.sentence
+    assert "record low is 1 % stiffer than record mid" in verdict.sentence
     budget = verdict.budget
     assert sum(budget.effects.values()) + budget.nominal + budget.unexplained + budget.noise == pytest.approx(1.0)
     assert budget.unexplained < 0.01 and budget.effects["stiffness_record_to_record"] > 0.001

@@ -53,13 +53,11 @@ class RecordToRecord:
 
     @property
     def words(self) -> str:
-        """Such as: from record to record by 0.8 % (1.1 % more in record low than in record high)."""
+        """Such as: 0.8 %: record low is 1.1 % stiffer than record high."""
         less, more = (pick(self.values, key=lambda name: self.values[name]) for pick in (min, max))
         apart = self._written(self.values[more] - self.values[less])
-        return (
-            f"from record to record by {self._written(self.spread)}"
-            f" ({apart} more in record {more} than in record {less})"
-        )
+        how = f"has {apart} more than" if self.figure == TENSION else f"is {apart} stiffer than"
+        return f"{self._written(self.spread)}: record {more} {how} record {less}"
 
     def _written(self, size: float) -> str:
         return f"{size:.2g} N" if self.figure == TENSION else f"{100.0 * size:.2g} %"

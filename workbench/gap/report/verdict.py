@@ -144,7 +144,7 @@ class Verdict:
         parts, differs = [], self.record_to_record
         if differs is not None and self.outcome != "none":
             share = _percent(self.budget.effects.get(differs.label, 0.0))
-            parts.append(f"{share} are {differs.figure} that differs {differs.words}")
+            parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
         if self.nominal_errors is not None and self.budget.nominal >= SHOWN:
             parts.append(f"{_percent(self.budget.nominal)} are small errors of the model{self._errors_in_words}")
         if self.budget.unexplained >= SHOWN:
@@ -156,7 +156,8 @@ class Verdict:
     def _differing(self, differs: RecordToRecord) -> str:
         """The sentence where nothing is hidden but a figure that differs from record to record."""
         share = _percent(self.budget.effects.get(differs.label, 0.0))
-        return f"The {differs.figure} differs {differs.words}, which causes {share} of the gap{self._rest}."
+        how = f"The {differs.figure} differs from record to record by {differs.words}"
+        return f"{how}. This causes {share} of the gap{self._rest}."
 
     @property
     def _errors_in_words(self) -> str:
