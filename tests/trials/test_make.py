@@ -171,7 +171,7 @@ def test_the_labels_are_gone_from_the_disk_when_a_diagnosis_runs(tmp_path, monke
         assert not list(vault.rglob("labels.json")), "labels are in reach of the diagnosis"
         return {"effects": [{"kind": "sensor_gain", "output": "nobody", "parameters": {}}], "shrinkage": {}}
 
-    held = hold_trials(2, 4, kinds=[("sensor_gain",), ()], diagnose_case=guess)
+    held = hold_trials(2, 2, kinds=[("sensor_gain",), ()], diagnose_case=guess)
     assert len(seen) == 2
     assert held.tally.shares == {"single": (1, 1), "none": (0, 1)}
     assert held.scores["case-001"]["kinds"] and not held.scores["case-001"]["channels"]
