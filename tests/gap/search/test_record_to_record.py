@@ -115,7 +115,7 @@ def test_words_say_by_how_much_records_differ_and_which_two_most():
 @pytest.mark.parametrize("at", [None, 0.55])
 def test_a_hidden_effect_is_named_beside_a_stiffness_that_differs(rig, at):
     """And none where none is hidden; the budget gives the difference between records a share of its own."""
-    hidden = [] if at is None else [{"kind": "cubic_spring", "at": at, "stiffness": 30.0}]
+    hidden = [] if at is None else [{"kind": "cubic_spring", "at": at, "stiffness": 300.0}]
     records = [of_stiffness(rig, name, hidden) for name in LEVELS]
     verdict = diagnose(rig, records[:3], validation=records[3:])
     assert [e["kind"] for e in verdict.to_json()["effects"]] == [e["kind"] for e in hidden]
