@@ -54,7 +54,7 @@ def test_only_what_keeps_its_level_looks_random(rig, records):
     assert not looks_random(evidence(told, records(stiffer, 0.0)))
 
 
-def test_what_drifts_below_the_first_mode_is_not_the_forces_level(rig, records):
+def test_what_drifts_far_below_the_first_mode_is_not_the_forces_level(rig, records):
     # accelerometers hardly see it: what an estimate of the force does there is chance
     seen = evidence(replace(rig, actuators=rig.actuators[:1]), records(rig, 0.05))
     (place, *_), n = seen.at_peaks, seen.data.counted[0].n_samples
@@ -91,3 +91,16 @@ def test_a_weak_effect_beside_it_is_found(rig, records):
     assert sorted(effect.label for effect in both.effects) == ["modulus_error", "random_disturbance"]
     factor = next(e.values["factor"] for e in both.effects if "factor" in e.values)
     assert factor == pytest.approx(1.002, abs=5e-4)
+
+
+@pytest.mark.slow
+def test_it_is_found_beside_a_stronger_law(rig, records):
+    told, law = replace(rig, actuators=rig.actuators[:1]), OneSidedStop(0.9, 80.0, 0.002)
+    catalogue = tuple(kind_named(name) for name in ("one_sided_stop", "coulomb_friction", "random_disturbance"))
+    found = diagnose(told, records(replace(rig, elements=(law,)), 0.01), catalogue=catalogue)
+    assert sorted(effect.label for effect in found.effects) == ["one_sided_stop", "random_disturbance"]
+    stop, wind = sorted(found.effects, key=lambda effect: effect.label)
+    assert stop.values["stiffness"] == pytest.approx(80.0, rel=0.01)
+    assert stop.values["at"] == pytest.approx(0.9, abs=0.002)
+    assert wind.values["rms"] == pytest.approx(0.01, rel=0.15)  # of its power a part is above what the beam answers to
+    assert wind.values["at"] == pytest.approx(1.3, abs=0.01)

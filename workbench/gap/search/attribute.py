@@ -16,7 +16,7 @@ from workbench.gap.prediction.logged_inputs import logging_noise
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData, noise_found
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.beside_random import decide_on_random
+from workbench.gap.search.beside_random import decide_on_random, random_beside_singles
 from workbench.gap.search.decide import decide
 from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -293,6 +293,9 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
+    random = random_beside_singles(search, singles)
+    if random is not None:
+        return random
     if beside.is_enough or beside.by_singles():
         beside.run()
         return beside.decision()

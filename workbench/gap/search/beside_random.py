@@ -26,9 +26,11 @@ NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wro
 RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
 STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
 FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
+BESIDE_SINGLES = 2  # likeliest kinds of single effects that a random force is tried beside
 WHITENED_BESIDE = 0.2  # of unit power: what small errors of the model leave after a fit of them
 TOGETHER = 6  # iterations of errors of the nominal model beside it
 SPREAD = 0.5  # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
+DRIFTING = 0.1  # of the first elastic frequency: sensors of rates hardly see a force below, and its estimate drifts
 FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
 
@@ -36,9 +38,8 @@ def looks_random(evidence: Evidence) -> bool:
     """Whether the unmodelled force is as strong in every record, follows little that the rig does, and is no tone."""
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
-    # sensors of rates hardly see a force below the first mode, and its estimate drifts there
     elastic = evidence.rig.modes.omega[evidence.rig.modes.omega > 0] / (2.0 * np.pi)
-    slowest = float(elastic[0]) if elastic.size else 0.0
+    slowest = DRIFTING * float(elastic[0]) if elastic.size else 0.0
     levels = np.array([_rms_above(slowest, force, records[0].sample_time) for force in forces])
     if len(forces) < 2 or np.ptp(levels) > SPREAD * levels.mean():
         return False
@@ -81,6 +82,17 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
         off = with_random(search, fit(search.rig, (errors,), beside.data, iterations=TOGETHER))
         found = Decision("explained", *off) if off[1].holds_within(WHITENED_BESIDE) else None
     return found, [each[0] for each in tried]
+
+
+def random_beside_singles(search: Search, singles: Sequence[Fit]) -> Decision | None:
+    """A random disturbance beside a stronger effect that leaves what looks random; None where none holds."""
+    tried = []
+    for single in spread_over_kinds(singles, 1)[:BESIDE_SINGLES]:
+        evidence = search.evidence_of(apply_all(search.rig, single.effects))
+        evidence = _by_laws_on_measured_motion(search, evidence)
+        if looks_random(evidence):
+            tried.append(with_random(search, single, evidence))
+    return _likeliest(search, tried)
 
 
 def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
