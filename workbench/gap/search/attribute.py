@@ -319,10 +319,11 @@ def _with_a_second(
         return decision
     if len(beside.steps) == 1:
         beside.run()
-    decision = beside.decision()
-    if decision.outcome != "explained" and pairs.by_exchange():
-        return pairs.decision(start)
-    return decision
+    if beside.decision().outcome != "explained" and pairs.by_exchange():
+        decision = pairs.decision(start)
+        if not (are_common(decision.best.effects) and beside.is_nothing):
+            return decision
+    return beside.decision()
 
 
 def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:

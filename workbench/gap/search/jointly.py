@@ -249,7 +249,8 @@ def surely_late(errors: Effect) -> Effect:
 def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = ()) -> Effect:
     """The errors with each accelerometer on that side of the jumps at the samples which the records show it to read.
 
-    Those that are known to be late stay so.
+    Those that are known to be late stay so. Predictions one sample ahead tell: what a wrong frequency does to whole
+    records looks like any delay.
     """
     known = errors.target.late
     jumping = tuple(s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known)
@@ -260,14 +261,14 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     def left(delay: float) -> np.ndarray:
         tried = nominal_errors(search.rig, replace(errors.target, late=known, early=()), none)
         tried = replace(tried, values={**tried.values, **{f"delay_{name}": delay for name in jumping}})
-        return search.data.residual(apply_all(search.rig, (*effects, tried)))
+        return search.ahead.residual(apply_all(search.rig, (*effects, tried)))
 
     # where motion is quick between samples, what a sensor reads a while before a jump is not what it reads at once
     delays = np.array([*(-delay for delay in SETTINGS.delays), 0.0, JUST_LATE, *SETTINGS.delays])
     residuals = {float(delay): left(float(delay)) for delay in delays}
     before, at, after = left(-JUST_LATE), residuals[0.0], residuals[JUST_LATE]
-    step, smooth = (search.data.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
-    powers = np.array([search.data.by_channel(residual).sum(axis=0) for residual in residuals.values()])
+    step, smooth = (search.ahead.by_channel(b - a).sum(axis=0) for a, b in ((at, after), (before, at)))
+    powers = np.array([search.ahead.by_channel(residual).sum(axis=0) for residual in residuals.values()])
     rows = [j for j, s in enumerate(search.rig.sensors) if s.name in jumping and step[j] > SETTINGS.jump * smooth[j]]
     sided = {search.rig.sensors[j].name: float(delays[powers[:, j].argmin()]) for j in rows}
     late = (*known, *(name for name, delay in sided.items() if delay > 0))

@@ -8,14 +8,14 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all, key_of
 from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
-from workbench.gap.effects.nominal import group_of, nominal_errors
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import SETTINGS as JOINTLY
-from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened, surely_late
+from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.plain import COMMON, MOST_COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import one_more
@@ -107,9 +107,6 @@ class Stepwise:
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
         self.steps.append(self._afresh(()))
-        again = on_their_sides(search, opened(search, self.last.errors))
-        if again.target.late != self.last.errors.target.late:  # what errors had hidden at first
-            self.steps = [fit_jointly(search, (), again)]
         self._hear_inputs(self.last)
 
     @property
@@ -140,6 +137,10 @@ class Stepwise:
         best = replace(self._simplest(best, self._alone[1:]), others=tuple(self._alone))
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
+        fewer = self._without_needless(best)
+        if not fewer.effects:  # it had but led the errors into another valley
+            self.steps.append(fit_jointly(self.search, (), fewer.errors))
+            return self.is_enough
         self.steps.append(best)
         self._hear_inputs(best)
         return True
@@ -306,7 +307,7 @@ class Stepwise:
 
     def _is_worth(self, best: Step, step: Step) -> bool:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
-        if not self._matters(best):
+        if not self._matter(best.effects, best.fit.effects):
             return False
         if self.search.logged and self._is_likelier(best, step):
             return True
@@ -325,18 +326,18 @@ class Stepwise:
         gain = float(np.log(step.fit.cost / best.fit.cost))
         return gain > WORTHWHILE and self.search.tells_apart(best.fit.cost, step.fit.cost, more)
 
-    def _matters(self, step: Step) -> bool:
-        """Whether each effect of a set alters what the sensors read by more than the tolerance, in some record."""
+    def _matter(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
+        """Whether each of some effects of a set alters the readings by more than the tolerance, in some record."""
         data, rig = self.search.data, self.search.rig
         scales = [record.outputs.std(axis=1, keepdims=True) for record in data.counted]
-        whole = data.predictions(apply_all(rig, step.fit.effects))
+        whole = data.predictions(apply_all(rig, beside))
 
-        def altered(effects: tuple[Effect, ...]) -> float:
-            without = data.predictions(apply_all(rig, (*effects, step.errors)))
+        def altered(effect: Effect) -> float:
+            without = data.predictions(apply_all(rig, [e for e in beside if e is not effect]))
             each = zip(whole, without, scales, strict=True)
             return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
 
-        return all(altered(effects) > self.tolerance for effects in each_left_out(step.effects))
+        return all(altered(effect) > self.tolerance for effect in effects)
 
     def _is_timing(self, step: Step) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
@@ -360,24 +361,22 @@ class Stepwise:
         Where frequencies are off, motions of whole records run out of step, and the way is told one sample ahead.
         """
         search = self.search
-        sides = [on_their_sides(search, nominal_errors(search.rig, search.prior), effects)]
-        # what was late before may have been so for want of an effect
-        late = surely_late(self.last.errors).target.late if self.steps else ()
-        if late:
-            known = {name: self.last.errors.values[name] for name in (f"delay_{sensor}" for sensor in late)}
-            kept = nominal_errors(search.rig, replace(search.prior, late=late), known)
-            sides.append(on_their_sides(search, kept, effects))
-        by_sides = {errors.target.late: errors for errors in sides}
-        started = {
-            late: fit(search.rig, (*effects, errors), search.ahead, iterations=JOINTLY.iterations, chord=True)
-            for late, errors in by_sides.items()
-        }
-        best = min(started, key=lambda late: started[late].cost)
-        ahead, none = started[best], by_sides[best]
+        none = on_their_sides(search, nominal_errors(search.rig, search.prior), effects)
+        ahead = self._ahead(effects, none)
+        *others, errors = ahead.effects
+        # with frequencies set right the sides show better
+        again = on_their_sides(search, replace(errors, target=replace(errors.target, late=(), early=())), others)
+        if again.target.late != none.target.late:
+            ahead = min(ahead, self._ahead(others, again), key=lambda each: each.cost)
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
         if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
             return found
         return min(found, fit_jointly(search, effects, none), key=lambda s: s.fit.cost)
+
+    def _ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
+        """Effects and errors fitted to predictions one sample ahead."""
+        search = self.search
+        return fit(search.rig, (*effects, errors), search.ahead, iterations=JOINTLY.iterations, chord=True)
 
     def _whole(self, step: Step) -> Step:
         """The step fitted to all records.
@@ -425,8 +424,12 @@ class Stepwise:
         if step.logged > LEAST_LOGGED and not self.search.logged:
             search = beside_inputs(self.at_first, step.fit, step.sensor_noise) or search
         found = in_place_of_errors(search, step.effects, step.errors)
-        if found is not None:
-            self.search = search
+        if found is None:
+            return None
+        named = [effect for effect in found.effects if effect.kind not in (*COMMON, NOMINAL_ERRORS)]
+        if not self._matter(named, found.effects):
+            return None
+        self.search = search
         return found
 
     def _promoted(self, step: Step) -> Step:
