@@ -30,7 +30,7 @@ CURVED_OVER = 2e-3  # of the extent: half of the stretch over which the likeliho
 LEVEL_SPREAD = 0.15  # of its rms between records, relative, at most
 WHITENED = 0.08  # mean square of each whitened residual, off one by at most
 FOLLOWS = 0.1  # share of it that inputs and motion account for, at most
-TONAL = 0.7  # share of it that one sinusoid accounts for, at most
+TONAL = 0.7  # share of it that its mean and one sinusoid account for, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ class RandomForceFit:
         chi2_by_record: (n_records,) mean squares of the whitened residual.
         rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records show.
         follows: largest share of the force that the inputs and the motion of its record account for.
-        tonal: least share of the force of a record that one sinusoid accounts for.
+        tonal: least share of the force of a record that its mean and one sinusoid account for.
     """
 
     at: Where
@@ -71,7 +71,7 @@ class RandomForceFit:
     @property
     def holds(self) -> bool:
         """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
-        no single tone, which could be predicted.
+        no constant or single tone, which could be predicted.
         """
         return self.holds_within(WHITENED)
 
@@ -156,9 +156,10 @@ def _fractions(where: Where, extent: np.ndarray) -> np.ndarray:
 
 
 def tonal(force: np.ndarray, sample_time: float) -> float:
-    """Share of a force that its strongest sinusoid accounts for."""
-    _, amplitude, _ = tone(force, sample_time)
-    return float(min(0.5 * amplitude**2 / max(force.var(), 1e-300), 1.0))
+    """Share of a force's power that its mean and its strongest sinusoid account for."""
+    mean = float(force.mean())
+    _, amplitude, _ = tone(force - mean, sample_time)
+    return float(min((mean**2 + 0.5 * amplitude**2) / max(float(force @ force) / force.size, 1e-300), 1.0))
 
 
 def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceFilter:
