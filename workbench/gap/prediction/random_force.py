@@ -158,7 +158,7 @@ def _fractions(where: Where, extent: np.ndarray) -> np.ndarray:
 def tonal(force: np.ndarray, sample_time: float) -> float:
     """Share of a force's power that its mean and its strongest sinusoid account for."""
     mean = float(force.mean())
-    _, amplitude, _ = tone(force - mean, sample_time)
+    _, amplitude, _ = tone(force, sample_time)
     return float(min((mean**2 + 0.5 * amplitude**2) / max(float(force @ force) / force.size, 1e-300), 1.0))
 
 

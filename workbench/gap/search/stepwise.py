@@ -1,6 +1,6 @@
 """Effects added one after the other, each beside a nominal model that is a little wrong everywhere."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -280,7 +280,7 @@ class Stepwise:
     def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
         """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
         best = min(tried, key=lambda s: s.fit.cost)
-        if not self._is_timing(best):
+        if not self._is_timing(best, TIMING):
             return None
         prior, late = step.errors.target, best.effects[-1]
         jumping = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
@@ -339,10 +339,10 @@ class Stepwise:
 
         return all(altered(effect) > self.tolerance for effect in effects)
 
-    def _is_timing(self, step: Step) -> bool:
+    def _is_timing(self, step: Step, kinds: Collection[str] = ("sensor_delay",)) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
         least = dict(JOINTLY.widest)["delay"] * self.search.data.records[0].sample_time
-        return any(effect.values[TIMING[e]] < least for effect in step.effects if (e := effect.kind.name) in TIMING)
+        return any(effect.values[TIMING[e]] < least for effect in step.effects if (e := effect.kind.name) in kinds)
 
     def _slopes(self, step: Step) -> np.ndarray:
         """Sensitivities (n_values, n_errors) to errors beside the effects of a step, on the most telling records."""
