@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all, key_of
-from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
+from workbench.gap.effects.limiting_cases import contained, each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
@@ -96,8 +96,13 @@ class Stepwise:
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
-        likeliest = [f for f in spread_over_kinds(singles, 1) if f.effects[0].kind not in COMMON]
-        self.singles = likeliest[: SETTINGS.singles]
+        self.singles: list[Fit] = []
+        for single in spread_over_kinds(singles, 1):
+            # a law that comes to a likelier one at its bounds is no other explanation
+            comes_to = contained(single.effects, search.rig)
+            if single.effects[0].kind not in COMMON and not any(f.key in comes_to for f in self.singles):
+                self.singles.append(single)
+        self.singles = self.singles[: SETTINGS.singles]
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
