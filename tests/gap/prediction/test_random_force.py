@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from workbench.gap.prediction.random_force import _power, followed
+from workbench.gap.prediction.random_force import TONAL, _power, followed, tonal
 
 N = 2000
 
@@ -16,6 +16,15 @@ def record():
     pole = 0.998 * np.exp(0.2j)
     w = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], inputs.sum(axis=0))
     return inputs, np.array([w, np.gradient(w)]) / w.std()
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])
+def test_a_constant_and_a_tone_can_be_predicted_and_a_random_force_cannot(memory):
+    force = lfilter([1.0], [1.0, -memory], np.random.default_rng(2).normal(size=N))
+    wave = np.sin(0.3 * np.arange(N) + 0.4)
+    assert tonal(force, 0.01) < TONAL
+    assert tonal(1e-3 * force / force.std() - 1.0, 0.01) == pytest.approx(1.0, abs=1e-5)
+    assert tonal(wave + 2.0, 0.01) == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])

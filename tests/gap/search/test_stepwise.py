@@ -13,6 +13,7 @@ from workbench.gap.search.fit import cost_of, fit, sensitivity
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
+from workbench.trials.hold import hold_trials
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_dirty
 
@@ -135,3 +136,18 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
     assert noise_found(records) == pytest.approx([1.0, 1.0], rel=0.25 if memory else 0.08)
     if memory == 0.0:
         assert noise_found(records[:2]) == pytest.approx([1.0, 1.0], rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seed", "dirt", "kinds"),
+    [
+        (880002, "offset", ()),  # sides of accelerometers told beside a wrong stiffness
+        (20261502, "shape", ("actuator_bias",)),  # a constant force passed for a random one
+        (20261506, "input", ("sensor_lag",)),  # a lag passed for a delay
+        (20261507, "late", ("support_rotation",)),  # four laws of one spring came before it
+    ],
+)
+def test_trials_that_were_told_wrongly_once(seed, dirt, kinds):
+    (told,) = hold_trials(1, seed, kinds=[kinds], dirt=dirt, size=0.5).dirty_scores.values()
+    assert told["named"] and not told["wrong"]

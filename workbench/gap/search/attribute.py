@@ -260,8 +260,14 @@ def _logged(search: Search, best: Fit, noise: np.ndarray) -> float:
 
 
 def noise_of(search: Search, best: Fit) -> np.ndarray:
-    """Standard deviation of each sensor's noise (n_outputs,), by what a set leaves."""
-    return noise_found(search.data.differences(apply_all(search.rig, best.effects)))
+    """Standard deviation of each sensor's noise (n_outputs,), by what a set leaves.
+
+    What lies within the stated noise is noise: coloured noise has peaks, under which there is less, and is louder in
+    one record than in another.
+    """
+    left = search.data.differences(apply_all(search.rig, best.effects))
+    rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in left], axis=0))
+    return np.maximum(noise_found(left), np.minimum(rms, search.data.noise))
 
 
 def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
