@@ -267,7 +267,8 @@ def noise_of(search: Search, best: Fit) -> np.ndarray:
     """
     left = search.data.differences(apply_all(search.rig, best.effects))
     rms = np.sqrt(np.mean([(residual**2).mean(axis=1) for residual in left], axis=0))
-    return np.maximum(noise_found(left), np.minimum(rms, search.data.noise))
+    noise: np.ndarray = np.maximum(noise_found(left), np.minimum(rms, search.data.noise))
+    return noise
 
 
 def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
