@@ -10,7 +10,8 @@ from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
-from workbench.gap.prediction.residuals import FitData, noise_found
+from workbench.gap.prediction.noise import noise_found
+from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.rig.simulate import predict

@@ -8,7 +8,8 @@ import pytest
 
 from workbench.cases.case import Case
 from workbench.gap.diagnose import diagnose
-from workbench.gap.effects.catalogue import BEYOND, CATALOGUE, kind_named
+from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Parameter
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator

@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.gap.effects.catalogue import any_beyond
+from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.report.shrinkage import Budget
+from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
 from workbench.records.record import Record
 from workbench.rig.rig import Rig

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.catalogue import BEYOND, CATALOGUE
+from workbench.gap.effects.beyond import BEYOND
+from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior
 from workbench.gap.report.verdict import Verdict

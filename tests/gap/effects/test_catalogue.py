@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from workbench.gap.effects.catalogue import CATALOGUE, POWER_DAMPER, POWER_SPRING, in_catalogue, kind_named
+from workbench.gap.effects.beyond import POWER_DAMPER, POWER_SPRING, in_catalogue
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter
 from workbench.gap.effects.environment import _is_distortion
 from workbench.gap.effects.limiting_cases import contained, simpler_forms

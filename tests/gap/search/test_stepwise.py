@@ -8,7 +8,8 @@ import pytest
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
-from workbench.gap.prediction.residuals import FitData, noise_found
+from workbench.gap.prediction.noise import noise_found
+from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import cost_of, fit, sensitivity
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig

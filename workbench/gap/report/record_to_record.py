@@ -11,7 +11,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import deviations_of, parted
 from workbench.gap.effects.record_to_record import TENSION, label_of
 from workbench.gap.effects.structural import buckling_load
-from workbench.gap.report.shrinkage import mean_square
+from workbench.gap.report.budget import mean_square
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 

@@ -1,26 +1,15 @@
-"""How far a gap shrinks on held-out records, and its budget: effects, errors of the model, noise, and the rest."""
+"""How far the gap shrinks on records kept out of the fit: the only place that opens validation records."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import group_of, parted
-from workbench.gap.effects.record_to_record import label_of
-from workbench.gap.prediction.logged_inputs import logging_noise_power
-from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
 
 DRAWS = 400
-REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
-IN_PERCENT = ("stiffness", "mass", "frequency", "damping")
-SCATTER = 1.5  # of the power that noise of the inputs leaves: resonances make few independent values of a record
-RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
-PLURAL = {"stiffness": "stiffness", "mass": "mass", "frequency": "frequencies", "damping": "damping"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +45,7 @@ def measure(
     for record in records:
         lead = round(settle / record.sample_time)
         measured = record.outputs[:, lead:]
-        scale = measured.std(axis=1, keepdims=True)
-        scale = np.where(scale > 0, scale, 1.0)
+        scale = scale_of(measured)
         predicted = [predict(rig, record, substeps=substeps)[:, lead:] for rig in (nominal, corrected)]
         errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
@@ -92,175 +80,7 @@ def _block_length(rig: Rig, record: Record) -> int:
     return int(np.clip(memory, record.n_samples // 20, max(record.n_samples // 8, 1)))
 
 
-@dataclass(frozen=True, eq=False)
-class Budget:
-    """Shares of the mean square of the nominal residual, which sum to one.
-
-    Attributes:
-        effects: share that each named effect takes away, by label, in the order in which they count; a figure that
-            differs from record to record stands among them, as "stiffness_record_to_record".
-        nominal: share that small errors of the nominal model take away beyond them, and that noise of the logged inputs
-            leaves.
-        unexplained: share that is left and is not noise.
-        noise: share of the sensors' noise.
-        by_record: the same four shares (n_shares,) of each record by name, effects first.
-        errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on.
-        noise_stated, noise_found: (n_outputs,) standard deviation of each sensor's noise, in its unit.
-        sensors: (n_outputs,) names.
-    """
-
-    effects: Mapping[str, float]
-    nominal: float
-    unexplained: float
-    noise: float
-    by_record: Mapping[str, np.ndarray] = field(repr=False)
-    errors: Mapping[str, float] = field(default_factory=dict)
-    noise_stated: tuple[float, ...] = ()
-    noise_found: tuple[float, ...] = ()
-    sensors: tuple[str, ...] = ()
-
-    @property
-    def noise_ratio(self) -> float:
-        """Noise found over noise stated, the median of all sensors."""
-        return float(np.median(np.array(self.noise_found) / np.array(self.noise_stated)))
-
-    @property
-    def noise_remark(self) -> str | None:
-        """A remark where the noise found and the noise stated disagree."""
-        ratio = self.noise_ratio
-        if 1.0 / REMARKED < ratio < REMARKED:
-            return None
-        return f"The noise of the sensors is {ratio:.2g} times the stated noise_std."
-
-    def to_json(self) -> dict[str, Any]:
-        """Plain numbers, as the case format asks for them: effects by kind."""
-        by_kind: dict[str, float] = {}
-        for label, share in self.effects.items():
-            kind = label.split("[")[0]
-            by_kind[kind] = by_kind.get(kind, 0.0) + share
-        return {
-            "effects": {kind: _rounded(share) for kind, share in by_kind.items()},
-            "nominal": _rounded(self.nominal),
-            "unexplained": _rounded(self.unexplained),
-            "noise": _rounded(self.noise),
-        }
-
-
-def budget_of(
-    rig: Rig,
-    effects: Sequence[Effect],
-    errors: Effect | None,
-    records: Sequence[Record],
-    *,
-    noise_found: np.ndarray,
-    logged: float = 0.0,
-    settle: float = 0.0,
-    substeps: int = 8,
-) -> Budget:
-    """Take the mean square of the nominal residual apart.
-
-    Each sensor counts by the standard deviation of its readings, as in the gap of a record. What effects and errors of
-    the nominal model take away together is shared in proportion to what is left without each of them alone; causes
-    that partly cancel one another would else take away nothing, or less.
-
-    Args:
-        rig: nominal.
-        effects: that were named.
-        errors: of the nominal model, where they were fitted; see `with_unseen` for what differs from record to record.
-        records: held out of the fit, or those fitted where none were.
-        noise_found: (n_outputs,).
-        logged: noise of the logged inputs, as a share of their rms.
-        settle: seconds at the start of each record that do not count.
-        substeps: of a sample, where the rig is not linear.
-    """
-
-    def squares(chosen: Sequence[Effect]) -> np.ndarray:
-        """Mean square (n_records,) of what is left with these effects."""
-        real = apply_all(rig, chosen)
-        return np.array([mean_square(real, record, settle, substeps) for record in records])
-
-    labels, causes = [effect.label for effect in effects], list(effects)
-    alike, between = (None, None) if errors is None else parted(errors)
-    if between is not None:
-        labels.append(label_of(between.target.figure))
-        causes.append(between)
-    causes += [] if alike is None else [alike]
-    nominal, left = squares(()), squares(causes)
-    without = [squares([c for c in causes if c is not cause]) for cause in causes]
-    weights = np.array([np.maximum(w - left, 0.0) for w in without]).reshape(len(causes), len(records))
-    total = weights.sum(axis=0)
-    taken = np.maximum(nominal - left, 0.0) * weights / np.where(total > 0, total, 1.0)
-    by_size = sorted(range(len(labels)), key=lambda i: -taken[i].sum())
-    rows = [*taken[by_size], taken[-1] if alike is not None else np.zeros_like(left)]
-    noise = np.minimum(np.array([_noise_power(record, noise_found, settle) for record in records]), left)
-    rest = left - noise
-    by_inputs = np.zeros_like(left)
-    if logged:
-        by_inputs = np.minimum(SCATTER * logged**2 * power_of_inputs(rig, records, settle), rest)
-    rows[-1], rest = rows[-1] + by_inputs, rest - by_inputs
-    for row, i in enumerate(by_size):  # what no model can predict is theirs
-        if causes[i].kind.remainder:
-            rows[row], rest = rows[row] + rest, np.zeros_like(rest)
-    shares = np.array([*rows, rest, noise])
-    whole = shares.sum(axis=1).clip(0.0) / max(nominal.sum(), 1e-300)
-    whole = whole / max(whole.sum(), 1e-300)
-    by_record = {r.name: shares[:, i] / max(nominal[i], 1e-300) for i, r in enumerate(records)}
-    return Budget(
-        effects={labels[i]: float(share) for i, share in zip(by_size, whole, strict=False)},
-        nominal=float(whole[-3]),
-        unexplained=float(whole[-2]),
-        noise=float(whole[-1]),
-        by_record=by_record,
-        errors={**sizes_of(alike), **({"inputs_percent": 100.0 * logged} if by_inputs.sum() > 0 else {})},
-        noise_stated=tuple(float(s.noise_std) for s in rig.sensors),
-        noise_found=tuple(noise_found.tolist()),
-        sensors=tuple(s.name for s in rig.sensors),
-    )
-
-
-def mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> float:
-    """Mean square of what a rig leaves of a record, each sensor by the standard deviation of its readings."""
-    lead = round(settle / record.sample_time)
-    measured = record.outputs[:, lead:]
-    with np.errstate(over="ignore", invalid="ignore"):  # one effect of two that balance each other may run away
-        predicted = predict(rig, record, substeps=substeps)[:, lead:]
-        left = (((measured - predicted) / _scale(measured)) ** 2).mean()
-    return float(left) if left < RUNAWAY else RUNAWAY
-
-
-def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
-    measured = record.outputs[:, round(settle / record.sample_time) :]
-    return float(((noise[:, None] / _scale(measured)) ** 2).mean())
-
-
-def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
-    """Mean square (n_records,) that noise of the logged inputs leaves, were it as strong as they are."""
-    lead = round(settle / records[0].sample_time)
-    powers = logging_noise_power(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))
-    scales = np.array([_scale(record.outputs[:, lead:])[:, 0] for record in records])
-    return np.asarray((powers / scales**2).mean(axis=1))
-
-
-def _scale(measured: np.ndarray) -> np.ndarray:
+def scale_of(measured: np.ndarray) -> np.ndarray:
+    """What each sensor's readings (n_outputs, n_samples) count by: their standard deviation; 1 at rest."""
     scale = measured.std(axis=1, keepdims=True)
     return np.where(scale > 0, scale, 1.0)
-
-
-def sizes_of(errors: Effect | None) -> dict[str, float]:
-    """Root mean squares of the errors of a nominal model, by group; of delays about their mean, in ms."""
-    if errors is None:
-        return {}
-    values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*IN_PERCENT, "delay")}
-    sizes = {
-        f"{PLURAL[group]}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
-        for group in IN_PERCENT
-        if values[group]
-    }
-    if values["delay"]:
-        sample_time = getattr(errors.target, "sample_time", 1.0)
-        sizes["delays_ms"] = 1e3 * sample_time * float(np.sqrt(np.mean(np.square(values["delay"]))))
-    return sizes
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.4g}")

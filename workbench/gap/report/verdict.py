@@ -6,14 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.catalogue import any_beyond
+from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.where import Where
+from workbench.gap.report.budget import Budget
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
 from workbench.gap.report.record_to_record import RecordToRecord
-from workbench.gap.report.shrinkage import Budget, Shrinkage
+from workbench.gap.report.shrinkage import Shrinkage
 from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints

@@ -13,8 +13,9 @@ from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.logged_inputs import logging_noise
+from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
-from workbench.gap.prediction.residuals import FitData, noise_found
+from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.beside_random import decide_on_random, random_beside_singles
 from workbench.gap.search.decide import decide

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.prediction.logged_inputs import logging_noise
-from workbench.gap.prediction.residuals import noise_found
+from workbench.gap.prediction.noise import noise_found
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.search import Search

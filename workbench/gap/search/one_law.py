@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from workbench.gap.effects.catalogue import BEYOND, any_beyond, in_catalogue
+from workbench.gap.effects.beyond import BEYOND, any_beyond, in_catalogue
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit

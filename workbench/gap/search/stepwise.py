@@ -143,7 +143,7 @@ class Stepwise:
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
         fewer = self._without_needless(best)
-        if not fewer.effects:  # it had but led the errors into another valley
+        if not fewer.effects:  # all that it did was to lead the errors out of a false valley
             self.steps.append(fit_jointly(self.search, (), fewer.errors))
             return self.is_enough
         self.steps.append(best)

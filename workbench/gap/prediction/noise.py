@@ -1,0 +1,48 @@
+"""The noise of each sensor, found from what a fitted model leaves of several records."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from workbench.arrays import Floats
+
+LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
+REACH, QUIET = 5, 0.25  # bands to either side, and their quantile: modes leave a quarter of them free of peaks
+LOWER = 0.67  # deviations by which that quantile lies below the mean
+ALIKE, SAME = 1.3, 1.1  # times the power of the quietest record; what differs from it by chance alone
+LOUD = 0.5  # of the mean square: peaks that hold less are not worth leaving out
+
+
+def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Standard deviation of each sensor's noise (n_outputs,), in the sensors' units.
+
+    Noise is as strong in every record, while what a model lacks goes with the level; so the noise is at most the least
+    of all records; and errors of a model make peaks about its modes, so the noise is at most what lies under them in
+    a spectrum that is smooth otherwise, white or coloured.
+
+    Args:
+        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+    """
+    whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
+    under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
+    # what is as strong in two records of unequal level is noise, of whatever colour
+    alike = whole[1] < ALIKE * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
+    same = whole < SAME * whole[0]
+    noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
+    power: Floats = np.where(alike | (under > LOUD * whole[0]), noise, under)
+    return np.sqrt(power)
+
+
+def _under_peaks(residual: Floats) -> Floats:
+    """Mean square (n_outputs,) under the peaks of the spectrum."""
+    n_outputs, n_samples = residual.shape
+    window = np.hanning(n_samples)
+    spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
+    bands = max(spectrum.shape[1] // LINES, 1)
+    means = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
+    reach = min(REACH, (bands - 1) // 2)
+    around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
+    floor = np.quantile(around, QUIET, axis=2) * (1.0 + LOWER / np.sqrt(LINES))
+    under: Floats = np.minimum(means, floor).mean(axis=1)
+    return under
