@@ -11,11 +11,17 @@ from workbench.identification.free_decay.drift import HIGHEST_DEGREE, without_dr
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.proportional import ProportionalFit, proportional_fit
-from workbench.identification.free_decay.refinement import Identified, Refined, in_coloured_noise, refine, unshaped
+from workbench.identification.free_decay.refinement import (
+    Identified,
+    OfRefined,
+    Refined,
+    in_coloured_noise,
+    refine,
+    unshaped,
+)
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
 from workbench.identification.signal.decay import decay_start
 from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
-from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
@@ -42,7 +48,7 @@ WITHIN = 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RingDown(ModalEstimates):
+class RingDown(OfRefined):
     """The modes of free decays.
 
     Attributes:
@@ -66,15 +72,6 @@ class RingDown(ModalEstimates):
     by_amplitude: AmplitudeDependence
     proportional: ProportionalFit | None
     notes: tuple[str, ...]
-
-    @property
-    def modes(self) -> SampledModes:  # type: ignore[override]  # read-only here
-        return self.refined.modes
-
-    @property
-    def covariance(self) -> np.ndarray:  # type: ignore[override]
-        """(2 n_modes, 2 n_modes) of (ω, ζ)."""
-        return self.refined.covariance
 
     def _remarks(self) -> tuple[str, ...]:
         of_modes = (f"mode {r + 1}: {remark}" for r, remark in enumerate(self.remarks) if remark)

@@ -82,8 +82,23 @@ class Refined(ModalEstimates):
         return np.asarray(np.sqrt(np.einsum("rjj->jr", self.shape_covariance)))
 
 
+class OfRefined(ModalEstimates):
+    """What was found about refined modes, whose figures and errors are its own."""
+
+    refined: Refined
+
+    @property
+    def modes(self) -> SampledModes:  # type: ignore[override]  # read-only here
+        return self.refined.modes
+
+    @property
+    def covariance(self) -> np.ndarray:  # type: ignore[override]
+        """(2 n_modes, 2 n_modes) of (ω, ζ)."""
+        return self.refined.covariance
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Identified(ModalEstimates):
+class Identified(OfRefined):
     """The modes of a record, and what was taken for noise.
 
     Attributes:
@@ -101,15 +116,6 @@ class Identified(ModalEstimates):
     noise_modes: SampledModes
     noise_evidence: np.ndarray
     remarks: tuple[str, ...] = field(default=())
-
-    @property
-    def modes(self) -> SampledModes:  # type: ignore[override]  # read-only here
-        return self.refined.modes
-
-    @property
-    def covariance(self) -> np.ndarray:  # type: ignore[override]
-        """(2 n_modes, 2 n_modes) of (ω, ζ)."""
-        return self.refined.covariance
 
     def without_artefacts(self, nyquist: float, *, growing: bool = False) -> "Identified":
         """Only poles that can be modes (`credible`); the others join `noise_modes`.
