@@ -107,19 +107,23 @@ def likeliest(search: Search, step: Step) -> Deviations | None:
 def beside_records(before: Stepwise) -> Stepwise | None:
     """What holds beside a figure of the nominal model that differs from record to record.
 
-    None where the records do not ask for one, or it does not halve what they leave.
+    What effects explain without is theirs: a law of the motion, too, makes records of other levels look stiffer. None
+    where the records do not ask for such a figure, or it does not halve what they leave.
 
     Args:
-        before: what holds without, its likeliest single effects tried.
+        before: what holds without, its likeliest single effects tried; where a figure is asked for, it is run.
     """
-    search = before.at_first
-    asked = likeliest(search, before.nearest)
+    search, nearest = before.at_first, before.nearest
+    asked = likeliest(search, nearest)
     if asked is None:
         return None
+    before.run()
+    if before.decision().outcome == "explained":
+        return before
     search.report(f"{asked.figure} that differs from record to record", 0.5)
     beside = Stepwise(replace(search, differs=asked.figure), before.tolerance, before.singles)
-    noise = before.nearest.noise_power
-    if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < HALF * before.nearest.excess(noise):
+    noise = nearest.noise_power
+    if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < HALF * nearest.excess(noise):
         beside.run()
         return beside
     return None

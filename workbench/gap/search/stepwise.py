@@ -93,6 +93,7 @@ class Stepwise:
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
         is_beyond: whether effects crowd about one place, as they do where a law is beyond the catalogue.
         is_tried: whether an effect has been tried beside noise of the logged inputs, which may stand for it.
+        is_run: whether effects have been added as long as that pays.
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
@@ -107,6 +108,7 @@ class Stepwise:
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
         self.is_tried = False
+        self.is_run = False
         self.plain: Fit | None = None
         self.is_beyond = False
         search.report("small errors of the nominal model", 0.4)
@@ -151,7 +153,10 @@ class Stepwise:
         return True
 
     def run(self) -> None:
-        """Add effects as long as each takes most of what is left above the noise."""
+        """Add effects as long as each takes most of what is left above the noise; once."""
+        if self.is_run:
+            return
+        self.is_run = True
         while len(self.last.effects) < SETTINGS.most and not self.is_enough:
             before = self.last
             step = self._with_one_more(before)
