@@ -141,14 +141,16 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seed", "dirt", "kinds"),
+    ("seed", "dirt", "size", "kinds"),
     [
-        (880002, "offset", ()),  # sides of accelerometers told beside a wrong stiffness
-        (20261502, "shape", ("actuator_bias",)),  # a constant force passed for a random one
-        (20261506, "input", ("sensor_lag",)),  # a lag passed for a delay
-        (20261507, "late", ("support_rotation",)),  # four laws of one spring came before it
+        (880002, "offset", 0.5, ()),  # sides of accelerometers told beside a wrong stiffness
+        (20261502, "shape", 0.5, ("actuator_bias",)),  # a constant force passed for a random one
+        (20261506, "input", 0.5, ("sensor_lag",)),  # a lag passed for a delay
+        (20261507, "late", 0.5, ("support_rotation",)),  # four laws of one spring came before it
+        (20261134, "mixed", 0.5, ("bouc_wen",)),  # passed for a stiffness that differs from record to record
+        (20261150, "input", 2.0, ()),  # an error of all damping of no size
     ],
 )
-def test_trials_that_were_told_wrongly_once(seed, dirt, kinds):
-    (told,) = hold_trials(1, seed, kinds=[kinds], dirt=dirt, size=0.5).dirty_scores.values()
+def test_trials_that_were_told_wrongly_once(seed, dirt, size, kinds):
+    (told,) = hold_trials(1, seed, kinds=[kinds], dirt=dirt, size=size).dirty_scores.values()
     assert told["named"] and not told["wrong"]

@@ -436,7 +436,9 @@ class Stepwise:
         found = in_place_of_errors(search, step.effects, step.errors)
         if found is None:
             return None
-        named = [effect for effect in found.effects if effect.kind not in (*COMMON, NOMINAL_ERRORS)]
+        # both common errors are errors of the model; one alone is an effect
+        errors = {NOMINAL_ERRORS, *(COMMON if {e.kind for e in found.effects}.issuperset(COMMON) else ())}
+        named = [effect for effect in found.effects if effect.kind not in errors]
         if not self._matter(named, found.effects):
             return None
         self.search = search
