@@ -396,8 +396,8 @@ SENSOR_GAIN = _sensor(
     "gain",
     "a wrong sensor gain",
     lambda evidence, _: [{"gain": 0.9}],
-    low=-20.0,
-    high=20.0,
+    low=-100.0,
+    high=100.0,
     signed=True,
     neutral=1.0,
 )
