@@ -9,12 +9,14 @@ from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import FURTHER, RIVAL, WORTHWHILE, Search, in_one_valley, promise
+from workbench.gap.search.search import FURTHER, RIVAL, WORTHWHILE, Search, in_one_valley, promise, spread_over_kinds
 from workbench.rig.simulate import is_stepped
+from workbench.structure.domain import NamedPoints
 
 FINE = 8  # substeps of a sample
 TARGETS_A_KIND = 3  # of single effects that are tried
 TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
+EXCHANGED = 2  # likeliest effects in whose places other kinds are tried
 FAR_BEHIND = 10.0  # times the least promise: what is not fitted to its end
 HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records, or this share of
 HOPEFUL_SHARE = 0.05  # what the nominal rig leaves there, where steps of half a sample cost more than a small noise
@@ -39,7 +41,25 @@ def one_more(
     for effect in weighed.likeliest():
         if sum(effect.kind is other.kind for other in chosen) < TARGETS_A_KIND:
             chosen.append(effect)
-    return fitted_ahead(search, [(*given, effect) for effect in chosen])
+    found = fitted_ahead(search, [(*given, effect) for effect in chosen])
+    if not (search.held and found):
+        return found
+    # beside errors that give way, a start that stands a little off its place comes to nothing
+    there = fitted_ahead(search, [(*given, effect) for effect in _exchanged(found, weighed)])
+    return distinct_valleys(search, sorted((*found, *there), key=lambda f: f.cost))
+
+
+def _exchanged(found: Sequence[Fit], weighed: Weighed) -> list[Effect]:
+    """Linear kinds of the structure, each where the likeliest of others stand."""
+
+    def is_linear(effect: Effect) -> bool:
+        return effect.kind.path == "structure" and not effect.kind.nonlinear and effect.at is not None
+
+    if isinstance(weighed.domain, NamedPoints):
+        return []
+    likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][:EXCHANGED]
+    starts = {effect.kind: effect for effect in reversed(weighed.likeliest()) if is_linear(effect)}
+    return [e.moved_to(one.at) for one in likeliest for e in starts.values() if e.kind is not one.kind]
 
 
 def pairs_at_once(search: Search, weighed: Weighed) -> list[Fit]:
