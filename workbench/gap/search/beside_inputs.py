@@ -7,6 +7,7 @@ from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
 from workbench.gap.search.fit import Fit
 from workbench.gap.search.jointly import measured
 from workbench.gap.search.search import Search
+from workbench.rig.rig import Rig
 
 WHITE = 2.0  # mean square, white, that a set may leave beside that noise for a search to go on beside it
 HEARINGS = 2  # rounds of learning the sensors' noise beside it
@@ -34,3 +35,8 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
         beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
         white = measured(beside, fitted).fit
     return beside
+
+
+def likeliest_loss(search: Search, rig: Rig) -> float:
+    """Minus the log-likelihood of what a rig leaves, beside as much noise of the logged inputs as is likeliest."""
+    return likeliest_share(rig, search.data, search.data.differences(rig)).loss

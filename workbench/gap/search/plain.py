@@ -66,7 +66,9 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
     return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
 
 
-def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effect) -> Fit | None:
+def in_place_of_errors(
+    search: Search, effects: tuple[Effect, ...], errors: Effect, rivals: Sequence[tuple[Effect, ...]] = ()
+) -> Fit | None:
     """The effects, or one more, that leave only noise with no errors of the nominal model but common and late ones.
 
     They say the same with fewer numbers than errors of their own for every mode and wave.
@@ -75,6 +77,7 @@ def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effe
         search: with the noise found beside the errors.
         effects: that were found beside the errors.
         errors: of the nominal model; sensors stay as late as they make them.
+        rivals: other sets that explain the records beside errors, which make up for the wrong place or law.
     """
     if errors.target.record:  # no effect differs from record to record
         return None
@@ -86,7 +89,7 @@ def in_place_of_errors(search: Search, effects: tuple[Effect, ...], errors: Effe
         if both is not None:
             return _one_common(search, common, late, both)
         return _one_more(search, (*common, *late), ())
-    sets = [effects, *((*effects, effect) for effect in common), (*effects, *common)]
+    sets = [s for given in (effects, *rivals) for s in (given, *((*given, e) for e in common), (*given, *common))]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
@@ -113,14 +116,23 @@ def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:
 
 
 def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | None:
-    """The simplest of sets that leaves only noise."""
+    """The simplest of sets that leaves only noise, or another that is surely likelier and no more of the same."""
     quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAINLY), list(sets))
+    best: Fit | None = None
     for candidate in sorted((f for f in quickly if f.cost < NEAR), key=lambda f: f.n_parameters):
+        if best is not None and _labels(best) <= _labels(candidate):
+            continue
         effects = _on_their_sides(search, candidate.effects)
         found = fit(search.rig, effects, search.data.stepped(FINE), iterations=PLAINLY)
-        if search.explains(found):
-            return _with_one_late(search, finished(search, found))
-    return None
+        more = 0 if best is None else found.n_parameters - best.n_parameters
+        if search.explains(found) and (best is None or search.surely_better(found, best.cost, more)):
+            best = found
+    return None if best is None else _with_one_late(search, finished(search, best))
+
+
+def _labels(found: Fit) -> set[str]:
+    """Of the effects of a fit."""
+    return {effect.label for effect in found.effects}
 
 
 def _on_their_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect, ...]:

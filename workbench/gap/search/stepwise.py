@@ -12,7 +12,7 @@ from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_erro
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
-from workbench.gap.search.beside_inputs import beside_inputs
+from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.jointly import SETTINGS as JOINTLY
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
@@ -245,17 +245,23 @@ class Stepwise:
             return Decision("none", self.last.fit, noise=noise, beside=beside)
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
 
-    def _rivals(self) -> tuple[tuple[Fit, float], ...]:
-        """Other sets that leave only noise too, with their probabilities by description length."""
+    def _others(self) -> list[Step]:
+        """The set that the effects of the last were chosen as, and other sets that leave only noise too."""
         key = key_of(self.last.effects)
         chosen = next((s for s in reversed(self.steps) if s.others and key_of(s.effects) == key), None)
         if chosen is None:
+            return []
+        return [chosen, *(s for s in chosen.others if key_of(s.effects) != key and self.explains(s))]
+
+    def _rivals(self) -> tuple[tuple[Fit, float], ...]:
+        """Other sets that leave only noise too, with their probabilities by description length."""
+        sets = self._others()
+        if not sets:
             return ()
-        others = [s for s in chosen.others if key_of(s.effects) != key and self.explains(s)]
         a_number = 0.5 * np.log(self.search.data.n_values)
-        length = [s.description(chosen.sensor_noise) + a_number * s.fit.n_parameters for s in (chosen, *others)]
+        length = [s.description(sets[0].sensor_noise) + a_number * s.fit.n_parameters for s in sets]
         odds = np.exp(min(length) - np.array(length))
-        likely = sorted(zip(others, odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
+        likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
         return tuple((s.fit, float(p)) for s, p in likely if p > SETTINGS.excluded)
 
     def _with_one_more(self, step: Step) -> Step | None:
@@ -308,11 +314,11 @@ class Stepwise:
         """The best on whole records of sets fitted to the most telling ones."""
         # and of what was found before errors could bend to it
         alone = [] if step.effects else self._alone
-        tried = sorted((s for s in (*tried, *alone) if not self._is_timing(s)), key=lambda s: s.fit.cost)
-        if not tried:
-            return step
+        tried = sorted((s for s in tried if not self._is_timing(s)), key=lambda s: s.fit.cost)
         near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
-        whole = sorted((s if s in alone else self._whole(s) for s in near), key=lambda s: s.fit.cost)
+        whole = sorted((*map(self._whole, near), *alone), key=lambda s: s.fit.cost)
+        if not whole:
+            return step
         return replace(self._simplest(whole[0], whole[1:]), others=tuple(whole))
 
     def _is_worth(self, best: Step, step: Step) -> bool:
@@ -333,8 +339,10 @@ class Stepwise:
     def _is_likelier(self, best: Step, step: Step) -> bool:
         """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
         more = max(best.fit.n_parameters - step.fit.n_parameters, 1)
-        gain = float(np.log(step.fit.cost / best.fit.cost))
-        return gain > WORTHWHILE and self.search.tells_apart(best.fit.cost, step.fit.cost, more)
+        # each beside as much noise of the inputs as it leaves: where that stands for an effect it is loud
+        losses = [likeliest_loss(self.search, apply_all(self.search.rig, s.fit.effects)) for s in (best, step)]
+        gain = 2.0 * (losses[1] - losses[0]) / self.search.data.n_values
+        return gain > WORTHWHILE and self.search.tells_apart(1.0, float(np.exp(gain)), more)
 
     def _matter(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
         """Whether each of some effects of a set alters the readings by more than the tolerance, in some record."""
@@ -433,7 +441,8 @@ class Stepwise:
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         if step.logged > LEAST_LOGGED and not self.search.logged:
             search = beside_inputs(self.at_first, step.fit, step.sensor_noise) or search
-        found = in_place_of_errors(search, step.effects, step.errors)
+        rivals = [other.effects for other in self._others()[1:]]
+        found = in_place_of_errors(search, step.effects, step.errors, rivals)
         if found is None:
             return None
         # both common errors are errors of the model; one alone is an effect
