@@ -301,7 +301,7 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
-    random = random_beside_singles(search, singles)
+    random = None if beside.is_enough else random_beside_singles(search, singles)
     if random is not None:
         return random
     if beside.is_enough or beside.by_singles():

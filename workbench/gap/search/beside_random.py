@@ -89,9 +89,11 @@ def random_beside_singles(search: Search, singles: Sequence[Fit]) -> Decision | 
     tried = []
     for single in spread_over_kinds(singles, 1)[:BESIDE_SINGLES]:
         evidence = search.evidence_of(apply_all(search.rig, single.effects))
-        evidence = _by_laws_on_measured_motion(search, evidence)
+        hearing, evidence = _heard(search, single.effects, evidence)
+        evidence = _by_laws_on_measured_motion(hearing, evidence)
         if looks_random(evidence):
-            tried.append(with_random(search, single, evidence))
+            heard = replace(single, cost_by_channel=hearing.data.by_channel(hearing.data.residual(evidence.rig)))
+            tried.append(with_random(hearing, heard, evidence))
     return _likeliest(search, tried)
 
 

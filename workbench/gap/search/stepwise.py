@@ -410,10 +410,13 @@ class Stepwise:
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best, or a set that it comes to at bounds of its parameters, where that leaves hardly more."""
         fresh = list(simpler_sets(best.effects, self.search.rig))
+        sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
+        # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
+        best = min((best, *(s for s in sets if s.fit.n_parameters == best.fit.n_parameters)), key=lambda s: s.fit.cost)
         enough = (1.0 + SETTINGS.simpler) * max(best.excess(best.sensor_noise), SETTINGS.simpler)
         fewer = [
             step
-            for step in (*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0))))
+            for step in sets
             if step.fit.n_parameters < best.fit.n_parameters
             and step.excess(best.sensor_noise) < enough
             and not self._tells_apart(best, step)
