@@ -48,6 +48,7 @@ class StepwiseSettings:
         further: likewise, that a further effect is looked for to explain.
         in_part: likewise, for effects that are named although something else is there.
         no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
+        spotless: likewise, that errors of the model alone leave in trials that hide nothing: under 0.02 in 40 of them.
         excluded: probability below which another set that explains the records is no rival.
         astray: share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray.
         loud: times the noise of the sensors that a set must leave above it for noise of the inputs to be heard in it;
@@ -72,6 +73,7 @@ class StepwiseSettings:
     further: float = 1e-3
     in_part: float = 0.2
     no_gap: float = 0.15
+    spotless: float = 0.05
     excluded: float = 1e-3
     astray: float = 0.02
     loud: float = 0.5
@@ -157,7 +159,7 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
-        while len(self.last.effects) < SETTINGS.most and not self.is_enough:
+        while len(self.last.effects) < SETTINGS.most and not (self.is_enough and self._is_spotless):
             before = self.last
             step = self._with_one_more(before)
             if step is None:
@@ -179,6 +181,11 @@ class Stepwise:
         """Whether the last set leaves nothing that is worth another effect."""
         left = self.explains(self.last) or (self.last.effects and self.unexplained < SETTINGS.further)
         return bool(left and self.last.is_plausible and (self.is_tried or not self.search.logged))
+
+    @property
+    def _is_spotless(self) -> bool:
+        """Whether what the last set leaves above the noise is less than any effect would."""
+        return self.last.excess(self.last.noise_power) < SETTINGS.spotless * float(self.last.noise_power.mean())
 
     def _hear_inputs(self, step: Step) -> Step | None:
         """The step beside noise of the logged inputs, where that makes what it leaves all but white; None elsewhere.
@@ -325,7 +332,7 @@ class Stepwise:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
         if not self._matter(best.effects, best.fit.effects):
             return False
-        if self.search.logged and self._is_likelier(best, step):
+        if (self.search.logged or self.explains(step)) and self._is_likelier(best, step):
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
