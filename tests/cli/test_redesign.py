@@ -1,6 +1,7 @@
 """`workbench redesign`: from a case and its verdict to a controller, a page and JSON."""
 
 import json
+from runpy import run_path
 
 import numpy as np
 import pytest
@@ -33,14 +34,18 @@ def case(tmp_path_factory, hinged_beam):
 @pytest.mark.slow
 def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     folder, verdict = case
-    page, told = tmp_path / "p.html", tmp_path / "r.json"
-    options = ("--verdict", verdict, "--damping", 0.3, "--draws", 6, "--page", page, "--json", told)
+    page, told, code = tmp_path / "p.html", tmp_path / "r.json", tmp_path / "anew.py"
+    options = ("--verdict", verdict, "--damping", 0.3, "--draws", 6, "--page", page, "--json", told, "--to", code)
     done = run("redesign", folder, *options)
     assert done.exit_code == 0, done.output
     assert "stable on 6 of 6 draws" in done.output and "F1: delay 40 ms" in done.output
     found = json.loads(told.read_text())
     assert found["safe"] and found["redesigned"]["stable"] == 6
     assert found["steps"][-1]["loss"] < 0.5 * found["steps"][0]["loss"]
+    assert "controller" in done.output and "the redesigned one" in done.output
+    step = run_path(str(code))["Controller"]()
+    commands = np.array([step.step(readings) for readings in np.eye(4)])
+    assert commands.shape == (4, 2) and np.abs(commands).max() > 0
     html = page.read_text(encoding="utf-8")
     assert found["sentence"].split(";")[0] in html and "Under the inputs of the measured record low" in html
 
@@ -55,3 +60,21 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
     assert unknown.exit_code == 2 and "the laws are imsc, coupled, poles, on-off" in unknown.output
     slow = run("redesign", folder, "--verdict", verdict, "--rate-hz", 5)
     assert slow.exit_code == 2 and "too slow for mode 2" in slow.output
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--rate-hz", 0, "above 0 Hz"),
+        ("--rate-hz", "nan", "above 0 Hz"),
+        ("--draws", 0, "greater than or equal"),
+        ("--impulse-at", 9.0, "lies outside the structure"),
+        ("--control", 7, "7 modes cannot be controlled of 5"),
+        ("--to", "anew.m", ".c, .py or .mat"),
+        ("--to", "no/anew.c", "make it first"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_any_work(run, case, option, value, said):
+    folder, verdict = case
+    refused = run("redesign", folder, "--verdict", verdict, option, value)
+    assert refused.exit_code == 2 and said in refused.output

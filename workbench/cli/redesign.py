@@ -7,6 +7,7 @@ import typer
 from rich.table import Table
 
 from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig
+from workbench.cli.rig_file import ImpulseAt, impulse_place
 from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
 
 if TYPE_CHECKING:
@@ -28,12 +29,14 @@ def redesign(
     rate_hz: Annotated[
         float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
     ] = None,
-    impulse_at: Annotated[
-        float | None, typer.Option(help="Place of the impulse of the test, m; that of the hammer unless given.")
-    ] = None,
-    draws: Annotated[int, typer.Option(help="Possible rigs on which both controllers are proved.")] = 200,
+    impulse_at: ImpulseAt = None,
+    draws: Annotated[int, typer.Option(min=1, help="Possible rigs on which both controllers are proved.")] = 200,
     seed: Annotated[int, typer.Option(help="Of the draws and of the noise.")] = 0,
     workers: Workers = None,
+    to: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="The controller to use: NAME.c (with NAME.h), NAME.py or NAME.mat."),
+    ] = None,
     json_path: JsonPath = None,
     page: PagePath = None,
 ) -> None:
@@ -41,9 +44,11 @@ def redesign(
 
     The law in use is designed for the nominal model and reads a Kalman filter on the case's sensors.
 
-    Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05
+    Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05 --to controller.c
     """
     from workbench.cases.case import read_case
+    from workbench.design.export.export import check_name, write_controller
+    from workbench.design.laws.law import controlled_indices
     from workbench.robust.on_rig import impulse_test
     from workbench.robust.plain_law import plain_law
     from workbench.robust.redesign import redesign as run
@@ -51,8 +56,17 @@ def redesign(
     from workbench.study.whole_file import check_target
 
     check_target(json_path)
+    check_target(to)
+    if to is not None:
+        check_name(to)
+    if rate_hz is not None and not 0 < rate_hz < float("inf"):
+        raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
     found = read_case(case)
     rig, records = found.rig, (*found.fit, *found.validation)
+    # with no actuator at all the law says so
+    count = max(len([a for a in rig.actuators if not a.direct]), 1) if control is None else control
+    controlled = controlled_indices(rig.modes, count)
+    struck = None if impulse_at is None else impulse_place(rig, impulse_at)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
         possible, _ = possible_rig(
@@ -60,9 +74,8 @@ def redesign(
         )
         level = _largest(records)
         sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
-        controlled = range(len([a for a in rig.actuators if not a.direct]) if control is None else control)
-        test = impulse_test(rig, controlled, sample_time, impulse_at, level=level, seed=seed)
-        chosen = plain_law(law, rig, control, damping=damping, impulse_at=test.impulse_at, impulse=test.impulse)
+        test = impulse_test(rig, controlled, sample_time, struck, level=level, seed=seed)
+        chosen = plain_law(law, rig, count, damping=damping, impulse_at=test.impulse_at, impulse=test.impulse)
         result = run(
             possible,
             chosen,
@@ -81,6 +94,9 @@ def redesign(
     for note in result.notes:
         say(f"  {note}")
     write_json(json_path, result.to_json())
+    if to is not None:
+        names = " and ".join(short(path) for path in write_controller(result.controller, to))
+        say(f"  controller {names}: {'the redesigned one' if result.pays else 'the present one, which is kept'}")
     target = page or Path("out") / f"{found.name}-redesign.html"
     shown = (found.validation or found.fit)[0]
     say(f"  page       {short(redesign_page(result, target, name=found.name, record=shown, folder=case))}")

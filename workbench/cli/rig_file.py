@@ -17,7 +17,7 @@ ImpulseAt = Annotated[
     str | None,
     typer.Option(
         metavar="PLACE",
-        help="Place of a unit impulse: m (X,Y on a plate) or a name; the hammer's unless given.",
+        help="Place of the impulse: m (X,Y on a plate) or a name; the hammer's unless given.",
     ),
 ]
 Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]

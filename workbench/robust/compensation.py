@@ -98,11 +98,13 @@ def _held(a: np.ndarray, b: np.ndarray, span: float) -> np.ndarray:
 
 
 def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> None:
-    """Refuse a rate too slow for the controlled modes.
+    """Refuse a rate that is none, or too slow for the controlled modes.
 
     Raises:
         DesignError: naming the mode and the rate that it needs.
     """
+    if not 0 < sample_time < np.inf:
+        raise DesignError(f"a controller runs once every sample_time seconds, above 0; got {sample_time:g}")
     r = max(controlled, key=lambda i: modes.omega[i])
     per_period = 2.0 * np.pi / modes.omega[r] / sample_time if modes.omega[r] > 0 else np.inf
     if per_period < SLOWEST:

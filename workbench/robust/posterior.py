@@ -94,7 +94,7 @@ class UncertainRig:
             seed: of the draws, or a generator.
 
         Raises:
-            ValueError: hardly any draw is a rig that can be.
+            ValueError: fewer than one, or hardly any draw is a rig that can be.
         """
         return tuple(rig for rig, _ in self.draws_with_effects(n, seed))
 
@@ -103,6 +103,8 @@ class UncertainRig:
         self, n: int, seed: int | np.random.Generator = 0
     ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
         """The same, each with the effects that make it."""
+        if n < 1:
+            raise ValueError(f"the possible rigs are read from 1 draw or more; got {n}")
         rng = np.random.default_rng(seed)
         sets = [self, *(rival for rival, _ in self.rivals)]
         shares = np.array([p for _, p in self.rivals])

@@ -41,7 +41,7 @@ def export(
             `sample_design`.
         ValueError: a file name of another kind.
     """
-    kind = None if path is None else _kind(Path(path))
+    kind = None if path is None else check_name(Path(path))
     design = sample_design(modes, controller, sample_rate_hz=sample_rate_hz, computing_delay=computing_delay)
     if path is not None and kind is not None:
         words = {"readings": design.readings, "commands": design.commands, "states": design.states}
@@ -68,7 +68,7 @@ def write_controller(
         ValueError: an ending of another kind, or a name that C or Python cannot have.
     """
     path = Path(path)
-    kind = _kind(path)
+    kind = check_name(path)
     if kind == "mat":
         savemat(path, _mat(controller, readings, commands, states))
         return (path,)
@@ -76,7 +76,12 @@ def write_controller(
     return tuple(path.with_name(name) for name, text in texts.items() if path.with_name(name).write_text(text, "utf-8"))
 
 
-def _kind(path: Path) -> str:
+def check_name(path: Path) -> str:
+    """What a file's name says it is to hold: "c", "python" or "mat".
+
+    Raises:
+        ValueError: an ending of another kind, or a name that C or Python cannot have.
+    """
     kind = "mat" if path.suffix == ".mat" else LANGUAGES.get(path.suffix, "")
     if not kind:
         raise ValueError(f"{path}: a controller is written as .c, .py or .mat; name the file so")
