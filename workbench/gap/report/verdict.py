@@ -93,8 +93,9 @@ class Verdict:
 
     @property
     def record_to_record(self) -> RecordToRecord | None:
-        """A figure of the nominal model that differs from record to record; None where none does."""
-        return RecordToRecord.of(self.nominal, self.effects)
+        """A figure of the nominal model that differs from record to record; None where that causes next to nothing."""
+        differs = RecordToRecord.of(self.nominal, self.effects)
+        return None if differs is None or self.budget.effects.get(differs.label, 0.0) < SHOWN else differs
 
     @property
     def sentence(self) -> str:
