@@ -5,8 +5,18 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.effects.effect import Evidence, Kind, Parameter, Scales, place_of, place_parameters, place_values
+from workbench.gap.effects.effect import (
+    Effect,
+    Evidence,
+    Kind,
+    Parameter,
+    Scales,
+    place_of,
+    place_parameters,
+    place_values,
+)
 from workbench.gap.effects.nonlinear import with_element
+from workbench.gap.effects.ports import ACTUATOR_BIAS
 from workbench.identification.signal.distortion import period_of
 from workbench.records.record import Record
 from workbench.rig.elements import PeriodicForce, RandomForce
@@ -14,6 +24,7 @@ from workbench.rig.rig import Rig
 from workbench.structure.domain import Between
 
 SAME_LINE = 0.15  # of the resolution 1/T: so near is the strongest sinusoid to one that is there
+SLOW = 0.05  # of the first elastic frequency: a disturbance below may be constant
 ONE_LEVEL = 1.1  # ratio of the largest rms of an input to the least, at which records are of one level
 
 
@@ -61,6 +72,14 @@ def _periodic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
             yield {**place_values(place.at), "frequency": frequency, "amplitude": amplitude, "phase": phase}
 
 
+def _constant(tone: Effect, rig: Rig) -> Iterator[Effect]:
+    """A disturbance so slow that it hardly turns within a record, as a constant force of an actuator."""
+    elastic = rig.modes.frequencies_hz[rig.modes.omega > 0]
+    if elastic.size and tone.values["frequency"] < SLOW * elastic[0]:
+        force = float(tone.values["amplitude"] * np.sin(tone.values["phase"]))
+        yield from (Effect(ACTUATOR_BIAS, a.name, {"force": force}) for a in rig.actuators if not a.direct)
+
+
 def _force(name: str, rig: Rig) -> Parameter:
     unit = Scales.of(rig).force
     return Parameter(name, "N", 1e-15 * unit, 1e9 * unit, logarithmic=True)
@@ -78,6 +97,7 @@ PERIODIC_DISTURBANCE = Kind(
     apply=lambda rig, _, v: with_element(rig, PeriodicForce(place_of(v), v["frequency"], v["amplitude"], v["phase"])),
     starts=_periodic_starts,
     numbers=lambda tone, _: {**tone.numbers, "phase": (tone.values["phase"] + np.pi) % (2.0 * np.pi) - np.pi},
+    simpler=_constant,
     phrase="a periodic disturbance",
 )
 
