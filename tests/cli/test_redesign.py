@@ -43,6 +43,8 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     assert found["safe"] and found["redesigned"]["stable"] == 6
     assert found["steps"][-1]["loss"] < 0.5 * found["steps"][0]["loss"]
     assert "controller" in done.output and "the redesigned one" in done.output
+    text = code.read_text(encoding="utf-8")
+    assert "d0: displacement at x = 0.3, m" in text and "command of F1, 4 samples ago" in text
     step = run_path(str(code))["Controller"]()
     commands = np.array([step.step(readings) for readings in np.eye(4)])
     assert commands.shape == (4, 2) and np.abs(commands).max() > 0
@@ -69,6 +71,8 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
         ("--rate-hz", "nan", "above 0 Hz"),
         ("--draws", 0, "greater than or equal"),
         ("--impulse-at", 9.0, "lies outside the structure"),
+        ("--impulse-at", "F9", "or name an input: F1, F2"),
+        ("--impulse-at", 0, "moves none of the controlled modes"),
         ("--control", 7, "7 modes cannot be controlled of 5"),
         ("--to", "anew.m", ".c, .py or .mat"),
         ("--to", "no/anew.c", "make it first"),

@@ -145,6 +145,15 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         DesignError, match=r"10 samples a second are too slow for mode 2 at 3.142 Hz: sample at 12.57 Hz"
     ):
         redesign(plain, controller, sample_time=0.1)
+    with pytest.raises(DesignError, match="above 0; got 0"):
+        redesign(plain, controller, sample_time=0.0)
+    with pytest.raises(ValueError, match="x = 7 lies outside the structure"):
+        redesign(plain, controller, sample_time=DT, impulse_at=7.0)
+    with pytest.raises(DesignError, match="moves none of the controlled modes"):
+        redesign(plain, controller, sample_time=DT, impulse_at=0.0)
+    late = possible(rig, effect("actuator_delay", "all", delay=0.04))
+    with pytest.raises(DesignError, match=r"delay of F1, 40 ms, is 40,000 samples .* sample at 1.25e\+04 Hz or slower"):
+        redesign(late, controller, sample_time=1e-6, test=LoopTest(2, 1e-6, 0.8))
     with pytest.raises(DesignError, match="how often"):
         redesign(plain, controller)
     by_hand = Law(controller.law.gain, controller.law.controlled, controller.law.actuators)

@@ -47,7 +47,7 @@ def redesign(
     Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05 --to controller.c
     """
     from workbench.cases.case import read_case
-    from workbench.design.export.export import check_name, write_controller
+    from workbench.design.export.export import check_name
     from workbench.design.laws.law import controlled_indices
     from workbench.robust.on_rig import impulse_test
     from workbench.robust.plain_law import plain_law
@@ -67,15 +67,14 @@ def redesign(
     count = max(len([a for a in rig.actuators if not a.direct]), 1) if control is None else control
     controlled = controlled_indices(rig.modes, count)
     struck = None if impulse_at is None else impulse_place(rig, impulse_at)
+    sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
+    test = impulse_test(rig, controlled, sample_time, struck, level=_largest(records), seed=seed)
+    chosen = plain_law(law, rig, count, damping=damping, impulse_at=test.impulse_at, impulse=test.impulse)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
         possible, _ = possible_rig(
             found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
         )
-        level = _largest(records)
-        sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
-        test = impulse_test(rig, controlled, sample_time, struck, level=level, seed=seed)
-        chosen = plain_law(law, rig, count, damping=damping, impulse_at=test.impulse_at, impulse=test.impulse)
         result = run(
             possible,
             chosen,
@@ -95,7 +94,7 @@ def redesign(
         say(f"  {note}")
     write_json(json_path, result.to_json())
     if to is not None:
-        names = " and ".join(short(path) for path in write_controller(result.controller, to))
+        names = " and ".join(short(path) for path in result.export(to))
         say(f"  controller {names}: {'the redesigned one' if result.pays else 'the present one, which is kept'}")
     target = page or Path("out") / f"{found.name}-redesign.html"
     shown = (found.validation or found.fit)[0]

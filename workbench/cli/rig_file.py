@@ -1,4 +1,4 @@
-"""The rig that `design` and `place` read, and what their options say about it."""
+"""The rig that `design`, `place` and `redesign` read, and what their options say about it."""
 
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +17,7 @@ ImpulseAt = Annotated[
     str | None,
     typer.Option(
         metavar="PLACE",
-        help="Place of the impulse: m (X,Y on a plate) or a name; the hammer's unless given.",
+        help="Place of the impulse: m (X,Y on a plate), a point or an input by name; the hammer's unless given.",
     ),
 ]
 Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]
@@ -74,10 +74,16 @@ def place_in(domain: Domain, text: str, option: str) -> Place:
 
 
 def impulse_place(rig: Rig, at: str | None) -> Place:
-    """Where the impulse acts: as given, or at the rig's hammer."""
+    """Where the impulse acts: as given, by place or by input, or at the rig's hammer."""
+    inputs = {a.name: a.at for a in rig.actuators if not isinstance(a.at, Between | Patch)}
+    if at is not None and at.strip() in inputs:
+        return inputs[at.strip()]
     if at is not None:
-        return place_in(rig.modes.domain, at, "--impulse-at")
-    hammers = [a.at for a in rig.actuators if a.direct and not isinstance(a.at, Between | Patch)]
+        try:
+            return place_in(rig.modes.domain, at, "--impulse-at")
+        except ValueError as error:
+            raise ValueError(f"{error}; or name an input: {', '.join(inputs) or 'there is none'}") from None
+    hammers = [inputs[a.name] for a in rig.actuators if a.direct and a.name in inputs]
     if not hammers:
         raise ValueError("the place of the impulse is missing: give --impulse-at, or an [[input]] of kind hammer")
     return hammers[0]

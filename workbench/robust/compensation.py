@@ -18,7 +18,7 @@ from scipy.linalg import expm
 
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller
-from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays
+from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, modal_states
 from workbench.design.estimation.observers import observed_plant
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
@@ -31,6 +31,7 @@ from workbench.structure.modes import Modes
 
 STEPS = ("sensors", "delay", "dead zone", "saturation", "friction")  # what can be compensated, in this order
 SLOWEST = 4.0  # samples in a period of a controlled mode, at least
+LONGEST = 500  # samples of delay that a predictor holds in its states
 
 
 class Loop(NamedTuple):
@@ -124,7 +125,7 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
         steps: of `STEPS`; "sensors" takes out gain, offset and cross-talk, and allows for late and slow ones.
 
     Raises:
-        DesignError: a rate too slow for the modes.
+        DesignError: a rate too slow for the modes, or too fast for an actuator's delay.
     """
     check_rate(loop.modes, loop.law.controlled, sample_time)
     actuators = [named(rig.actuators, a.name) for a in loop.law.actuators]
@@ -152,13 +153,34 @@ def compensated(rig: Rig, loop: Loop, sample_time: float, steps: Sequence[str] =
     if "friction" in steps:
         parts["friction"] = _friction(rig, loop, model, a, b, d)
     names = tuple(s.name for s in sensors), tuple(x.name for x in actuators)
-    return DigitalController(sample_time, *names, a, b, c, d, e, **parts, name=loop.controller.name)
+    parts |= {"name": loop.controller.name, "states": _states(model, loop, names[1])}
+    return DigitalController(sample_time, *names, a, b, c, d, e, **parts)
+
+
+def _states(model: _Model, loop: Loop, actuators: Sequence[str]) -> tuple[str, ...]:
+    """What each state is: estimates of the modes, commands behind their lags, and commands on their way."""
+    filters = loop.controller.state.size == 0  # it reads the modes anew at each sample
+    own = ["always zero"] * model.n if filters else modal_states(loop.law.controlled)
+    lagging = [f"command of {actuators[int(j)]} behind its lag" for j in np.flatnonzero(model.lags)]
+    past = [
+        f"command of {name}, {k + 1} {'sample' if k == 0 else 'samples'} ago"
+        for name, late in zip(actuators, model.late, strict=True)
+        for k in range(late)
+    ]
+    return (*own, *lagging, *past)
 
 
 def _model(loop: Loop, actuators: Sequence[Actuator], sample_time: float, aware: bool) -> _Model:
     a, b, _ = observed_plant(loop.modes, loop.controller.law, loop.controller.sensors)
     lags = np.array([x.time_constant if aware else 0.0 for x in actuators])
     delays = np.array([x.delay if aware else 0.0 for x in actuators])
+    if (delays > LONGEST * sample_time).any():
+        latest = max(actuators, key=lambda x: x.delay)
+        raise DesignError(
+            f"the delay of {latest.name}, {1e3 * latest.delay:.3g} ms, is {latest.delay / sample_time:,.0f} samples at"
+            f" {1 / sample_time:g} Hz, of which a predictor holds {LONGEST}: sample at {LONGEST / latest.delay:.4g} Hz"
+            " or slower"
+        )
     slow = np.flatnonzero(lags)
     n, n_x = len(a), len(a) + slow.size
     wide, into = np.zeros((n_x, n_x)), np.zeros((n_x, len(actuators)))

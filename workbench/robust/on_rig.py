@@ -21,7 +21,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
-from workbench.robust.compensation import Loop, without
+from workbench.robust.compensation import Loop, check_rate, without
 from workbench.robust.small_motion import loop_poles
 from workbench.structure.domain import Where
 from workbench.structure.modes import Modes, mac
@@ -30,6 +30,7 @@ Design = Law | OnOffLaw | Controller | PlacementTask
 
 PERIODS = 25  # of the lowest controlled mode: the length of a test
 MOST_SAMPLES = 6000
+UNMOVED, GRID = 1e-9, 33  # of the largest displacement of a mode: what does not move; points where it is looked for
 SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over what is stated
 ENOUGH, BETTER = 0.8, 1.02  # of the damping designed for; a faster filter must give so much more
 
@@ -63,7 +64,12 @@ def impulse_test(
         level: (n_outputs,) readings that the nominal rig without control then peaks at, in the median of the sensors;
             None for a unit impulse.
         seed: of the noise.
+
+    Raises:
+        DesignError: rigid modes alone, a sample time too long for the modes, or a place where none of them moves.
+        ValueError: a place that the structure does not have.
     """
+    check_rate(rig.modes, controlled, sample_time)
     if impulse_at is None:
         struck = next((a for a in rig.actuators if a.direct), rig.actuators[0])
         impulse_at = struck.at
@@ -71,11 +77,16 @@ def impulse_test(
     omega = omega[omega > 0]
     if not omega.size:
         raise DesignError("the controlled modes are all rigid, so they have no period: give a test of your own")
+    shape = rig.modes.phi_at(impulse_at)
+    if not np.abs(shape[list(controlled)]).max() > UNMOVED * np.abs(rig.modes.phi(rig.modes.domain.grid(GRID))).max():
+        raise DesignError(
+            f"an impulse at {rig.modes.domain.text(impulse_at)} moves none of the controlled modes, so it tests no"
+            " controller; strike elsewhere"
+        )
     n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
     test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
     if level is None:
         return test
-    shape = rig.modes.phi_at(impulse_at)
     damped = np.exp(-0.5 * np.diag(rig.modes.damping)[:, None] * test.time)
     omega = np.maximum(rig.modes.omega, 1e-9)[:, None]
     motion = (

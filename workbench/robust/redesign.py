@@ -3,11 +3,14 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from workbench.design.estimation.digital import DigitalController, sampled
+from workbench.design.export.export import write_controller
+from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loop
@@ -177,6 +180,23 @@ class Redesign:
     def __repr__(self) -> str:
         return f"<Redesign: {self.sentence}>"
 
+    def export(self, path: str | Path) -> tuple[Path, ...]:
+        """The files written of the controller to use: NAME.c and NAME.h, NAME.py or NAME.mat.
+
+        Args:
+            path: its ending names the kind; its name that of the functions in C.
+
+        Raises:
+            ValueError: an ending of another kind, or a name that C or Python cannot have.
+        """
+        rig, used = self.possible.rig, self.controller
+        return write_controller(
+            used,
+            path,
+            readings=reading_words(rig.modes.domain, [named(rig.sensors, name) for name in used.sensors]),
+            commands=command_words(rig.modes.domain, [named(rig.actuators, name) for name in used.actuators]),
+        )
+
     def to_json(self) -> dict[str, Any]:
         """The redesign as plain numbers."""
         moved = self.relocation
@@ -226,8 +246,9 @@ def redesign(
         report: called with (what, share done).
 
     Raises:
-        DesignError: a controller that does not fit the rig, a rate too slow for the modes, or modes that cannot be
-            controlled on the corrected rig.
+        DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
+            of them, or modes that cannot be controlled on the corrected rig.
+        ValueError: an impulse outside the structure, or no draws.
     """
     possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
     nominal, corrected = possible.nominal, possible.rig
@@ -308,7 +329,7 @@ def _compensated(
         rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
     )
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
-    weight = 2.0 * _vibration(ideal, loop.law.controlled) / max(ideal.effort, 1e-300)
+    weight = force_weight(ideal, loop.law.controlled)
     optimum = max(2.0 * _vibration(ideal) + weight * ideal.effort, 1e-300)
 
     def tried(name: str, what: str, controller: DigitalController) -> Step:
@@ -382,6 +403,16 @@ def _perfect(actuator: Actuator) -> Actuator:
     """The actuator with its gain and nothing lost on the way."""
     at = {"kind": actuator.kind, "direction": actuator.direction, "direct": actuator.direct}
     return Actuator(actuator.name, actuator.at, gain=actuator.gain, **at)  # type: ignore[arg-type]
+
+
+def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:
+    """ρ of the cost 2 ∫ energy dt + ρ ∫ FᵀF dt whose terms are equal over the controlled modes, as in the optimum.
+
+    Args:
+        run: of the loop that is taken for the optimum.
+        controlled: zero-based modes.
+    """
+    return 2.0 * _vibration(run, controlled) / max(run.effort, 1e-300)
 
 
 def _vibration(run: LoopRun, modes: Sequence[int] | None = None) -> float:

@@ -9,6 +9,7 @@
 v is the command that the actuator follows: an observer that is fed v instead of w does not wind up.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import control
@@ -70,6 +71,7 @@ class DigitalController:
         relays: of on-off control.
         friction: fed forward.
         name: for tables and plots.
+        states: (n_states,) what each state is, in words; empty where nobody says.
     """
 
     sample_time: float
@@ -89,6 +91,7 @@ class DigitalController:
     relays: Relays | None = None
     friction: FrictionForward | None = None
     name: str = "controller"
+    states: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n_sensors, n_actuators = len(self.sensors), len(self.actuators)
@@ -101,6 +104,8 @@ class DigitalController:
             object.__setattr__(self, name, frozen(getattr(self, name)))
         n = self.a.shape[0]
         n_outputs = n_actuators if self.relays is None else self.relays.force.size
+        if len(self.states) not in (0, n):
+            raise ValueError(f"DigitalController.states must name all {n} states, or none; got {len(self.states)}")
         expected = {"a": (n, n), "b": (n, n_sensors), "c": (n_outputs, n), "d": (n_outputs, n_sensors)}
         for name, shape in (expected | {"e": (n, n_actuators)}).items():
             if getattr(self, name).shape != shape:
@@ -147,6 +152,12 @@ class DigitalController:
         )
 
 
+def modal_states(modes: Sequence[int]) -> tuple[str, ...]:
+    """What an observer's estimates of these modes (zero-based) are, in words and in their order."""
+    kinds = (("displacement", "kg^0.5 m"), ("rate", "kg^0.5 m/s"))
+    return tuple(f"estimated {kind} of mode {r + 1}, {unit}" for kind, unit in kinds for r in modes)
+
+
 def sampled(controller: Controller, sample_time: float) -> DigitalController:
     """A controller as it is, run once a sample, each reading held until the next.
 
@@ -169,4 +180,5 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
         controller.direct,
         np.zeros((n, len(controller.law.actuators))),
         name=controller.name,
+        states=modal_states(controller.law.controlled) if n else (),
     )

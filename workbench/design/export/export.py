@@ -44,8 +44,7 @@ def export(
     kind = None if path is None else check_name(Path(path))
     design = sample_design(modes, controller, sample_rate_hz=sample_rate_hz, computing_delay=computing_delay)
     if path is not None and kind is not None:
-        words = {"readings": design.readings, "commands": design.commands, "states": design.states}
-        write_controller(design.controller, path, **words)
+        write_controller(design.controller, path, readings=design.readings, commands=design.commands)
     return design
 
 
@@ -55,14 +54,13 @@ def write_controller(
     *,
     readings: tuple[str, ...] = (),
     commands: tuple[str, ...] = (),
-    states: tuple[str, ...] = (),
 ) -> tuple[Path, ...]:
     """The files written: NAME.c and NAME.h, NAME.py or NAME.mat, as the path says.
 
     Args:
         controller: with all that it makes up for: limits, dead zones, relays, friction.
         path: its ending names the kind; its name that of the functions in C.
-        readings, commands, states: what each is, in words; names of sensors and actuators unless given.
+        readings, commands: what each is, in words; names of sensors and actuators unless given.
 
     Raises:
         ValueError: an ending of another kind, or a name that C or Python cannot have.
@@ -70,9 +68,9 @@ def write_controller(
     path = Path(path)
     kind = check_name(path)
     if kind == "mat":
-        savemat(path, _mat(controller, readings, commands, states))
+        savemat(path, _mat(controller, readings, commands))
         return (path,)
-    texts = source(controller, kind, path.stem, readings=readings, commands=commands, states=states)
+    texts = source(controller, kind, path.stem, readings=readings, commands=commands)
     return tuple(path.with_name(name) for name, text in texts.items() if path.with_name(name).write_text(text, "utf-8"))
 
 
@@ -91,9 +89,7 @@ def check_name(path: Path) -> str:
     return kind
 
 
-def _mat(
-    controller: DigitalController, readings: tuple[str, ...], commands: tuple[str, ...], states: tuple[str, ...]
-) -> dict[str, object]:
+def _mat(controller: DigitalController, readings: tuple[str, ...], commands: tuple[str, ...]) -> dict[str, object]:
     """Variables of the MAT file: the five matrices, what is made up for, and what each signal is."""
     one = controller
     content = {
@@ -103,7 +99,7 @@ def _mat(
         **{name: getattr(one, name) for name in ("offset", "scale", "limit", "rate", "dead_zone", "bias")},
         "readings": np.array(readings or one.sensors, object),
         "commands": np.array(commands or one.actuators, object),
-        "states": np.array(states, object),
+        "states": np.array(one.states, object),
     }
     if one.relays is not None:
         content |= {"relay_spread": one.relays.spread, "relay_force": one.relays.force}

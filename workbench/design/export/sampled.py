@@ -8,10 +8,10 @@ import numpy as np
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, sampled
 from workbench.design.export.sampled_loop import MOST_PAST, sampled_loop
+from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import close_with
-from workbench.records.record import QUANTITIES
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed
 
@@ -62,21 +62,17 @@ class SampledDesign(Printed):
     @property
     def states(self) -> tuple[str, ...]:
         """What each state of the controller is, in order."""
-        kinds = (("displacement", "kg^0.5 m"), ("rate", "kg^0.5 m/s"))
-        of = [f"estimated {kind} of mode {r + 1}, {unit}" for kind, unit in kinds for r in self.source.law.controlled]
-        return tuple(of) if self.controller.a.shape[0] else ()
+        return self.controller.states
 
     @property
     def readings(self) -> tuple[str, ...]:
         """What each reading is, in order."""
-        text = self.modes.domain.text
-        return tuple(f"{s.name}: {s.quantity} at {text(s.at)}, {QUANTITIES[s.quantity]}" for s in self.source.sensors)
+        return reading_words(self.modes.domain, self.source.sensors)
 
     @property
     def commands(self) -> tuple[str, ...]:
         """What each command is, in order."""
-        text = self.modes.domain.text
-        return tuple(f"{a.name}: {a.kind} at {text(a.at)}" for a in self.source.law.actuators)
+        return command_words(self.modes.domain, self.source.law.actuators)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         late = f", {1e3 * self.computing_delay:.4g} ms to compute" if self.computing_delay else ""

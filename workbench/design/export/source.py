@@ -9,6 +9,10 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from workbench.design.estimation.digital import ONSET, DigitalController
+from workbench.records.record import QUANTITIES
+from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
+from workbench.structure.domain import Domain
 
 HERE = Path(__file__).parent
 TEMPLATES = {"c": ("h", "c"), "python": ("py",)}
@@ -22,7 +26,6 @@ def source(
     *,
     readings: Sequence[str] = (),
     commands: Sequence[str] = (),
-    states: Sequence[str] = (),
 ) -> dict[str, str]:
     """Text by file name of a controller in "c" or "python".
 
@@ -30,7 +33,7 @@ def source(
         controller: to write.
         language: one of TEMPLATES.
         name: of the files and, in C, of the functions.
-        readings, commands, states: what each is, in words; bare names unless given.
+        readings, commands: what each is, in words; bare names unless given.
     """
     infinite = "INFINITY" if language == "c" else "inf"
     given = _Numbers(controller, infinite)
@@ -44,7 +47,7 @@ def source(
             [
                 *_listed("reading", readings or controller.sensors),
                 *_listed("command", commands or controller.actuators),
-                *_listed("z", states or ["state of the controller"] * given.sizes["n_states"]),
+                *_listed("z", controller.states or ["state of the controller"] * given.sizes["n_states"]),
             ]
         ),
         "matrices": given.matrices,
@@ -125,6 +128,16 @@ def _equations(given: _Numbers) -> list[str]:
     if states:
         lines.append("z <- A z + B y" + (" + E v" if "E" in given.matrices else ""))
     return lines
+
+
+def reading_words(domain: Domain, sensors: Sequence[Sensor]) -> tuple[str, ...]:
+    """What each reading is: sensor, quantity, place and unit."""
+    return tuple(f"{s.name}: {s.quantity} at {domain.text(s.at)}, {QUANTITIES[s.quantity]}" for s in sensors)
+
+
+def command_words(domain: Domain, actuators: Sequence[Actuator]) -> tuple[str, ...]:
+    """What each command is: actuator, kind and place."""
+    return tuple(f"{a.name}: {a.kind} at {domain.text(a.at)}" for a in actuators)
 
 
 def _listed(array: str, words: Sequence[str]) -> list[str]:
