@@ -19,7 +19,7 @@ from workbench.robust.on_rig import impulse_test
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.prediction import predict_loop
-from workbench.robust.redesign import redesign
+from workbench.robust.redesign import force_weight, redesign
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import make_trial_with_plant
 
@@ -67,7 +67,7 @@ def plant(index, seed, searched=False):
     found = redesign(possible, law, test=test, draws=DRAWS, seed=index, placement=False)
     sure = UncertainRig(rig, true, np.zeros((_size(rig, true),) * 2))
     best = redesign(sure, law, test=test, draws=1, seed=index, placement=False)
-    weight = _weight(best)
+    weight = force_weight(best.after, best.controlled)
     struck = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
     told = {}
     for name, controller in (("nominal", found.present), ("redesigned", found.controller), ("true", best.controller)):
@@ -102,12 +102,6 @@ def plant(index, seed, searched=False):
         "sentence": found.sentence,
         **told,
     }
-
-
-def _weight(design):
-    """ρ of the cost 2 ∫ energy dt + ρ ∫ FᵀF dt whose terms are equal over the controlled modes, as in the optimum."""
-    run, controlled = design.after, list(design.controlled)
-    return 2.0 * float(run.response.energy[controlled].sum()) * design.test.sample_time / run.effort
 
 
 def _inside(possible, noise, controller, test, run):
