@@ -159,6 +159,19 @@ class Redesign:
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
 
     @property
+    def advice(self) -> str:
+        """Which controller to use, and what it does after the test."""
+        if not self.pays:
+            return self._kept
+        old, new = self.present_proof, self.proof
+        forces = [interval(proof.peak_force)[0] for proof in (new, old)]
+        forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
+        return (
+            f"Use the redesigned controller: it {_settles(new)} where the present one {_settles(old)}{forced}"
+            " (medians of the draws)."
+        )
+
+    @property
     def safe(self) -> bool:
         """Whether the controller to use is stable on every draw, and bears an error as large as is unexplained."""
         margin = self._used.margin
@@ -466,6 +479,11 @@ def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
     return tuple(notes)
 
 
+def _settles(proof: Proof) -> str:
+    middle = interval(proof.settling)[0]
+    return f"settles in {middle:.3g} s" if np.isfinite(middle) else "does not settle within the test"
+
+
 def _of(part: int, whole: int) -> str:
     return f"{part:,} of {whole:,}"
 
@@ -475,9 +493,12 @@ def _percent(share: float) -> str:
 
 
 def _ratios(values: np.ndarray, lead: str = "") -> str:
+    """Median and 95 % interval in per cent; digits until its ends differ, two to four."""
     middle, low, high = (100.0 * v for v in interval(values))
-    return f"{_two(middle)} % ({lead}{_two(low)} to {_two(high)})"
+    digits = next((n for n in (2, 3) if _rounded(low, n) != _rounded(high, n)), 4)
+    return f"{_rounded(middle, digits)} % ({lead}{_rounded(low, digits)} to {_rounded(high, digits)})"
 
 
-def _two(value: float) -> str:
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
+def _rounded(value: float, digits: int) -> str:
+    whole = len(f"{abs(value):.0f}") if abs(value) >= 1 else 0
+    return f"{value:.{max(digits - whole, 0)}f}" if whole else f"{value:.{digits}g}"

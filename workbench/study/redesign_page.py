@@ -44,8 +44,9 @@ def redesign_page(
     blocks += [
         block(
             plot_redesign(found),
-            "Both controllers on the same possible rigs, drawn from the diagnosis; every dead zone, delay, friction and"
-            " noise is in.",
+            "Both controllers after the impulse of the test, on the same possible rigs, drawn from the diagnosis; every"
+            " dead zone, delay, friction and noise is in. The lower curve is the better controller; a wide band says"
+            " that the records leave much open.",
         ),
         block(plot_steps(found), "From the present controller to the redesigned one, one step after the other."),
     ]
@@ -62,7 +63,7 @@ def redesign_page(
         title=f"Redesign for {name}",
         lead=found.sentence,
         standing="good" if found.safe else "bad" if found.proof.share_stable < 0.95 else "part",
-        lines=[*moved, *found.notes],
+        lines=[*([found.advice] if found.pays else []), *moved, *found.notes],
         blocks=blocks,
         tables=tables,
         inputs={} if folder is None else case_inputs(folder),
@@ -115,12 +116,10 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     shown = []
     if isinstance(rig.modes.domain, Interval) and old.bounded and new.bounded:
         shown.append(_moving(found, old.response, new.response, caption))
-    shown.append(
-        block(
-            _readings(found, record, {"present": old.response, "redesigned": new.response}),
-            f"{caption}: the displacement where it is largest. Measured without control where a sensor stands there.",
-        )
-    )
+    read = any(s.quantity == "displacement" for s in rig.sensors)
+    where = "the sensor that reads the most, beside what was measured there without control" if read else "an actuator"
+    readings = _readings(found, record, {"present": old.response, "redesigned": new.response})
+    shown.append(block(readings, f"{caption}: the displacement at {where}."))
     return shown
 
 
