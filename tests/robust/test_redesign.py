@@ -91,8 +91,19 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     assert found.pays is pays
     assert found.controller is (found.redesigned if pays else found.present)
     assert ("Keep the present controller" in found.sentence) is not pays
+    assert found.advice.startswith("Use the redesigned" if pays else "Keep the present") and "inf" not in found.advice
     back = replace(sure, present_proof=found.proof, proof=present, weight=0.5)
     assert back.pays or pays or stable == [True, True], "more stable draws come first"
+
+
+def test_the_ends_of_an_interval_are_told_apart(rig, controller):
+    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
+    near, far = (
+        replace(sure.proof, damping=np.outer(v, np.ones(6))) for v in ((0.1041, 0.1043, 0.1045), (0.2, 0.25, 0.3))
+    )
+    found = replace(sure, present_proof=near, proof=far)
+    assert "at 10.43 % (95 %: 10.41 to 10.45) damping" in found.sentence
+    assert "25 % (20 to 30), as much effort" in found.sentence
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):

@@ -59,7 +59,7 @@ def plot_steps(result: Redesign) -> Figure:
         )
     ax.set_yticks(range(len(names)), names)
     ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.15 * max(*losses, 1e-6)))
-    ax.set_xlabel("vibration and effort above those with perfect actuators and sensors [%]")
+    ax.set_xlabel("vibration and effort above the ideal [%]")
     return figure
 
 

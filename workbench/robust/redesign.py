@@ -137,7 +137,7 @@ class Redesign:
         else:
             text = f"the present controller {self._does(old, '95 %: ')}"
             text += f", unstable on {unstable} draws" if unstable else ""
-            text += f"; redesigned: {self._does(new, '', named=False)}, {effort:.2g} times the effort"
+            text += f"; redesigned: {self._does(new, '', named=False)}, {_times(effort)} effort"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
         text += "" if self.pays else f" {self._kept}"
         return text if self.possible.explained else f"{text} {self._promise}"
@@ -482,6 +482,11 @@ def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
 def _settles(proof: Proof) -> str:
     middle = interval(proof.settling)[0]
     return f"settles in {middle:.3g} s" if np.isfinite(middle) else "does not settle within the test"
+
+
+def _times(effort: float) -> str:
+    times = f"{effort:.2g}"
+    return "as much" if times == "1" else f"{times} times the"
 
 
 def _of(part: int, whole: int) -> str:

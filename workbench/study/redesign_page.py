@@ -21,6 +21,7 @@ from workbench.study.page import PageContent, Table, block, write_page
 from workbench.study.verdict_page import case_inputs
 
 MOST = 3000  # samples of a record that are replayed
+NOTHING = 1e-4  # of the vibration and effort: a loss that no step need make up for
 
 
 def redesign_page(
@@ -48,8 +49,15 @@ def redesign_page(
             " dead zone, delay, friction and noise is in. The lower curve is the better controller; a wide band says"
             " that the records leave much open.",
         ),
-        block(plot_steps(found), "From the present controller to the redesigned one, one step after the other."),
     ]
+    if max(s.loss for s in found.steps) > NOTHING:
+        blocks.append(
+            block(
+                plot_steps(found),
+                "From the present controller to the redesigned one, one step after the other: how much more vibration"
+                " and effort each takes than the redesigned law would with perfect actuators and sensors.",
+            )
+        )
     tables: list[Table] = [
         ("On the same draws: median (95 %)", ("", "present", "redesigned"), _figures(found)),
         (
@@ -61,9 +69,9 @@ def redesign_page(
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
-        lead=found.sentence,
+        lead=f"{found.advice} {found.sentence}" if found.pays else found.sentence,
         standing="good" if found.safe else "bad" if found.proof.share_stable < 0.95 else "part",
-        lines=[*([found.advice] if found.pays else []), *moved, *found.notes],
+        lines=[*moved, *found.notes],
         blocks=blocks,
         tables=tables,
         inputs={} if folder is None else case_inputs(folder),
