@@ -9,7 +9,7 @@ import pytest
 
 from workbench.cases.case import Case, read_case
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect, apply_all, place_values
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -18,6 +18,7 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Bar
 from workbench.structure.modes import Modes, PointShapes
+from workbench.trials.hidden import stands
 from workbench.trials.hold import hold_trials
 from workbench.trials.make import KINDS, OUTSIDE_KINDS, draw_kinds, make_trial, write_trials
 from workbench.trials.scoring import score, tally
@@ -121,6 +122,29 @@ def test_trials_on_plain_modal_data_use_its_levels_and_places(kind):
     rig = apply_all(case.rig, [_effect(told)])
     predicted = simulate(rig, high.inputs, sample_time=0.05, substeps=16).outputs
     assert np.sqrt(np.mean((high.outputs - predicted) ** 2)) == pytest.approx(2e-4, rel=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("structure", "seed"), [("plates", 1), ("frames", 1)])
+def test_friction_of_two_directions_shows_in_the_records_that_it_hides_in(structure, seed):
+    case, label = make_trial(seed, kinds=("two_way_friction",), structure=structure)
+    (told,) = label["effects"]
+    place, speed = place_values(stands(told)), told["smoothing_speed"]
+    forces = told["force_forward"], told["force_backward"]
+    kinds = BY_NAME["two_way_friction"], BY_NAME["coulomb_friction"]
+    numbers = dict(zip(("force_forward", "force_backward"), forces, strict=True)), {"force": float(np.mean(forces))}
+    both, mean = (
+        apply_all(case.rig, [Effect(kind, None, {**place, **own, "smoothing_speed": speed})])
+        for kind, own in zip(kinds, numbers, strict=True)
+    )
+    noise = np.array([[sensor.noise_std] for sensor in case.rig.sensors])
+    squares = []
+    for record in case.fit:
+        y, without = (
+            simulate(r, record.inputs, sample_time=record.sample_time, substeps=8).outputs for r in (both, mean)
+        )
+        squares.append(np.mean(((y - without) / noise) ** 2))
+    assert np.sqrt(np.mean(squares)) > 0.095
 
 
 def test_an_unknown_kind_is_refused():

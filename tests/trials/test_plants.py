@@ -15,6 +15,7 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Bar, Beam
 from workbench.trials.finite_elements import Alterations, element_modes
 from workbench.trials.hidden import hide
+from workbench.trials.laws import POINT_LAWS, law_force
 from workbench.trials.plant import Plant
 
 
@@ -138,6 +139,19 @@ EFFECTS = {
     "quadratic_damper": {"coefficient": 3.0},
     "point_damper": {"coefficient": 0.8},
 }
+
+
+def test_friction_of_two_directions_is_of_one_with_a_constant_force_beside_it():
+    law, friction = POINT_LAWS["two_way_friction"], POINT_LAWS["coulomb_friction"]
+    hidden = {"kind": "two_way_friction", "at": 0.8, **EFFECTS["two_way_friction"]}
+    limit = law.limit(hidden)
+    assert limit == {"kind": "coulomb_friction", "at": 0.8, "force": 0.2, "smoothing_speed": 0.02}
+    for speed in (-0.3, -0.01, 0.0, 0.004, 0.5):
+        both, mean = (
+            law_force(one.code, np.array([e[name] for name in one.parameters]), 0.0, speed, 0.0)
+            for one, e in ((law, hidden), (friction, limit))
+        )
+        assert both - mean == pytest.approx(-0.1, abs=1e-15)
 
 
 def _reference(solved, forces, extra) -> np.ndarray:

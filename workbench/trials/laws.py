@@ -55,6 +55,7 @@ class PointSizes:
 
 
 Strengths = Callable[[float], dict[str, float]]
+Label = dict[str, Any]
 Draw = Callable[[PointSizes, np.random.Generator], Strengths]
 
 
@@ -67,12 +68,15 @@ class PointLaw:
         parameters: their names in a label, in the order of the law.
         draw: sizes, rng -> numbers at a strength near 1; None where they are drawn otherwise.
         outside: whether no catalogue of a diagnosis holds it: an honest verdict on it is "unknown".
+        limit: effect -> its limiting case, which is meant where no record shows the difference; None for a law that is
+            drawn far from any.
     """
 
     code: int
     parameters: tuple[str, ...]
     draw: Draw | None = None
     outside: bool = False
+    limit: Callable[[Label], Label] | None = None
 
 
 def _clearance(p: PointSizes, rng: np.random.Generator) -> Strengths:
@@ -95,6 +99,13 @@ def _two_way_friction(p: PointSizes, rng: np.random.Generator) -> Strengths:
         return {stronger: force, weaker: ratio * force, "smoothing_speed": speed}
 
     return law
+
+
+def _same_both_ways(e: Label) -> Label:
+    """Friction of the mean force; a constant force is what it lacks."""
+    both = "force_forward", "force_backward"
+    rest = {name: value for name, value in e.items() if name not in both}
+    return {**rest, "kind": "coulomb_friction", "force": 0.5 * sum(e[name] for name in both)}
 
 
 def _bouc_wen(p: PointSizes, rng: np.random.Generator) -> Strengths:
@@ -126,7 +137,12 @@ POINT_LAWS: dict[str, PointLaw] = {
     "one_sided_stop": PointLaw(STOP, CONTACT, _clearance),
     "coulomb_friction": PointLaw(FRICTION, ("force", "smoothing_speed"), _friction),
     "bouc_wen": PointLaw(BOUC_WEN, ("stiffness", "yield_displacement"), _bouc_wen),
-    "two_way_friction": PointLaw(SLIDING, ("force_forward", "force_backward", "smoothing_speed"), _two_way_friction),
+    "two_way_friction": PointLaw(
+        SLIDING,
+        ("force_forward", "force_backward", "smoothing_speed"),
+        _two_way_friction,
+        limit=_same_both_ways,
+    ),
     "quadratic_damper": PointLaw(QUADRATIC_DAMPER, ("coefficient",), _power("coefficient", 0.05, 0, 2)),
     "quadratic_spring": PointLaw(QUADRATIC, ("stiffness",), _power("stiffness", 0.1, 2), outside=True),
     "quintic_spring": PointLaw(QUINTIC, ("stiffness",), _power("stiffness", 0.05, 5), outside=True),

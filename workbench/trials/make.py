@@ -17,7 +17,8 @@ from workbench.trials.chance import draw_effect
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
 from workbench.trials.draws import DRAWS
 from workbench.trials.hidden import HIDE, OUTSIDE, hide
-from workbench.trials.plant import SolvedPlant
+from workbench.trials.laws import POINT_LAWS
+from workbench.trials.plant import Plant, SolvedPlant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
 from workbench.trials.scene import Scene, Unsuitable, extent
 
@@ -27,6 +28,7 @@ OUTSIDE_KINDS = tuple(OUTSIDE)
 MOST_BENCHES, MOST_DRAWS = 40, 8
 VISIBLE = 0.02
 SEEN = 0.03  # each effect of several must alter the response by this much beside the others
+DISTINCT = 0.1  # of the noise: what tells an effect from its limiting case must alter the readings by this much
 STRONG = 0.7  # of the gap that dirt makes: what an effect beside it must make at least
 
 # Kinds that a structure cannot show.
@@ -170,6 +172,7 @@ def _case(
     real = hide(dirty, effects).solved()
     if dirt != Dirt() and effects:
         _check_strong(bench, tests, effects, nominal, dirty.solved(), real, rng)
+    _check_distinct(bench, tests, effects, dirty, real)
     fit: list[Record] = []
     validation: list[Record] = []
     figures = {}
@@ -234,6 +237,30 @@ def _check_strong(
         raise Unsuitable(f"the effects alone alter the readings by {max(gaps):.2g}, at most")
     if max(ratios) < STRONG:
         raise Unsuitable(f"the effects make {max(ratios):.2g} times the gap that the dirt makes, at most")
+
+
+def _check_distinct(
+    bench: Bench, tests: dict[str, np.ndarray], effects: list[dict[str, Any]], dirty: Plant, real: SolvedPlant
+) -> None:
+    """The records to fit must tell an effect from its limiting case, else the simpler one is meant, and right.
+
+    Accelerometers see nothing of the constant force in friction that differs between directions but how it sets in.
+    """
+    for one in effects:
+        law = POINT_LAWS.get(one["kind"])
+        if law is None or law.limit is None:
+            continue
+        simpler = hide(dirty, [law.limit(e) if e is one else e for e in effects]).solved()
+        noise = np.array([[sensor.noise_std] for sensor in real.plant.sensors])
+        squares = []
+        for test in (name for name in tests if name != "validate"):
+            # the same random forces on both
+            moved = [tested(p, bench, test, tests[test], np.random.default_rng(0))[0] for p in (real, simpler)]
+            y, without = (p.readings(m, bench.sample_time) for p, m in zip((real, simpler), moved, strict=True))
+            squares.append(np.mean(((y - without) / noise) ** 2))
+        apart = float(np.sqrt(np.mean(squares)))
+        if not apart > DISTINCT:
+            raise Unsuitable(f"{one['kind']} alters the readings by {apart:.2g} of the noise beside its limiting case")
 
 
 def _logged(sent: Floats, noise: float, rng: np.random.Generator) -> Floats:
