@@ -130,6 +130,7 @@ def test_distances_separations_and_texts():
         (lambda: plate().phi((0.3, 0.2), 1), "about an axis"),
         (lambda: plate().phi((0.3, 0.2), direction="x"), "normal"),
         (lambda: frame().phi("cx"), "no point 'cx'; the points are ax, bx, ay"),
+        (lambda: frame().phi("bz"), "no point 'bz'; node 'b' has bx: give one of these"),
         (lambda: frame().phi("bx", direction="y"), "no direction 'y'; it has x"),
         (lambda: frame().phi("bx", 1), "no slopes"),
         (lambda: frame(positions=False).domain.distance("ax", "bx"), "positions of the named points are not known"),

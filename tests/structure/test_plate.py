@@ -253,6 +253,7 @@ def test_a_membrane_has_its_closed_form():
     [
         ({"edges": "hinged"}, "simply supported"),
         ({"edges": {"left": "free"}}, "left, right, bottom, top"),
+        ({"edges": {}}, "or one for all; got none"),
         ({"mass_per_area": lambda x, y: x - 0.5}, "must be positive everywhere"),
         ({"poisson_ratio": 0.7}, "Poisson's ratio"),
         ({"attachments": [PointMass((1.2, 0.1), 1.0)]}, "outside"),

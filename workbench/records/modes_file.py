@@ -34,7 +34,8 @@ def read_modes(
     Universal files (.uff, .unv): data sets 55 or 2414 at nodes, with coordinates of 15 or 2411. NPZ, MAT and HDF5:
     `shapes` (n_points, n_modes), `frequencies_hz` or `omega` (n_modes,), and where known `damping_ratios` (n_modes,),
     `modal_mass` (n_modes,), `names`, `nodes` and `directions` (n_points,), `positions` (n_points, 3) in m, and
-    `mass_matrix` (n_points, n_points), by which the shapes are then scaled and checked.
+    `mass_matrix` (n_points, n_points), by which the shapes are then scaled and checked. Without it and `modal_mass`
+    they are taken as mass-normalised.
 
     Args:
         modal_mass: (n_modes,) or one number, kg, in place of what the file says: φᵀ M φ of its shapes.

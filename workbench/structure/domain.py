@@ -355,8 +355,16 @@ class NamedPoints:
         found = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
         if -1 in found:
             name = names[found.index(-1)]
-            raise PlaceError(f"there is no point {name!r}; the points are {_some(self.names)}: give one of these")
+            raise PlaceError(f"there is no point {name!r}; {self._known(name)}: give one of these")
         return np.array(found, int)
+
+    def _known(self, name: Any) -> str:
+        """The points of the node that a name begins with, in words; all points where it begins with none."""
+        node = max((m for m in self.nodes if str(name).startswith(m)), key=len, default=None)
+        if node is None:
+            return f"the points are {_some(self.names)}"
+        points = [n for n, m in zip(self.names, self.nodes, strict=True) if m == node]
+        return f"node {node!r} has {_some(points)}"
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Names, derivative 0 and sign: the point of the same node that moves or turns in the direction."""

@@ -75,7 +75,8 @@ def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str
     """
     each = dict(edges) if isinstance(edges, Mapping) else dict.fromkeys(SIDES, edges)
     if set(each) != set(SIDES):
-        raise ValueError(f"edges are given for {', '.join(SIDES)}, or one for all; got {', '.join(map(str, each))}")
+        got = ", ".join(map(str, each)) or "none"
+        raise ValueError(f"edges are given for {', '.join(SIDES)}, or one for all; got {got}")
     found = {}
     for side in SIDES:
         edge = each[side]
