@@ -41,6 +41,7 @@ def test_two_numerical_routes_agree_on_a_controlled_structure(hinged_beam, drive
     energy = expected.response.energy.sum(axis=0)
     assert found.bounded and found.stable
     assert found.energy == pytest.approx(energy, abs=5e-3 * energy.max())
+    assert found.modal_energy == pytest.approx(expected.response.energy, abs=5e-3 * energy.max())
     # the rig's work is by the mean force over each sample, which a late or slow force is not
     off = 1e-2 if "late" not in drive else 5e-2
     assert found.work == pytest.approx(expected.work, abs=off * np.abs(expected.work).max())

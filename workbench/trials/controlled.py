@@ -17,7 +17,7 @@ class Controlled:
     """What a plant did under a controller.
 
     Attributes:
-        energy: (n_samples,) of all modes.
+        modal_energy: (n_modes, n_samples) of each mode.
         work: (n_modes,) of the actuators in each mode.
         effort: ∫ FᵀF dt.
         peak_force: of any actuator, N.
@@ -26,13 +26,18 @@ class Controlled:
         outputs: (n_outputs, n_samples) what the controller's sensors read.
     """
 
-    energy: np.ndarray
+    modal_energy: np.ndarray
     work: np.ndarray
     effort: float
     peak_force: float
     bounded: bool
     sample_time: float
     outputs: np.ndarray
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(n_samples,) of all modes."""
+        return np.asarray(self.modal_energy.sum(axis=0))
 
     @property
     def vibration(self) -> float:
@@ -85,12 +90,20 @@ def control_plant(
     headed_for = (np.zeros(m), np.zeros(m), np.zeros(1))
     sums = (np.zeros(m), np.zeros(m), np.zeros(n), np.zeros(m))
     z, followed = np.zeros(controller.a.shape[0]), np.zeros(len(commanded))
-    energy, outputs = np.zeros(n_samples), np.zeros((len(controller.sensors), n_samples))
+    energy, outputs = np.zeros((n, n_samples)), np.zeros((len(controller.sensors), n_samples))
     most = np.ascontiguousarray(drive[1][:, 3])
     for k in range(n_samples):
-        energy[k] = 0.5 * float(y[n : 2 * n] @ y[n : 2 * n] + omega2 @ y[:n] ** 2)
-        if not energy[k] < RUN_AWAY * given:
-            given_up = energy[: k + 1], sums[2], float(sums[1].sum()), float(sums[3].max()), False, dt, outputs[:, :k]
+        energy[:, k] = 0.5 * (y[n : 2 * n] ** 2 + omega2 * y[:n] ** 2)
+        if not energy[:, k].sum() < RUN_AWAY * given:
+            given_up = (
+                energy[:, : k + 1],
+                sums[2],
+                float(sums[1].sum()),
+                float(sums[3].max()),
+                False,
+                dt,
+                outputs[:, :k],
+            )
             return Controlled(*given_up)
         outputs[:, k] = reading.at(k, y, pieces)
         command, followed, z = controller.step(z, followed, outputs[:, k])

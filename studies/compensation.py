@@ -1,0 +1,193 @@
+"""How much of what late, sticking or limited actuators cost does a redesigned controller win back on hidden plants?
+
+Performance is the settling time of the controlled modes after an impulse: until their energy stays below a hundredth of
+its peak. What an effect costs is that time under the present controller with the effect, over that without; a loop that
+does not settle takes the whole test.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect
+from workbench.robust.on_rig import impulse_test
+from workbench.robust.plain_law import plain_law
+from workbench.robust.posterior import UncertainRig
+from workbench.robust.redesign import redesign
+from workbench.trials.controlled import control_plant
+from workbench.trials.make import make_trial_with_plant
+
+PLANTS, SEED = 30, 20265
+DIRT = ("clean", "offset")
+LAWS = ("imsc", "coupled")
+CONTROLLED, DAMPING = 2, 0.35
+LATE, STICKS, LIMIT = 1.5, 0.3, 0.5  # samples; of the rms of the low level; of the peak force without a limit
+EFFECTS = {
+    "delay": ("actuator_delay", "delay", "delay"),
+    "dead zone": ("actuator_dead_zone", "width", "dead_zone"),
+    "saturation": ("actuator_saturation", "limit", "limit"),
+}  # its kind, its parameter, and what it is of an actuator
+SETTLED = 0.01  # of the largest energy of the controlled modes
+LOST = 0.02  # of the settling time: a plant that loses less has nothing to win back
+HALF, DEARER = 0.5, 1.05  # of what is lost; times the effort without the effect
+
+
+def plant(index, seed):
+    """One hidden plant without any effect, and with each in turn under the present and the redesigned controller."""
+    rng = np.random.default_rng([seed, index])
+    case, real = _made(rng, DIRT[index // len(LAWS) % len(DIRT)])
+    rig = case.rig
+    level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
+    test = impulse_test(rig, range(CONTROLLED), case.fit[0].sample_time, level=level, seed=index)
+    at = {"impulse_at": test.impulse_at, "impulse": test.impulse}
+    law = plain_law(LAWS[index % len(LAWS)], rig, CONTROLLED, damping=DAMPING, **at)
+    struck = next(a for a in rig.actuators if a.direct or a.at == test.impulse_at).name
+
+    def controlled(hidden, controller):
+        noise = np.random.default_rng([seed, index, 7])
+        given = {"n_samples": test.n_samples, "struck": struck, "impulse": test.impulse}
+        return control_plant(hidden, controller, **given, rng=noise)
+
+    nominal = redesign(UncertainRig(rig, (), np.zeros((0, 0))), law, test=test, draws=1, placement=False)
+    free = controlled(real, nominal.present)
+    told = {"test": float(test.time[-1]), "without": _figures(free)}
+    for name, size in _sizes(case, free.peak_force).items():
+        kind, parameter, _ = EFFECTS[name]
+        effect = Effect(kind_named(kind), "all", {parameter: size})
+        found = redesign(UncertainRig(rig, (effect,), np.zeros((1, 1))), law, test=test, draws=1, placement=False)
+        hidden = _with_effect(real, name, size)
+        told[name] = {
+            "present": _figures(controlled(hidden, found.present)),
+            "redesigned": _figures(controlled(hidden, found.redesigned)),
+            "pays": found.pays,
+            "steps": [s.name for s in found.steps if s.kept],
+        }
+    return told
+
+
+def _made(rng, dirt):
+    """A case that hides no effect, and its plant."""
+    for _ in range(20):
+        try:
+            case, _, real = make_trial_with_plant(int(rng.integers(2**31)), kinds=(), dirt=dirt, size=0.5)
+            return case, real
+        except ValueError:
+            continue
+    raise ValueError(f"no bench of {dirt} records")
+
+
+def _sizes(case, peak):
+    low = next(r for r in case.fit if r.name == "low")
+    commanded = [i for i, a in enumerate(case.rig.actuators) if not a.direct]
+    rms = float(np.sqrt((low.inputs[commanded] ** 2).mean()))
+    return {"delay": LATE * low.sample_time, "dead zone": STICKS * rms, "saturation": LIMIT * peak}
+
+
+def _with_effect(real, name, size):
+    """The plant whose driven actuators have the effect."""
+    own = real.plant.actuators
+    changed = tuple(a if a.direct else replace(a, **{EFFECTS[name][2]: size}) for a in own)
+    return replace(real, plant=replace(real.plant, actuators=changed))
+
+
+def _figures(run):
+    own = run.modal_energy[:CONTROLLED].sum(axis=0)
+    above = np.flatnonzero(own > SETTLED * own.max())
+    settles = run.bounded and above[-1] < own.size - 1
+    return {
+        "stable": run.stable,
+        "settling": float(run.sample_time * (above[-1] + 1)) if settles else None,
+        "vibration": run.vibration,
+        "effort": run.effort,
+        "peak force": run.peak_force,
+    }
+
+
+def study(outcome, data: Path | None = None) -> None:
+    points = [{"index": i, "seed": SEED} for i in range(PLANTS)]
+    results = outcome.run(points, plant)
+    for result in results:
+        if result.error is not None:
+            outcome.say(f"plant {result['index']}: {result.error}")
+    rows = [dict(r.values) for r in results if r.error is None]
+    report(outcome, rows)
+    outcome.check("plants that ended in an error", PLANTS - len(rows), 0)
+
+
+def report(outcome, rows):
+    """What each effect costs, and what is won back of it."""
+    rows = [row for row in rows if row["without"]["settling"] is not None]
+    outcome.table("plants", rows)
+    lost = {name: [row for row in rows if _over(row, name, "present") > 1.0 + LOST] for name in EFFECTS}
+    table = {}
+    for name, there in lost.items():
+        won = np.array([_won(row, name) for row in there])
+        effort = [row[name]["redesigned"]["effort"] / row["without"]["effort"] for row in there]
+        table[name] = {
+            "plants that lose": len(there),
+            "unstable": sum(not row[name]["present"]["stable"] for row in there),
+            "settling over that without, present": float(np.median([_over(row, name, "present") for row in there])),
+            "redesigned": float(np.median([_over(row, name, "redesigned") for row in there])),
+            "won back, median": float(np.median(won)),
+            "half or more won back on": int((won >= HALF).sum()),
+            "of the others, less vibration of all modes on": sum(
+                row[name]["redesigned"]["vibration"] < row[name]["present"]["vibration"]
+                for row, share in zip(there, won, strict=True)
+                if share < HALF
+            ),
+            "effort over that without": float(np.median(effort)),
+            "redesign pays by cost and work": sum(row[name]["pays"] for row in there),
+        }
+    outcome.table("each effect", table)
+    outcome.say(
+        f"Of {len(rows)} hidden plants "
+        + "; ".join(
+            f"a {name} slows {t['plants that lose']} (median {t['settling over that without, present']:.2f} times the"
+            f" settling time), redesigned {t['redesigned']:.2f} times: {100 * t['won back, median']:.0f} % won back,"
+            f" half or more on {t['half or more won back on']}, and on"
+            f" {t['of the others, less vibration of all modes on']} of the others all modes together vibrate less"
+            for name, t in table.items()
+        )
+        + "."
+    )
+    for name, t in table.items():
+        share, effort = t["won back, median"], t["effort over that without"]
+        outcome.check(f"{name}: share of the lost settling time won back, median", share, HALF, at_least=True)
+        outcome.check(f"{name}: effort of the redesign over that without it, median", effort, DEARER)
+    unstable = sum(not row[name]["redesigned"]["stable"] for row in rows for name in EFFECTS)
+    outcome.check("loops that are unstable when redesigned", unstable, 0)
+    caption = "Settling time of the controlled modes of each hidden plant with an effect, over that without it."
+    outcome.figure("settling", _figure(lost), caption)
+
+
+def _over(row, name, controller):
+    """Settling time with an effect over that without; the whole test where it does not settle."""
+    settling = row[name][controller]["settling"]
+    return (row["test"] if settling is None else settling) / row["without"]["settling"]
+
+
+def _won(row, name):
+    """Share of the lost time that is won back, at most all of it."""
+    present, redesigned = _over(row, name, "present"), _over(row, name, "redesigned")
+    return min((present - redesigned) / (present - 1.0), 1.0)
+
+
+def _figure(lost):
+    figure, axes = new_figure(1, len(lost), width=10, height=4.0, sharey=True)
+    for ax, (name, there) in zip(axes, lost.items(), strict=True):
+        order = sorted(there, key=lambda row: _over(row, name, "present"))
+        for who, words, colour in (("present", "present", COLOURS[1]), ("redesigned", "redesigned", COLOURS[0])):
+            values = [_over(row, name, who) for row in order]
+            ax.plot(np.arange(len(order)), values, "o", color=colour, markersize=4, label=words)
+        for i, row in enumerate(order):
+            ends = [_over(row, name, who) for who in ("present", "redesigned")]
+            ax.plot([i, i], ends, color=GREY, linewidth=0.8, zorder=0)
+        ax.axhline(1.0, color=GREY, linewidth=0.8)
+        ax.set(yscale="log", xlabel="hidden plant that loses time", title=name)
+        ax.set_xticks([])
+    axes[0].set_ylabel("settling time over that\nwithout the effect")
+    axes[0].legend(fontsize=8)
+    return figure
