@@ -114,7 +114,10 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     if np.linalg.eigvals(a - b @ law.gain).real.max() >= 0:
         raise DesignError("the controlled modes do not settle, so their work has no limit; take a finite time")
     if np.diag(modes.damping).max() > 0:
-        raise DesignError("modes are damped, so friction shares the work: use finite_spillover with a final time")
+        raise DesignError(
+            "modes are damped, so friction shares the work: use"
+            " workbench.design.spillover.spillover.finite_spillover(close_loop(modes, law), state, final_time)"
+        )
     work = np.zeros(n)
     work[index] = -_energies(modes, state)[index]
     if residual:
