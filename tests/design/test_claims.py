@@ -1,9 +1,12 @@
 """What Chapter 5 of the dissertation claims, and where each claim ends."""
 
+from itertools import combinations
+
 import numpy as np
 import pytest
 
-from workbench.design.estimation.modal_filter import hermite_filter
+from workbench.design.estimation.controller import filtered
+from workbench.design.estimation.modal_filter import displacement_filter, hermite_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
@@ -11,7 +14,10 @@ from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
 from workbench.design.placement.sensor_placement import filter_error, place_sensors
 from workbench.design.spillover.spillover import distributed_cost, effort, finite_spillover, modal_cost, spillover
 from workbench.rig.actuators import Actuator
+from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Beam
+from workbench.structure.modes import Modes
+from workbench.structure.plate import Plate
 
 PLACES = (2.0, 4.0, 6.0, 8.0), (1.5, 3.5, 6.5, 8.5), (1.3, 2.6, 3.9, 5.2)
 
@@ -98,3 +104,41 @@ def test_sensors_of_a_filter_placed():
     assert best.exhaustive and best.error <= min(every)
     with pytest.raises(DesignError, match="8 sensors cannot stand at 7"):
         place_sensors(found, 3, 8, 1.0, mean_squares=squares, candidates=few)
+
+
+def test_the_one_sensor_of_the_first_mode_of_a_plate_stands_at_its_centre():
+    # among these the centre alone is on the nodal lines of the second and the third mode, which move more
+    plate = Plate(
+        length=(0.9, 0.6), mass_per_area=8.0, bending_stiffness=60.0, poisson_ratio=0.3, edges="simply supported"
+    )
+    candidates = [(0.2, 0.1), (0.45, 0.15), (0.45, 0.3), (0.3, 0.3), (0.7, 0.5)]
+    squares = [1.0, 100.0, 100.0]
+    placed = place_sensors(plate.modes(3), 1, 1, 8.0, mean_squares=squares, candidates=candidates)
+    assert placed.places == [(0.45, 0.3)] and placed.exhaustive
+    with pytest.raises(DesignError, match=r"no choice of 2 candidate places makes a filter: .* its mass"):
+        place_sensors(plate.modes(3), 1, 2, mean_squares=squares, candidates=candidates)
+
+
+def test_sensors_at_named_points_leave_the_least_error_of_all_choices():
+    rng = np.random.default_rng(5)
+    omega, shapes = np.array([3.0, 8.0, 17.0, 30.0]), rng.standard_normal((7, 4))
+    points = NamedPoints(tuple("abcdefg"))
+    found = Modes(omega, np.full(4, 0.01), lambda index, _: shapes[index], points)
+    squares = omega**-2.0
+
+    def error(choice):  # of the motion of least strain energy through the readings, by Lagrange's multipliers
+        seen = shapes[list(choice)]
+        spread = seen.T / omega[:, None] ** 2
+        off = (spread @ np.linalg.inv(seen @ spread) @ seen - np.eye(4))[:2]
+        return np.sqrt((off**2 @ squares).sum() / squares[:2].sum())
+
+    placed = place_sensors(found, 2, 3, mean_squares=squares)
+    best = min(combinations(range(7), 3), key=error)
+    assert placed.exhaustive and placed.places == ["abcdefg"[i] for i in best]
+    assert placed.error == pytest.approx(error(best), rel=1e-9)
+
+
+def test_a_filter_of_other_modes_than_the_law_controls_is_refused():
+    law = imsc(modes(), 2, actuators(PLACES[0][:2]), weight=20.0)
+    with pytest.raises(ValueError, match="gives 3 modal coordinates and the law controls 2"):
+        filtered(law, displacement_filter(modes().select([0, 1, 2]), [2.0, 4.0, 6.0, 8.0], 1.0))

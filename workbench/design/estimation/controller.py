@@ -73,7 +73,17 @@ def reading(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
 
 
 def filtered(law: Law, filter_: ModalFilter) -> Controller:
-    """A law through a modal filter: displacements and velocities at its places, slopes and theirs where it has any."""
+    """A law through a modal filter: displacements and velocities at its places, slopes and theirs where it has any.
+
+    Raises:
+        ValueError: a filter of other modes than the law controls.
+    """
+    n_filtered = len(filter_.displacement)
+    if n_filtered != len(law.controlled):
+        raise ValueError(
+            f"the filter gives {n_filtered} modal coordinates and the law controls {len(law.controlled)} modes; make"
+            " the filter of the controlled modes: modes.select(list(law.controlled))"
+        )
     weights, kinds = [filter_.displacement], [("displacement", "velocity", "")]
     if filter_.slope.size:
         weights.append(filter_.slope)

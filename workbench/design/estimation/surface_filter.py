@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,7 +14,7 @@ from workbench.structure.domain import NamedPoints, Rectangle
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
-from workbench.structure.profile import FieldLike, as_field
+from workbench.structure.profile import FieldLike, ProfileLike, as_field
 
 READINGS = 3  # not on one line: what a plane through them needs
 PER_SIDE = 24  # readings of zero along a held edge of the longer side
@@ -69,14 +70,34 @@ def filter_on(
     Raises:
         ValueError: no structure where one is needed, or sensors that make no filter.
     """
+    mass: ProfileLike | FieldLike | None = None
+    if isinstance(structure, Plate | Membrane):
+        mass = structure.mass_per_area
+    elif structure is not None:
+        mass = structure.mass_per_length
+    return filter_of_mass(mass, modes, filtered, places)
+
+
+def filter_of_mass(
+    mass: ProfileLike | FieldLike | None, modes: Modes, filtered: Sequence[int], places: ArrayLike
+) -> ModalFilter:
+    """The filter of displacements that `filter_on` gives, of modes whose mass is known and not the whole structure.
+
+    Args:
+        mass: kg/m along a structure, kg/m² over a surface; not needed at named points.
+        modes, filtered, places: as in `filter_on`.
+
+    Raises:
+        ValueError: no mass where it is needed, or sensors that make no filter.
+    """
     if isinstance(modes.domain, NamedPoints):
         return point_filter(modes, [str(name) for name in np.ravel(np.asarray(places, object))], filtered)
-    own = modes.select(list(filtered))
-    if structure is None:
+    if mass is None:
         raise ValueError("a modal filter needs the structure between the sensors, for its mass; describe it")
-    if isinstance(structure, Plate | Membrane):
-        return surface_filter(own, places, structure.mass_per_area)
-    return displacement_filter(own, np.sort(np.asarray(places, float)), structure.mass_per_length)
+    own = modes.select(list(filtered))
+    if isinstance(modes.domain, Rectangle):
+        return surface_filter(own, places, cast(FieldLike, mass))
+    return displacement_filter(own, np.sort(np.asarray(places, float)), cast(ProfileLike, mass))
 
 
 def _held(modes: Modes, domain: Rectangle, at: np.ndarray) -> Floats:

@@ -8,16 +8,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from math import comb
+from warnings import warn
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
-from workbench.design.estimation.modal_filter import displacement_filter
+from workbench.design.estimation.surface_filter import filter_of_mass
 from workbench.design.laws.law import DesignError, controlled_indices
+from workbench.design.placement.places import as_places
+from workbench.design.placement.task import listed
+from workbench.structure.domain import Interval, Place, Rectangle, same_place
 from workbench.structure.modes import Modes, frozen
-from workbench.structure.profile import ProfileLike
+from workbench.structure.profile import FieldLike, ProfileLike
 from workbench.threads import one_blas_thread
+
+Mass = ProfileLike | FieldLike | None
+SPACINGS = 40  # from end to end of a structure between candidates
+SPACINGS_OVER = 12  # along the longer side of a surface
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,9 +33,10 @@ class SensorPlacement:
     """Places of the sensors and how well the filter then reads.
 
     Attributes:
-        positions: (n_sensors,) m, increasing.
+        positions: (n_sensors,) m, increasing; on a surface (n_sensors, 2) m; at named points (n_sensors,) names.
         error: root of Σ (T - I)² e over Σ e of the controlled modes.
-        even_error: the same of evenly spaced sensors.
+        even_error: the same of evenly spaced sensors; on a surface and at named points, of every so many candidates.
+            Infinite where these make no filter.
         exhaustive: whether every choice of the candidates was tried; else the best is local, from several starts.
     """
 
@@ -37,15 +46,21 @@ class SensorPlacement:
     exhaustive: bool
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "positions", frozen(self.positions))
+        named = np.asarray(self.positions).dtype.kind in "OU"
+        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+
+    @property
+    def places(self) -> list[Place]:
+        """The positions as places: floats, pairs of floats, or names."""
+        return [same_place(at) for at in self.positions]
 
 
 def filter_error(
-    modes: Modes, controlled: Sequence[int], positions: ArrayLike, mass_per_length: ProfileLike, mean_squares: ArrayLike
+    modes: Modes, controlled: Sequence[int], positions: ArrayLike, mass: Mass, mean_squares: ArrayLike
 ) -> float:
     """Relative error of a displacement filter's modal coordinates, modes moving with given mean squares (n_modes,)."""
     index, e = list(controlled), np.asarray(mean_squares, float)
-    seen = displacement_filter(modes.select(index), positions, mass_per_length).seen(modes)
+    seen = filter_of_mass(mass, modes, index, positions).seen(modes)
     seen[np.arange(len(index)), index] -= 1.0
     return float(np.sqrt((seen**2 @ e).sum() / e[index].sum()))
 
@@ -55,65 +70,93 @@ def place_sensors(
     modes: Modes,
     controlled: int | Sequence[int],
     count: int,
-    mass_per_length: ProfileLike,
+    mass: Mass = None,
     *,
     mean_squares: ArrayLike,
     candidates: ArrayLike | None = None,
     starts: int = 3,
     most_tried: int = 2000,
     seed: int = 0,
+    mass_per_length: ProfileLike | None = None,
 ) -> SensorPlacement:
     """Places of `count` displacement sensors among candidates for the least error of the filter.
 
     Every choice is tried where there are at most `most_tried`; else sensors are exchanged one by one from even places
-    and random ones until no exchange helps, and where no candidates were given moved freely from there.
+    and random ones until no exchange helps, and along a structure, where no candidates were given, moved freely from
+    there.
 
     Args:
         modes: all, controlled and residual.
         controlled: how many of the lowest, or which.
+        mass: kg/m along a structure, kg/m² over a surface; not needed at named points.
         mean_squares: (n_modes,) of the modal coordinates.
-        candidates: (n_candidates,) m; 39 even places unless given.
+        candidates: places of the domain: (n_candidates,) m, (n_candidates, 2) m or names; unless given, 39 even places,
+            a grid over the surface, or every point that is a displacement.
+        mass_per_length: the former name of mass.
 
     Raises:
-        DesignError: fewer candidates than sensors, or mean squares that are none.
+        DesignError: fewer candidates than sensors, candidates of which no choice makes a filter, or mean squares that
+            are none.
     """
     index = controlled_indices(modes, controlled)
     e = np.asarray(mean_squares, float)
     if e.shape != (modes.n_modes,) or (e < 0).any() or not e[list(index)].sum() > 0:
         raise DesignError(f"mean squares are needed of all {modes.n_modes} modes, none negative; got {e}")
-    grid = modes.length * np.arange(1, 40) / 40 if candidates is None else np.unique(np.asarray(candidates, float))
-    if not 1 <= count <= grid.size:
-        raise DesignError(f"{count} sensors cannot stand at {grid.size} candidate places; allow more")
+    if mass_per_length is not None:
+        warn("place_sensors(mass_per_length=...) is now place_sensors(mass=...)", DeprecationWarning, stacklevel=3)
+        mass = mass_per_length
+    grid = _candidates(modes, candidates)
+    if not 1 <= count <= len(grid):
+        raise DesignError(f"{count} sensors cannot stand at {len(grid)} candidate places; allow more")
 
     known: dict[tuple[int, ...], float] = {}
+    refused: list[str] = []
 
     def error(choice: tuple[int, ...]) -> float:
         if choice not in known:
-            known[choice] = filter_error(modes, index, grid[list(choice)], mass_per_length, e)
+            try:
+                known[choice] = filter_error(modes, index, grid[list(choice)], mass, e)
+            except ValueError as reason:
+                refused.append(str(reason))
+                known[choice] = np.inf
         return known[choice]
 
-    even = filter_error(modes, index, modes.length * np.arange(1, count + 1) / (count + 1), mass_per_length, e)
-    exhaustive = comb(grid.size, count) <= most_tried
+    along = modes.length if isinstance(modes.domain, Interval) else 0.0
+    evenly = along * np.arange(1, count + 1) / (count + 1)
+    first = np.unique(np.round(np.linspace(0, len(grid) - 1, count + 2)[1:-1]).astype(int))
+    spread = [tuple(map(int, first))] if first.size == count else []
+    even = filter_error(modes, index, evenly, mass, e) if along else min(map(error, spread), default=np.inf)
+    exhaustive = comb(len(grid), count) <= most_tried
     if exhaustive:
-        best = min(combinations(range(grid.size), count), key=error)
-        return SensorPlacement(grid[list(best)], error(best), even, True)
-    rng = np.random.default_rng(seed)
-    first = np.unique(np.round(np.linspace(0, grid.size - 1, count + 2)[1:-1]).astype(int))
-    choices = [tuple(first)] if first.size == count else []
-    choices += [tuple(sorted(rng.choice(grid.size, count, replace=False))) for _ in range(starts)]
-    best = min((_exchanged(tuple(map(int, choice)), grid.size, error) for choice in choices), key=error)
-    if candidates is not None:
-        return SensorPlacement(grid[list(best)], error(best), even, False)
+        best = min(combinations(range(len(grid)), count), key=error)
+    else:
+        rng = np.random.default_rng(seed)
+        drawn = [sorted(rng.choice(len(grid), count, replace=False)) for _ in range(starts)]
+        choices = [*spread, *(tuple(map(int, choice)) for choice in drawn)]
+        best = min((_exchanged(choice, len(grid), error) for choice in choices), key=error)
+    if np.isinf(error(best)):
+        raise DesignError(f"no choice of {count} candidate places makes a filter: {refused[-1]}")
+    if exhaustive or candidates is not None or not along:
+        return SensorPlacement(grid[list(best)], error(best), even, exhaustive)
 
     def anywhere(x: np.ndarray) -> float:
-        inside = 0 < x.min() and x.max() < modes.length and (np.diff(x) > 1e-3 * modes.length).all()
-        return filter_error(modes, index, x, mass_per_length, e) if inside else np.inf
+        inside = 0 < x.min() and x.max() < along and (np.diff(x) > 1e-3 * along).all()
+        return filter_error(modes, index, x, mass, e) if inside else np.inf
 
     # between the candidates: from the best of them and from even places
-    starts_at = grid[list(best)], modes.length * np.arange(1, count + 1) / (count + 1)
+    starts_at = grid[list(best)], evenly
     found = [minimize(anywhere, x, method="Nelder-Mead", options={"maxfev": 60 * count}) for x in starts_at]
     polished = min(found, key=lambda result: result.fun)
     return SensorPlacement(polished.x, float(polished.fun), even, False)
+
+
+def _candidates(modes: Modes, given: ArrayLike | None) -> np.ndarray:
+    """Different places (n_candidates, ...) of the domain where sensors may stand."""
+    domain = modes.domain
+    if isinstance(domain, Interval):
+        return np.unique(domain.locate(domain.grid(SPACINGS) if given is None else given))
+    places = as_places(domain, domain.grid(SPACINGS_OVER) if given is None else given)
+    return np.array(list(dict.fromkeys(listed(places))), float if isinstance(domain, Rectangle) else object)
 
 
 def _exchanged(choice: tuple[int, ...], size: int, error: Callable[[tuple[int, ...]], float]) -> tuple[int, ...]:
