@@ -8,12 +8,17 @@ import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
-from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.effects.nominal import IdentifiedPrior, NominalPrior, nominal_errors
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit
 from workbench.gap.search.intervals import with_intervals
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
 from workbench.robust.posterior import UncertainRig
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
 
 GAINS = (
     Effect(kind_named("actuator_gain"), "F1", {"gain": 0.8}),
@@ -82,6 +87,36 @@ def test_errors_of_the_nominal_model_and_places_go_through_json(told):
     for one, other in zip(possible.draws(3, seed=5), again.draws(3, seed=5), strict=True):
         assert np.array_equal(one.modes.omega, other.modes.omega)
     assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
+
+
+def identified_rig(covariance=None):
+    """Two modes as they were identified at a driving point and another sensor."""
+    points, shapes = NamedPoints(("F", "y")), PointShapes(np.array([[0.7, 0.5], [0.6, -0.4]]))
+    shape_covariance = None if covariance is None else np.array([1e-4 * np.eye(2), 4e-4 * np.eye(2)])
+    modes = Modes(
+        omega=[10.0, 23.0],
+        damping=[0.02, 0.01],
+        shapes=shapes,
+        domain=points,
+        covariance=covariance,
+        shape_covariance=shape_covariance,
+    )
+    return Rig(modes, (Actuator("F", "F"),), (Sensor("y", "y", noise_std=1e-4),))
+
+
+def test_errors_of_an_identified_rig_go_through_json():
+    rig = identified_rig(np.diag([1e-4, 4e-4, 1e-8, 1e-8]))
+    errors = nominal_errors(rig, IdentifiedPrior.of_modes(rig), {"identified_1": 0.5, "identified_3": -1.0})
+    spring = Effect(kind_named("cubic_spring"), None, {"at": "F", "stiffness": 3.0})
+    n = len(errors.values) + 1
+    possible = UncertainRig(rig, (spring, errors), 1e-2 * np.eye(n))
+    again = UncertainRig.from_json(rig, json.loads(json.dumps(possible.to_json())))
+    for one, other in zip(possible.draws(3, seed=5), again.draws(3, seed=5), strict=True):
+        assert np.array_equal(one.modes.omega, other.modes.omega)
+        assert np.array_equal(one.modes.phi("y"), other.modes.phi("y"))
+    assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
+    with pytest.raises(ValueError, match="modes know their covariance"):
+        UncertainRig.from_json(identified_rig(), possible.to_json())
 
 
 def test_what_cannot_be_is_named(told):

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all
-from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior
+from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.fit import Fit, parameters_of
 from workbench.rig.rig import Rig
@@ -169,7 +170,7 @@ class UncertainRig:
         unknown = [entry["kind"] for entry in written["effects"] if entry["kind"] not in kinds]
         if unknown:
             raise ValueError(f"no effect is called {unknown[0]!r}; hand a catalogue that holds it")
-        effects = tuple(_effect(kinds[entry["kind"]], entry) for entry in written["effects"])
+        effects = tuple(_effect(nominal, kinds[entry["kind"]], entry) for entry in written["effects"])
         n = len(parameters_of(nominal, effects))
         covariance = np.array(written["covariance"], float) if n else np.zeros((0, 0))
         rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in written["rivals"])
@@ -218,16 +219,31 @@ def _effect_json(effect: Effect) -> dict[str, Any]:
     target = effect.target
     if isinstance(target, NominalPrior):
         target = {"prior": asdict(target)}
+    elif isinstance(target, IdentifiedPrior):
+        target = {"identified": target.root.tolist()}
     values = {n: {"between": list(v)} if isinstance(v, Between) else v for n, v in effect.values.items()}
     return {"kind": effect.kind.name, "target": target, "values": values, "deviations": dict(effect.deviations)}
 
 
-def _effect(kind: Kind, written: Mapping[str, Any]) -> Effect:
+def _effect(nominal: Rig, kind: Kind, written: Mapping[str, Any]) -> Effect:
     target = written["target"]
-    if isinstance(target, Mapping):
+    if isinstance(target, Mapping) and "identified" in target:
+        target = _identified(nominal, np.array(target["identified"], float))
+    elif isinstance(target, Mapping):
         prior: dict[str, Any] = {n: tuple(v) if isinstance(v, list) else v for n, v in target["prior"].items()}
         target = NominalPrior(**prior)
     elif isinstance(target, list):
         target = tuple(target)
     values = {n: Between(*v["between"]) if isinstance(v, Mapping) else v for n, v in written["values"].items()}
     return Effect(kind, target, values, dict(written["deviations"]))
+
+
+def _identified(nominal: Rig, root: Floats) -> IdentifiedPrior:
+    """Errors of identified modes, with the root of their covariance as it was written."""
+    prior = IdentifiedPrior.of_modes(nominal)
+    if prior is None or prior.root.shape[0] != root.shape[0]:
+        raise ValueError(
+            "errors of an identified rig are read beside that rig alone: give one whose modes know their covariance, as"
+            " rig_from makes it"
+        )
+    return replace(prior, root=root)
