@@ -104,6 +104,8 @@ def test_the_ends_of_an_interval_are_told_apart(rig, controller):
     found = replace(sure, present_proof=near, proof=far)
     assert "at 10.43 % (95 %: 10.41 to 10.45) damping" in found.sentence
     assert "25 % (20 to 30), as much effort" in found.sentence
+    alike = replace(sure.proof, damping=np.full((3, 6), 0.05))
+    assert "redesigned: 5.00 % (draws alike)," in replace(found, proof=alike).sentence
 
 
 def test_every_draw_is_judged_by_its_own_simulation(rig, controller):

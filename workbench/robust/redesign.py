@@ -500,7 +500,9 @@ def _percent(share: float) -> str:
 def _ratios(values: np.ndarray, lead: str = "") -> str:
     """Median and 95 % interval in per cent; digits until its ends differ, two to four."""
     middle, low, high = (100.0 * v for v in interval(values))
-    digits = next((n for n in (2, 3) if _rounded(low, n) != _rounded(high, n)), 4)
+    digits = next((n for n in (2, 3, 4) if _rounded(low, n) != _rounded(high, n)), 0)
+    if not digits:
+        return f"{_rounded(middle, 3)} % (draws alike)"
     return f"{_rounded(middle, digits)} % ({lead}{_rounded(low, digits)} to {_rounded(high, digits)})"
 
 
