@@ -8,6 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.limiting_cases import each_left_out
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import clipped_level, rounding_step
 from workbench.gap.localisation.evidence import Evidence
@@ -206,7 +207,7 @@ def attribute(
         outcome = "explained" if outcome == "none" else outcome
     beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
     if beside is not None:
-        best = _beside_identified(within, best, beside, seen)
+        best = beside_identified(within, best, beside, seen)
     if random is None:
         best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None)
         best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
@@ -232,13 +233,25 @@ def attribute(
     )
 
 
-def _beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:
-    """The set fitted anew beside errors of the identified rig; what was read off the records stays."""
+def beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:
+    """The set fitted anew beside errors of the identified rig; what was read off the records stays.
+
+    Of several effects one may have stood for these errors: it is left out where the records do as well without.
+    """
     others = [effect for effect in best.effects if effect not in seen]
     if not others:
         return best
-    both = (*others, nominal_errors(search.rig, identified))
-    found = fit(search.rig, both, search.data, iterations=TOGETHER, workers=search.workers)
+
+    def beside(effects: Sequence[Effect], errors: Effect) -> Fit:
+        return fit(search.rig, (*effects, errors), search.data, iterations=TOGETHER, workers=search.workers)
+
+    found = beside(others, nominal_errors(search.rig, identified))
+    while len(found.effects) > 2:
+        *effects, errors = found.effects
+        fewer = min((beside(some, errors) for some in each_left_out(effects)), key=lambda f: f.cost)
+        if search.tells_apart(found.cost, fewer.cost, found.n_parameters - fewer.n_parameters):
+            break
+        found = fewer
     return replace(found, effects=(*seen, *found.effects))
 
 

@@ -1,0 +1,55 @@
+"""What explains records, beside a rig that was itself identified."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.nominal import IdentifiedPrior
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE
+from workbench.gap.search.attribute import beside_identified
+from workbench.gap.search.fit import fit
+from workbench.gap.search.search import Search
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
+
+OMEGA, MASS, NOISE, DOUBT = 10.0, 2.0, 1e-4, 3e-3
+GAIN = Effect(kind_named("sensor_gain"), "y", {"gain": 1.2})
+
+
+def identified(omega):
+    """A mass on a spring, its frequency known to 0.3 %."""
+    modes = Modes(
+        omega=[omega],
+        damping=[0.02],
+        shapes=PointShapes(np.full((2, 1), MASS**-0.5)),
+        domain=NamedPoints(("F", "y")),
+        covariance=np.diag([(DOUBT * OMEGA) ** 2, 1e-8]),
+        shape_covariance=np.full((1, 2, 2), 1e-6 / MASS),
+    )
+    return Rig(modes, (Actuator("F", "F"),), (Sensor("y", "y", noise_std=NOISE),))
+
+
+@pytest.mark.parametrize(("added", "kinds"), [(0.0, ["sensor_gain"]), (0.2, ["point_mass", "sensor_gain"])])
+def test_a_mass_that_stood_for_an_error_of_the_identified_frequency_is_left_out(added, kinds):
+    """ω² = k / (M + m): 0.3 % of the frequency is 0.6 % of the mass, and 0.2 kg is 10 %."""
+    nominal = identified(OMEGA * (1.0 + DOUBT))
+    mass = Effect(kind_named("point_mass"), None, {"at": "y", "mass": added})
+    real = apply_all(identified(OMEGA), [GAIN, *([mass] if added else [])])
+    rng = np.random.default_rng(2)
+    clean = simulate(real, rng.normal(size=(1, 600)), sample_time=0.05, name="test")
+    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
+    data = FitData((record,), np.array([NOISE]))
+    before = data.by_channel(data.residual(nominal))
+    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    alone = fit(nominal, (GAIN, replace(mass, values={"at": "y", "mass": added + 0.01})), data)
+    assert alone.effects[1].values["mass"] > 0.008, "without the doubt it stands for the error"
+    found = beside_identified(search, alone, IdentifiedPrior.of_modes(nominal), ())
+    assert sorted(e.kind.name for e in found.effects if not e.kind.first) == kinds
