@@ -5,11 +5,12 @@ import numpy as np
 from workbench.gap.effects.effect import apply_all
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
 from workbench.gap.search.fit import Fit
-from workbench.gap.search.jointly import measured
+from workbench.gap.search.jointly import fit_jointly, measured
 from workbench.gap.search.search import Search
 from workbench.rig.rig import Rig
 
 WHITE = 2.0  # mean square, white, that a set may leave beside that noise for a search to go on beside it
+BENT = 0.1  # of what a set leaves without that noise: errors of the model that bent to it may leave so much beside it
 HEARINGS = 2  # rounds of learning the sensors' noise beside it
 
 
@@ -28,6 +29,10 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
     (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
     beside = louder.beside_inputs(rig, share)
     white = measured(beside, fitted).fit
+    if WHITE < white.cost < BENT * fitted.cost:
+        fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
+        rig = apply_all(search.rig, fitted.effects)
+        left = search.data.differences(rig)
     if share < LEAST_LOGGED or white.cost > WHITE:
         return None
     for _ in range(HEARINGS):  # each sensor's noise by the power of its innovations
