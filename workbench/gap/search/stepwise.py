@@ -451,7 +451,8 @@ class Stepwise:
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         if step.logged > LEAST_LOGGED and not self.search.logged:
             search = beside_inputs(self.at_first, step.fit, step.sensor_noise) or search
-        rivals = [other.effects for other in self._others()[1:]]
+        key, rig = key_of(step.effects), self.search.rig
+        rivals = [s.effects for s in self._others()[1:] if key not in contained(s.effects, rig)]
         found = in_place_of_errors(search, step.effects, step.errors, rivals)
         if found is None:
             return None
