@@ -18,7 +18,7 @@ from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.beside_random import decide_on_random, random_beside_singles
+from workbench.gap.search.beside_random import decide_on_random, random_beside
 from workbench.gap.search.decide import decide
 from workbench.gap.search.finish import widened
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -314,7 +314,7 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
-    random = None if beside.is_enough else random_beside_singles(search, singles)
+    random = None if beside.is_enough else random_beside(search, singles)
     if random is not None:
         return random
     if beside.is_enough or beside.by_singles():
@@ -344,7 +344,9 @@ def _with_a_second(
         decision = pairs.decision(start)
         if not (are_common(decision.best.effects) and beside.is_nothing):
             return decision
-    return beside.decision()
+    decision = beside.decision()
+    random = None if decision.outcome in ("explained", "none") else random_beside(search, pairs.found[:1])
+    return random or decision
 
 
 def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:

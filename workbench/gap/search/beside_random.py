@@ -26,7 +26,7 @@ NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wro
 RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
 STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
 FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
-BESIDE_SINGLES = 2  # likeliest kinds of single effects that a random force is tried beside
+LIKELIEST_SETS = 2  # of other effects, that a random force is tried beside
 WHITENED_BESIDE = 0.2  # of unit power: what small errors of the model leave after a fit of them
 TOGETHER = 6  # iterations of errors of the nominal model beside it
 SPREAD = 0.5  # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
@@ -84,15 +84,15 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     return found, [each[0] for each in tried]
 
 
-def random_beside_singles(search: Search, singles: Sequence[Fit]) -> Decision | None:
-    """A random disturbance beside a stronger effect that leaves what looks random; None where none holds."""
+def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
+    """A random disturbance beside stronger effects that leave what looks random; None where none holds."""
     tried = []
-    for single in spread_over_kinds(singles, 1)[:BESIDE_SINGLES]:
-        evidence = search.evidence_of(apply_all(search.rig, single.effects))
-        hearing, evidence = _heard(search, single.effects, evidence)
+    for given in spread_over_kinds(found, 1)[:LIKELIEST_SETS]:
+        evidence = search.evidence_of(apply_all(search.rig, given.effects))
+        hearing, evidence = _heard(search, given.effects, evidence)
         evidence = _by_laws_on_measured_motion(hearing, evidence)
         if looks_random(evidence):
-            heard = replace(single, cost_by_channel=hearing.data.by_channel(hearing.data.residual(evidence.rig)))
+            heard = replace(given, cost_by_channel=hearing.data.by_channel(hearing.data.residual(evidence.rig)))
             tried.append(with_random(hearing, heard, evidence))
     return _likeliest(search, tried)
 

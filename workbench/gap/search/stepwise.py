@@ -345,11 +345,16 @@ class Stepwise:
 
     def _is_likelier(self, best: Step, step: Step) -> bool:
         """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
-        more = max(best.fit.n_parameters - step.fit.n_parameters, 1)
+        more, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
+        return gain > WORTHWHILE and self.search.tells_apart(1.0, float(np.exp(gain)), more)
+
+    def _gain(self, best: Step, step: Step) -> float:
+        """Twice the log-likelihood that one step has more than another, a value."""
+        if not self.search.logged:
+            return float(np.log(step.fit.cost / best.fit.cost))
         # each beside as much noise of the inputs as it leaves: where that stands for an effect it is loud
         losses = [likeliest_loss(self.search, apply_all(self.search.rig, s.fit.effects)) for s in (best, step)]
-        gain = 2.0 * (losses[1] - losses[0]) / self.search.data.n_values
-        return gain > WORTHWHILE and self.search.tells_apart(1.0, float(np.exp(gain)), more)
+        return 2.0 * (losses[1] - losses[0]) / self.search.data.n_values
 
     def _matter(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
         """Whether each of some effects of a set alters the readings by more than the tolerance, in some record."""
@@ -432,8 +437,8 @@ class Stepwise:
 
     def _tells_apart(self, best: Step, simpler: Step) -> bool:
         """Whether, where only noise is left, records surely prefer a set to a simpler one, by more than a trifle."""
-        more = best.fit.n_parameters - simpler.fit.n_parameters
-        return self.explains(best) and self.search.tells_apart(best.fit.cost, simpler.fit.cost, more)
+        more, gain = best.fit.n_parameters - simpler.fit.n_parameters, self._gain(best, simpler)
+        return self.explains(best) and self.search.tells_apart(1.0, float(np.exp(gain)), more)
 
     def _without_needless(self, step: Step) -> Step:
         """The set without effects that a later one has made needless."""
