@@ -149,6 +149,15 @@ def test_noise_is_found_beside_resonances_and_in_colours(memory):
         (20261507, "late", 0.5, ("support_rotation",)),  # four laws of one spring came before it
         (20261134, "mixed", 0.5, ("bouc_wen",)),  # passed for a stiffness that differs from record to record
         (20261150, "input", 2.0, ()),  # an error of all damping of no size
+        (20261129, "offset", 0.5, ("two_way_friction",)),  # a hysteretic spring that always slides
+        (20261135, "triple", 0.5, ("random_disturbance", "sensor_bias", "sensor_quantisation")),  # coarse rounding
+        (20261138, "shape", 1.0, ("midplane_stretching",)),  # lost to noise of the inputs, of which there is none
+        (20261154, "triple", 2.0, ("sensor_gain", "stiffness_drift", "support_rotation")),  # a gain of 27
+        (20261175, "offset", 2.0, ("support_rotation",)),  # told as a spring beside it
+        (20261180, "mixed", 2.0, ("local_stiffness_loss",)),  # told as a mass there
+        (880129, "offset", 0.5, ("actuator_bias",)),  # told as a disturbance of 3e-5 Hz
+        (880521, "input", 2.0, ()),  # errors bent to noise of the inputs
+        (881003, "triple", 0.5, ("actuator_dead_zone", "clearance", "ground_spring")),  # told as a cubic spring
     ],
 )
 def test_trials_that_were_told_wrongly_once(seed, dirt, size, kinds):
