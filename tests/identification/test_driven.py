@@ -355,3 +355,40 @@ def test_predicts_a_further_record_as_the_true_model_does(seed, n_modes, late, n
     assert found.modes.n_modes == n_modes
     error = (further.outputs - found.response(further.inputs)).std(axis=1)
     assert (error / (further.outputs - clean).std(axis=1)).max() < 1.05
+
+
+def drifting(change, seed, n=3000, snr=30.0):
+    """Two outputs of three modes driven by noise; the second frequency changes evenly over the record, step by step."""
+    rng = np.random.default_rng(seed)
+    u, y = rng.standard_normal(n), np.zeros((2, n))
+    shapes = np.array([[1.0, 0.6, 0.3], [0.5, -1.0, 0.7]])
+    for r, (hz, zeta) in enumerate(((1.3, 0.01), (4.1, 0.008), (9.7, 0.01))):
+        x = np.zeros(2)
+        for k in range(n):
+            y[:, k] += shapes[:, r] * x[0]
+            omega = 2 * np.pi * hz * (1 + change * (r == 1) * (k / (n - 1) - 0.5))
+            d = omega * np.sqrt(1 - zeta**2)
+            c, s, rest = np.cos(d * DT), np.sin(d * DT), np.array([u[k] / omega**2, 0.0])
+            a = np.array([[c + zeta * omega / d * s, s / d], [-(omega**2) / d * s, c - zeta * omega / d * s]])
+            x = np.exp(-zeta * omega * DT) * a @ (x - rest) + rest
+    y += y.std(axis=1, keepdims=True) * 10 ** (-snr / 20) * rng.standard_normal(y.shape)
+    outputs = tuple(Channel(f"y{j}", "displacement") for j in range(2))
+    return Record(DT, y, outputs, u[None], (Channel("F", "force"),), name="drifting")
+
+
+@pytest.mark.parametrize(("change", "seed"), [(0.003, 0), pytest.param(-0.008, 2, marks=pytest.mark.slow)])
+def test_a_mode_that_changes_within_the_record_is_one_mode_with_a_remark(change, seed):
+    found = identify_driven(drifting(change, seed))
+    assert found.modes.frequencies_hz == pytest.approx([1.3, 4.1, 9.7], rel=2e-3)
+    (said,) = [remark for remark in found.remarks if "change within the record" in remark]
+    by = float(said.split("mode 2 (")[1].split("about ")[1].split(" %")[0])
+    assert "mode 1" not in said and "mode 3" not in said
+    assert by == pytest.approx(100 * change, rel=0.25)
+
+
+@pytest.mark.slow
+def test_modes_that_stay_have_no_such_remark():
+    plant = system()
+    for seed in range(20):
+        for record in (measured(plant, excitation("noise", seed=seed), fraction=0.01, seed=seed), drifting(0.0, seed)):
+            assert not any("change within" in remark for remark in identify_driven(record).remarks)

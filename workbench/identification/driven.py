@@ -21,6 +21,7 @@ from workbench.identification.input_output.mode_clusters import overlap_remarks
 from workbench.identification.input_output.model_order import DECIDED, Selected, evidence_of, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.subspace_poles import subspace_poles
+from workbench.identification.input_output.time_variance import change_remarks, joined
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import (
@@ -235,8 +236,11 @@ def identify_driven(
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
+    fit = joined(data, selected.fit, budget)
+    selected = replace(selected, fit=fit, evidence=np.array([evidence_of(fit, r) for r in range(fit.poles.size)]))
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
-    return _report(records, data, selected, (*remarks, *overlap, *budget.remarks))
+    changes = () if budget.remarks else change_remarks(data, fit)
+    return _report(records, data, selected, (*remarks, *overlap, *changes, *budget.remarks))
 
 
 def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownInputs, Selected]:

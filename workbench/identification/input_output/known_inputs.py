@@ -215,6 +215,15 @@ class KnownInputs:
         """Rows of one record as samples."""
         return samples_of(rows) if self.by_line else rows
 
+    def tilted(self, rows: np.ndarray) -> np.ndarray:
+        """Columns (n_rows, k) times the time of each record, from -1/2 at its first sample to 1/2 at its last."""
+        found = []
+        for part in self.rows:
+            samples = self._samples(rows[part])
+            later = samples * np.linspace(-0.5, 0.5, len(samples))[:, None]
+            found.append(lines_of(later) if self.by_line else later)
+        return np.vstack(found)
+
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         x = np.zeros((self.values.shape[0], self.n_excitations), complex)
         for k, (record, rows) in enumerate(zip(self.records, self.rows)):
