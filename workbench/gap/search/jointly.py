@@ -197,9 +197,10 @@ def measured(search: Search, found: Fit, substeps: int = 4) -> Step:
         step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
         return Step(step, of_noise[0], search.logged, of_noise)
     residuals = whole.differences(rig)
-    by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+    with np.errstate(over="ignore", invalid="ignore"):  # of a motion that runs away
+        by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
+        sensor_noise = np.minimum(noise_found(residuals) / whole.noise, SETTINGS.credible) ** 2
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
-    sensor_noise = np.minimum(noise_found(residuals) / whole.noise, SETTINGS.credible) ** 2
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
     return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
