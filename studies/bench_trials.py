@@ -1,0 +1,66 @@
+"""How often does the diagnosis name what hides on a plate or a frame, in blind trials simulated by finite elements?
+
+Plates have any of five sets of edges; frames have two or three storeys and are known at every other node alone. Half of
+what hides in a frame at a point acts between two points.
+"""
+
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+
+from workbench.draw.trials import plot_confusion
+from workbench.trials.hold import hold_trials
+from workbench.trials.make import OUTSIDE_KINDS, draw_kinds
+from workbench.trials.scoring import tally
+
+SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 902412  # of each structure
+
+
+def trial(structure, kinds, seed):
+    """One blind trial: the score of the diagnosis, its verdict, and the processor time of it all, s."""
+    begun = process_time()
+    held = hold_trials(1, seed, kinds=[kinds], structure=structure)
+    (score,), (verdict,) = held.scores.values(), held.verdicts.values()
+    return {"score": score, "sentence": verdict["sentence"], "processor": process_time() - begun}
+
+
+def cases_on(structure, seed):
+    """The trials on plates, or on frames: what hides in each, and its seed."""
+    drawn = [kinds for kinds in draw_kinds(60, seed, structure=structure) if not set(kinds) & set(OUTSIDE_KINDS)]
+    singles, pairs = ([kinds for kinds in drawn if len(kinds) == n] for n in (1, 2))
+    each = [*singles[:SINGLES], *pairs[:PAIRS], *[()] * QUIET]
+    seeds = [*range(SINGLES), *range(13, 13 + PAIRS), *range(17, 17 + QUIET)]
+    return [{"structure": structure, "kinds": list(k), "seed": seed + i} for k, i in zip(each, seeds, strict=True)]
+
+
+def study(outcome, data: Path | None = None) -> None:
+    cases = [*cases_on("plates", SEED), *cases_on("frames", SEED + 1000)]
+    found = outcome.run(cases, trial)
+    held = [result for result in found if result.error is None]
+    for result in found:
+        where = f"{result['structure']}, seed {result['seed']}"
+        if result.error is not None:
+            outcome.say(f"{where}: {result.error}")
+        elif not result["score"]["kinds"]:
+            outcome.say(f"{where}: hidden {result['score']['hidden']}, told {result['score']['told']}")
+    outcome.table("scores", {f"{r['structure']} {r['seed']}": r["score"] for r in held})
+    for structure in ("plates", "frames"):
+        outcome.table(f"shares on {structure}", tally(r["score"] for r in held if r["structure"] == structure).shares)
+    whole = tally(r["score"] for r in held)
+    outcome.table("shares", whole.shares)
+    for family in whole.shares:
+        taken = [r["processor"] for r in held if r["score"]["family"] == family]
+        times = dict(zip(("median", "nine of ten", "longest"), np.quantile(taken, (0.5, 0.9, 1.0)), strict=True))
+        outcome.table(f"processor time of {family} cases, s", {name: round(float(t), 1) for name, t in times.items()})
+
+    outcome.check(f"trials of {len(cases)} that ended in an error", len(found) - len(held), 0)
+    for family, limit in (("single", 0.95), ("pair", 0.85)):
+        right, of = whole.shares[family]
+        outcome.check(f"{family}: share named rightly of {of}", right / of, limit, at_least=True)
+    quiet, of = whole.shares["none"]
+    outcome.check(f"false alarms in {of} cases that hide nothing", of - quiet, 0)
+    outcome.check(f"places wrong, or more than 2 % of the diagonal off, of {whole.placed}", whole.misplaced, 0)
+    outcome.figure(
+        "confusion", plot_confusion(whole), "Hidden against named effects, in blind trials on plates and frames."
+    )
