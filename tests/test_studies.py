@@ -21,7 +21,7 @@ LONG = {"blind_trials", "dirty_trials", "own_trials", "false_alarms", "many_case
 LONG |= {"local_loss", "identification_order", "identification_peers", "identification_coverage", "identification_size"}
 LONG |= {"identification_records", "diagnosis_speed", "silverbox", "patch_pairs", "emps", "f16", "frame_gap"}
 LONG |= {"placement", "ruler", "robustness_to_identification", "arm_change", "identification_ambient_peers"}
-LONG |= {"closing_the_loop", "compensation", "imsc_vs_coupled", "plate_control", "bar_identification"}
+LONG |= {"bench_trials", "closing_the_loop", "compensation", "imsc_vs_coupled", "plate_control", "bar_identification"}
 STUDIES = [
     pytest.param(path, id=path.stem, marks=[pytest.mark.slow] if path.stem in LONG else [])
     for path in sorted((ROOT / "studies").glob("*.py"))

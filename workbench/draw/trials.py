@@ -83,10 +83,11 @@ def plot_reliability(points: Sequence[Reliability]) -> Figure:
     x, y = [p.probability for p in points], [p.right for p in points]
     ax.errorbar(x, y, bars, fmt="o", color=COLOURS[0], capsize=3, label="± 2 standard deviations")
     for point in points:
-        beside = (8, -12) if point.probability < 0.7 else (-60, -12)
-        ax.annotate(f"{point.claims} claims", (point.probability, point.right), beside, textcoords="offset points")
+        beside = (8, 4) if point.probability < 0.7 else (-60, -12)
+        count = f"{point.claims} claim{'s' * (point.claims != 1)}"
+        ax.annotate(count, (point.probability, point.right), beside, textcoords="offset points")
     ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="share right")
-    ax.legend(loc="upper left", fontsize=8)
+    ax.legend(loc="lower right", fontsize=8)
     return figure
 
 

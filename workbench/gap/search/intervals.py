@@ -41,7 +41,7 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
     parameters = parameters_of(rig, found.effects)
     least = np.array([_least(found.effects[i], p) for i, p in parameters])
     level = max(float(residual @ residual) / residual.size, 1.0)
-    priors = np.array([0.0 if p.prior_std is None else 1.0 / p.prior_std**2 for _, p in parameters])
+    priors = np.array([_precision(p) for _, p in parameters])
     scale = np.sqrt(np.maximum((jacobian**2).sum(axis=0) + level * priors, 1e-300))
     jacobian, priors = jacobian / scale, priors / scale**2
     information = jacobian.T @ jacobian + level * np.diag(priors)
@@ -56,6 +56,15 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
     effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
     joint = _joint(information, information @ spread @ information, level, len(without))
     return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(least**2))
+
+
+def _precision(parameter: Parameter) -> float:
+    """What is known of a free coordinate before any record: of errors what is believed, of a place that it is one."""
+    if parameter.prior_std is not None:
+        return 1.0 / parameter.prior_std**2
+    if parameter.name in COORDINATES:  # the variance of a uniform distribution over the extent
+        return 12.0 * (parameter.scale / (parameter.high - parameter.low)) ** 2
+    return 0.0
 
 
 def _least(effect: Effect, parameter: Parameter) -> float:
