@@ -239,7 +239,7 @@ def identify_driven(
     fit = joined(data, selected.fit, budget)
     selected = replace(selected, fit=fit, evidence=np.array([evidence_of(fit, r) for r in range(fit.poles.size)]))
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
-    changes = () if budget.remarks else change_remarks(data, fit)
+    changes = () if budget.spent("check of modes that change within the record") else change_remarks(data, fit)
     return _report(records, data, selected, (*remarks, *overlap, *changes, *budget.remarks))
 
 

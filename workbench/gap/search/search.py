@@ -103,7 +103,11 @@ class Search:
 
     def tells_apart(self, better: float, cost: float, extra: int) -> bool:
         """Whether records surely prefer the lower of two costs, for `extra` more numbers, and by more than a trifle."""
-        n, gain = self.data.n_values, float(np.log(cost / better))
+        return self.pays(float(np.log(cost / better)), extra)
+
+    def pays(self, gain: float, extra: int) -> bool:
+        """The same of a gain: twice the log-likelihood, a value."""
+        n = self.data.n_values
         return gain > TRIFLE and n * gain > SURE + extra * np.log(n)
 
     def near(self, candidate: Fit, share: float) -> bool:

@@ -332,7 +332,9 @@ class Stepwise:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
         if not self._matter(best.effects, best.fit.effects):
             return False
-        if (self.search.logged or self.explains(step)) and self._is_likelier(best, step):
+        # where errors explain the records, late sensors among them, one more that is late is no effect
+        asked = self.explains(step) and not self._is_timing(best, TIMING)
+        if (self.search.logged or asked) and self._is_likelier(best, step):
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
@@ -346,7 +348,7 @@ class Stepwise:
     def _is_likelier(self, best: Step, step: Step) -> bool:
         """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
         more, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
-        return gain > WORTHWHILE and self.search.tells_apart(1.0, float(np.exp(gain)), more)
+        return gain > WORTHWHILE and self.search.pays(gain, more)
 
     def _gain(self, best: Step, step: Step) -> float:
         """Twice the log-likelihood that one step has more than another, a value."""
@@ -438,7 +440,7 @@ class Stepwise:
     def _tells_apart(self, best: Step, simpler: Step) -> bool:
         """Whether, where only noise is left, records surely prefer a set to a simpler one, by more than a trifle."""
         more, gain = best.fit.n_parameters - simpler.fit.n_parameters, self._gain(best, simpler)
-        return self.explains(best) and self.search.tells_apart(1.0, float(np.exp(gain)), more)
+        return self.explains(best) and self.search.pays(gain, more)
 
     def _without_needless(self, step: Step) -> Step:
         """The set without effects that a later one has made needless."""

@@ -1,4 +1,4 @@
-"""Modes that change within a record, with time or with the amplitude that comes and goes.
+"""Modes whose frequency changes within a record, evenly with time.
 
 A mode that remembers little of the record feels its pole as it is at the time: where λ(t) = λ + δ (t - T/2) / T,
 z(t) moves by δ (t - T/2) / T ∂z/∂λ to first order. Regressed on that, beside all that a constant model can follow, what
