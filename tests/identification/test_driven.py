@@ -387,6 +387,18 @@ def test_a_mode_that_changes_within_the_record_is_one_mode_with_a_remark(change,
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "seed", "n", "snr"),
+    [(0.02, 4, 1000, 50.0), (0.005, 3, 1500, 60.0), (0.005, 7, 3000, 60.0), (0.02, 7, 3000, 60.0)],
+)
+def test_a_change_far_above_the_noise_makes_no_further_modes(change, seed, n, snr):
+    """It did, up to the most that there may be, or poles that could not be distinguished ended the search."""
+    found = identify_driven(drifting(change, seed, n=n, snr=snr))
+    assert found.modes.frequencies_hz == pytest.approx([1.3, 4.1, 9.7], rel=6e-3)
+    assert any("mode 2" in remark and "change within the record" in remark for remark in found.remarks)
+
+
+@pytest.mark.slow
 def test_modes_that_stay_have_no_such_remark():
     plant = system()
     for seed in range(20):

@@ -12,6 +12,7 @@ from typing import Any
 import control
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import chi2
 
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
@@ -21,7 +22,7 @@ from workbench.identification.input_output.mode_clusters import overlap_remarks
 from workbench.identification.input_output.model_order import DECIDED, Selected, evidence_of, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.subspace_poles import subspace_poles
-from workbench.identification.input_output.time_variance import change_remarks, joined
+from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import (
@@ -233,13 +234,16 @@ def identify_driven(
             f" {', '.join(records[0].output_names)} rises above the noise; excite harder or longer, or look whether"
             " inputs and outputs belong together"
         )
+    data, selected, changing = _as_constant(data, selected, budget)
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
     fit = joined(data, selected.fit, budget)
-    selected = replace(selected, fit=fit, evidence=np.array([evidence_of(fit, r) for r in range(fit.poles.size)]))
+    if fit is not selected.fit:
+        selected = replace(selected, fit=fit, evidence=np.array([evidence_of(fit, r) for r in range(fit.poles.size)]))
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
-    changes = () if budget.spent("check of modes that change within the record") else change_remarks(data, fit)
+    late = budget.spent("check of modes that change within the record")
+    changes = () if late else change_remarks(data, fit, changing)
     return _report(records, data, selected, (*remarks, *overlap, *changes, *budget.remarks))
 
 
@@ -355,6 +359,28 @@ def _selected(
     return (other, fewer) if strange or other.cost(fewer.fit) - data.cost(selected.fit) <= worth else (data, selected)
 
 
+def _as_constant(
+    data: KnownInputs, selected: Selected, budget: Budget
+) -> tuple[KnownInputs, Selected, tuple[complex, ...]]:
+    """The same modes as constant ones, where the motion of modes that change was fitted beside them, and these modes.
+
+    Noise, standard errors and responses are then those of the model returned. No mode changes if, all modes being
+    known, that motion explains no more than it would of noise.
+    """
+    if not data.changing:
+        return data, selected, ()
+    plain, before = data.without_columns(), selected.fit
+    fit = settled(plain, projected(plain, before.poles, before.participation), budget=budget)
+    worth = float((((fit.residual**2).sum(axis=0) - (before.residual**2).sum(axis=0)) / before.noise**2).sum())
+    columns = (data.fixed.shape[1] - plain.fixed.shape[1]) * before.noise.size
+    changing = data.changing if worth > chi2.isf(FALSE_ALARM, columns) else ()
+    data = plain.weighted_by(plain.noise_spectrum(fit))
+    order = np.argsort(np.abs(fit.poles))
+    fit = settled(data, projected(data, fit.poles[order], fit.participation[order]), budget=budget)
+    evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
+    return data, replace(selected, fit=fit, evidence=evidence), changing
+
+
 def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) -> tuple[Selected, tuple[str, ...]]:
     """Without poles that cannot be modes, the others fitted anew, and a remark on them."""
     out: list[float] = []
@@ -388,6 +414,12 @@ def _with_noise(
 ) -> tuple[KnownInputs, Selected]:
     """Modes and noise estimated in turn until both stay the same; `once` is how `selected` was selected."""
     for _ in range(LEARNT):
+        changing = beside_changing(data, selected.fit, budget)
+        if changing is not None:
+            fewer = select_modes(changing[0], start=changing[1], **once)
+            # Modes that are truly close fit better than one that changes.
+            if changing[0].cost(fewer.fit) < data.cost(selected.fit):
+                data, selected = changing[0], fewer
         line_std = data.noise_spectrum(selected.fit)
         if alike(line_std, data.line_std) and not (selected.full and once["most_modes"] < how["most_modes"]):
             break

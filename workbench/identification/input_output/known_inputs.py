@@ -24,6 +24,7 @@ import numpy as np
 from scipy.fft import next_fast_len
 from scipy.signal import lfilter
 
+from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
@@ -48,6 +49,8 @@ class KnownInputs:
         any_fraction: whether each input acts later than that by any fraction of a sample, which stays unknown: then
             each has two columns of its own, that of its delay and that a sample later.
         line_std: relative noise of each line, one (n_rows, n_outputs) a record, of unit rms over all.
+        beside: (n_samples, n_columns) of all records, fixed columns beside those of the inputs and the constants.
+        changing: poles of the modes that move along these.
     """
 
     def __init__(
@@ -60,6 +63,8 @@ class KnownInputs:
         delays: np.ndarray | None = None,
         any_fraction: bool = False,
         line_std: Sequence[np.ndarray] | None = None,
+        beside: Floats | None = None,
+        changing: tuple[complex, ...] = (),
     ) -> None:
         self.records, self.at_rest, self.straight, self.may_feel = records, at_rest, straight, feedthrough
         self.dt, self.places = records[0].sample_time, records[0].positions
@@ -86,7 +91,12 @@ class KnownInputs:
         self.n_inputs = records[0].n_inputs
         self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
         self.feedthrough = (feedthrough or any_fraction) and not _flat(direct)
-        self.fixed = self._rows(np.hstack([direct, constant]) if self.feedthrough else constant)
+        self.beside, self.changing = beside, changing
+        fixed = [direct, constant] if self.feedthrough else [constant]
+        if beside is not None:
+            starts = np.cumsum([0, *(record.n_samples for record in records)])
+            fixed.append(np.vstack([beside[a + self.first : b] for a, b in zip(starts, starts[1:])]))
+        self.fixed = self._rows(np.hstack(fixed))
         self.resolution = 2.0 * np.pi / (max(lengths) * self.dt)
         self.highest = np.pi / self.dt
         self.size = next_fast_len(2 * max(lengths))
@@ -97,27 +107,40 @@ class KnownInputs:
 
     def weighted_by(self, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
         """The same records with lines weighted by their noise; with None, samples of equal weight."""
-        return self._with(self.delays, self.any_fraction, line_std)
+        return self._with(line_std=line_std)
+
+    def with_columns(self, rows: Floats, changing: tuple[complex, ...]) -> "KnownInputs":
+        """The same records with fixed columns of modes that change, (n_rows, n_columns) as the fit sees rows."""
+        before = np.zeros((self.first, rows.shape[1]))
+        samples = np.vstack([piece for part in self.rows for piece in (before, self._samples(rows[part]))])
+        beside = samples if self.beside is None else np.hstack([self.beside, samples])
+        return self._with(beside=beside, changing=(*self.changing, *changing))
+
+    def without_columns(self) -> "KnownInputs":
+        """The same records without further fixed columns."""
+        return self._with(beside=None, changing=())
 
     def delayed_by(self, delays: np.ndarray, any_fraction: bool = False) -> "KnownInputs":
         """The same records with inputs that act late by these delays, samples; lines weighted as before."""
-        found = self._with(delays, any_fraction, None)
+        found = self._with(delays=delays, any_fraction=any_fraction, line_std=None)
         if self.line_std is None:
             return found
         # Fewer or more rows: each line has the noise of the one at its frequency.
         lengths = [rows.stop - rows.start for rows in found.rows]
         return found.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
 
-    def _with(self, delays: np.ndarray, any_fraction: bool, line_std: Sequence[np.ndarray] | None) -> "KnownInputs":
-        return KnownInputs(
-            self.records,
-            at_rest=self.at_rest,
-            straight=self.straight,
-            feedthrough=self.may_feel,
-            delays=delays,
-            any_fraction=any_fraction,
-            line_std=line_std,
-        )
+    def _with(self, **changed: Any) -> "KnownInputs":
+        same = {
+            "at_rest": self.at_rest,
+            "straight": self.straight,
+            "feedthrough": self.may_feel,
+            "delays": self.delays,
+            "any_fraction": self.any_fraction,
+            "line_std": self.line_std,
+            "beside": self.beside,
+            "changing": self.changing,
+        }
+        return KnownInputs(self.records, **{**same, **changed})
 
     def noise(self, fit: Fit) -> np.ndarray:
         """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
@@ -215,14 +238,24 @@ class KnownInputs:
         """Rows of one record as samples."""
         return samples_of(rows) if self.by_line else rows
 
-    def tilted(self, rows: np.ndarray) -> np.ndarray:
-        """Columns (n_rows, k) times the time of each record, from -1/2 at its first sample to 1/2 at its last."""
+    def modulated(self, rows: Floats, factor: Floats) -> Floats:
+        """Columns (n_rows, k) times a factor at each sample, (n_samples,) of all records."""
         found = []
         for part in self.rows:
-            samples = self._samples(rows[part])
-            later = samples * np.linspace(-0.5, 0.5, len(samples))[:, None]
-            found.append(lines_of(later) if self.by_line else later)
+            samples = self._samples(rows[part]) * factor[part, None]
+            found.append(lines_of(samples) if self.by_line else samples)
         return np.vstack(found)
+
+    @property
+    def time(self) -> Floats:
+        """Of each sample in its record, from -1/2 at the first to 1/2 at the last, (n_samples,)."""
+        return np.concatenate([np.linspace(-0.5, 0.5, part.stop - part.start) for part in self.rows])
+
+    def power(self, pole: complex, l_r: np.ndarray) -> Floats:
+        """|z|² of a mode at each sample, over its largest, (n_samples,)."""
+        z = np.column_stack(self._modal_coordinate(pole, l_r))
+        squares = np.concatenate([(self._samples(z[part]) ** 2).sum(axis=1) for part in self.rows])
+        return np.asarray(squares / max(squares.max(), 1e-300))
 
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         x = np.zeros((self.values.shape[0], self.n_excitations), complex)

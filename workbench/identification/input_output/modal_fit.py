@@ -26,6 +26,8 @@ NEGLIGIBLE = 1e-6
 ROUND_OFF = 1e-26
 # Nepers over a record: no pole is searched that grows faster.
 MOST_GROWTH = 20.0
+# Participation factor over that held at one: factors that run apart without end are no mode's, and overflow.
+MOST_UNLIKE = 1e20
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -234,6 +236,8 @@ class _OutputError:
         highest, fastest = self.data.highest, self.data.highest / np.pi
         growing = poles.real > MOST_GROWTH * self.data.resolution / (2.0 * np.pi)
         if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest) | growing).any():
+            return None, step
+        if not (np.abs(participation) < MOST_UNLIKE).all():
             return None, step
         try:
             return projected(self.data, poles, participation), step

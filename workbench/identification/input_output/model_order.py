@@ -325,5 +325,8 @@ def whole_evidence_of(fit: Fit) -> np.ndarray:
                 spread[:, j, :, j] += own * fit.noise[j] ** 2
             first += part.residual.shape[1]
         c = amplitudes[:, r].ravel()
-        found[r] = c @ np.linalg.solve(spread.reshape(size, size), c)
+        spread = spread.reshape(size, size)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))
+        # Modes that are all but alike leave it singular.
+        found[r] = c * scale @ np.linalg.pinv(spread * np.outer(scale, scale), hermitian=True) @ (c * scale)
     return found

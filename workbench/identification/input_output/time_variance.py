@@ -1,8 +1,12 @@
-"""Modes whose frequency changes within a record, evenly with time.
+"""Modes that change within a record.
 
 A mode that remembers little of the record feels its pole as it is at the time: where λ(t) = λ + δ (t - T/2) / T,
 z(t) moves by δ (t - T/2) / T ∂z/∂λ to first order. Regressed on that, beside all that a constant model can follow, what
 the model leaves tells δ of every mode, with its standard error.
+
+A change far above the noise is not small to first order, nor always even with time, and other modes stand for it. Its
+motion is then near ∂z/∂λ at frequencies about its own, times low powers of time and of |z|²; the modes are searched
+beside these columns.
 """
 
 from typing import NamedTuple
@@ -19,6 +23,10 @@ SURE = 5.0  # standard errors that a change must have
 NEAR, ALIKE = 3.0, 0.9  # half-power bandwidths apart, and modal assurance, of modes that may be one
 INSTEAD = 0.5  # of what a second mode explains that a change of the first must explain in its place
 MATTERS = 0.1  # of the half-power bandwidth: a smaller change harms no model
+REACH, FAINT = 0.15, 0.2  # of the frequency, and of the evidence, of a mode that may stand for the change of another
+STEPS_ASIDE = (-1.0, 0.0, 1.0)  # half-power half-widths from the frequency of a mode at which it may be found
+STEPS = 12  # of a fit that only decides
+COLLINEAR = 1e-4  # singular value over which columns of unit length count
 FADED = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
 
 
@@ -40,16 +48,15 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     n, poles = fit.poles.size, fit.poles
     phi, t = columns(data, poles, fit.participation)
     slopes = [data.slopes(pole, l_r) for pole, l_r in zip(poles, fit.participation, strict=True)]
-    real, imaginary = (data.tilted(np.column_stack([s[k] for s in slopes])) for k in (0, 1))
+    real, imaginary = (data.modulated(np.column_stack([s[k] for s in slopes]), data.time) for k in (0, 1))
     basis = np.hstack([phi, t])
     basis = basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-300)
     products, along = np.zeros((2 * n, 2 * n)), np.zeros(2 * n)
     each = zip(fit.amplitudes, fit.noise, fit.residual.T, strict=True)
-    q = np.linalg.qr(basis)[0]
+    alike = np.linalg.qr(basis)[0] if data.weights is None else None
     for j, (a, noise, left) in enumerate(each):
         weight = 1.0 if data.weights is None else data.weights[:, j : j + 1]
-        if data.weights is not None:
-            q = np.linalg.qr(weight * basis)[0]
+        q = np.linalg.qr(weight * basis)[0] if alike is None else alike
         moved = weight * np.hstack([a.real * real - a.imag * imaginary, -a.real * imaginary - a.imag * real])
         moved = (moved - q @ (q.T @ moved)) / noise
         products += moved.T @ moved
@@ -79,29 +86,101 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
     return fit
 
 
+def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit] | None:
+    """The records with what changing modes move as further columns, and the fit without the modes that stood for it.
+
+    A change that is not small makes many modes beside one. Where they go, and the one is found to change, its motion at
+    frequencies about its own, times powers of the time and of its amplitude, follows the change whatever its course.
+    None where no mode is so.
+    """
+    if fit.amplitudes.shape[0] * data.n_inputs == 1:
+        return None  # one signal does not tell whether shapes are alike
+    strength = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
+    alike = _assurance(fit.amplitudes) * _assurance(fit.participation[:, : data.n_inputs].T) > ALIKE
+    beside: list[Floats] = []
+    changing: list[complex] = []
+    out = np.zeros(fit.poles.size, bool)
+    for r in np.argsort(-strength):
+        weak = strength < FAINT * strength[r]
+        near = np.abs(fit.poles.imag - fit.poles.imag[r]) < REACH * np.abs(fit.poles.imag[r])
+        others = np.flatnonzero(weak & near & alike[r] & ~out)
+        if out[r] or not others.size or budget.spent("check of modes that change within the record"):
+            continue
+        kept = np.delete(np.arange(fit.poles.size), others)
+        one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), STEPS, budget)
+        at = int(np.searchsorted(kept, r))
+        moved = _motion(data, one.poles[at], one.participation[at])
+        worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / fit.noise**2).sum())
+        phi = columns(data, one.poles, one.participation)[0]
+        if _explained(data, one, phi, moved, fit.noise) > INSTEAD * worth:
+            beside.append(moved)
+            changing.append(complex(one.poles[at]))
+            out[others] = True
+    if not beside:
+        return None
+    kept = np.flatnonzero(~out)
+    data = data.with_columns(_independent(np.hstack(beside)), tuple(changing))
+    return data, projected(data, fit.poles[kept], fit.participation[kept])
+
+
+def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:
+    """Orthonormal columns (n_rows, n_columns) that a mode moves along where it changes, beside those there are."""
+    power, time = data.power(pole, participation), data.time
+    found = []
+    for k in STEPS_ASIDE:
+        slopes = np.column_stack(data.slopes(pole + 1j * k * abs(pole.real), participation))
+        found += [data.modulated(slopes, factor) for factor in (time, time**2, time**3, power, power**2, power * time)]
+    moved = np.hstack(found)
+    moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
+    q = np.linalg.qr(data.fixed)[0]
+    return _independent(moved - q @ (q.T @ moved))
+
+
+def _independent(rows: Floats) -> Floats:
+    """Orthonormal columns that span those of a matrix but for what is collinear."""
+    u, s, _ = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(u[:, s > COLLINEAR])
+
+
+def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise: Floats) -> float:
+    """χ² by which further columns lower the misfit of a fit with columns Φ."""
+    found = 0.0
+    for j in range(noise.size):
+        weight = 1.0 if data.weights is None else data.weights[:, j : j + 1]
+        q = np.linalg.qr(weight * np.hstack([phi, further]))[0]
+        found += float(((q.T @ fit.residual[:, j]) ** 2).sum() / noise[j] ** 2)
+    return found
+
+
+def _assurance(vectors: np.ndarray) -> Floats:
+    """Modal assurance of columns among themselves, (n_modes, n_modes)."""
+    shapes = vectors / np.maximum(np.linalg.norm(vectors, axis=0), 1e-300)
+    return np.asarray(np.abs(shapes.conj().T @ shapes) ** 2)
+
+
 def _pairs(fit: Fit) -> list[tuple[int, int]]:
     """Modes near each other with shapes alike, the nearest first."""
-    poles, shapes = fit.poles, fit.amplitudes
-    size = np.maximum(np.linalg.norm(shapes, axis=0), 1e-300)
-    alike = np.abs((shapes / size).conj().T @ (shapes / size)) ** 2 > ALIKE
+    poles, alike = fit.poles, _assurance(fit.amplitudes) > ALIKE
     apart = np.abs(np.subtract.outer(poles.imag, poles.imag))
     near = apart < NEAR * np.add.outer(np.abs(poles.real), np.abs(poles.real))
     both = zip(*np.nonzero(np.triu(alike & near, 1)), strict=True)
     return sorted(((int(r), int(s)) for r, s in both), key=lambda pair: apart[pair])
 
 
-def change_remarks(data: KnownInputs, fit: Fit) -> tuple[str, ...]:
-    """A remark on the modes that change within a record."""
+def change_remarks(data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()) -> tuple[str, ...]:
+    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way."""
     if not fit.poles.size:
         return ()
     change = changes_in_time(data, fit)
-    words = [
-        f"mode {r + 1} ({np.abs(fit.poles[r]) / (2.0 * np.pi):.4g} Hz) by about {100 * change.frequency[r]:+.1g} %"
-        for r in np.flatnonzero(change.sure)
-    ]
-    if not words:
-        return ()
-    return (
-        f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; such a mode is the"
-        " mean of what it was: identify parts of the record, or levels one by one",
-    )
+    names = [f"mode {r + 1} ({np.abs(pole) / (2.0 * np.pi):.4g} Hz)" for r, pole in enumerate(fit.poles)]
+    sure = change.sure & (np.abs(change.frequency) < REACH)
+    words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure)]
+    others = sorted({names[r] for pole in changing if not sure[r := int(np.argmin(np.abs(fit.poles - pole)))]})
+    end = "such a mode is the mean of what it was: identify parts of the record, or levels one by one"
+    remarks = []
+    if words:
+        evenly = f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; {end}"
+        remarks.append(evenly)
+    if others:
+        remarks.append(f"modes change within the record, with their amplitude say: {', '.join(others)}; {end}")
+    return tuple(remarks)
