@@ -21,7 +21,7 @@ from workbench.robust.posterior import UncertainRig
 from workbench.robust.prediction import predict_loop
 from workbench.robust.redesign import force_weight, redesign
 from workbench.trials.controlled import control_plant
-from workbench.trials.make import make_trial_with_plant
+from workbench.trials.make import find_trial_with_plant
 
 PLANTS, SEED = 100, 20262
 SEARCHED = 3  # of these by the whole search; the others are told the kinds, as the blind trials name nearly all
@@ -46,7 +46,7 @@ def plant(index, seed, searched=False):
     if index % 3 == 2:
         other = str(rng.choice([k for k in KINDS if k.split("_")[0] != kinds[0].split("_")[0]]))
         kinds.append(other)
-    case, label, real = _made(rng, kinds, DIRT[index % len(DIRT)])
+    case, label, real = find_trial_with_plant(rng, kinds=kinds, dirt=DIRT[index % len(DIRT)], size=0.5)
     true = tuple(_effect(told) for told in label["effects"])
     rig = case.rig
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
@@ -86,7 +86,7 @@ def plant(index, seed, searched=False):
             "effort": run.effort,
             "cost": 2.0 * run.vibration + weight * run.effort,
             "peak force": run.peak_force,
-            "settling": _settling(run),
+            "settling": run.settling(),
         }
         if name == "redesigned":
             told["inside the bands"] = _inside(possible, noise, controller, test, run)
@@ -110,15 +110,6 @@ def _inside(possible, noise, controller, test, run):
         return None
     told = predict_loop(possible, controller, test, noise_std=noise, draws=PREDICTED, seed=1)
     return float(told.coverage(run.outputs)[:, 0].mean())
-
-
-def _made(rng, kinds, dirt):
-    for _ in range(20):
-        try:
-            return make_trial_with_plant(int(rng.integers(2**31)), kinds=kinds, dirt=dirt, size=0.5)
-        except ValueError:
-            continue
-    raise ValueError(f"no bench shows {' and '.join(kinds)}")
 
 
 def _effect(told):
@@ -160,12 +151,6 @@ def _beside(effect, rig, off):
         factor = off if p.name not in ("at", "gap") else 1.0 + 0.1 * (off - 1.0)
         values[p.name] = float(np.clip(factor * values[p.name], p.low, p.high))
     return replace(effect, values=values)
-
-
-def _settling(run):
-    above = np.flatnonzero(run.energy > 0.01 * run.energy.max())
-    settled = run.bounded and above[-1] < run.energy.size - 1
-    return float(run.sample_time * (above[-1] + 1)) if settled else None
 
 
 def study(outcome, data: Path | None = None) -> None:

@@ -18,7 +18,7 @@ from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.redesign import redesign
 from workbench.trials.controlled import control_plant
-from workbench.trials.make import make_trial_with_plant
+from workbench.trials.make import find_trial_with_plant
 
 PLANTS, SEED = 30, 20265
 DIRT = ("clean", "offset")
@@ -30,7 +30,6 @@ EFFECTS = {
     "dead zone": ("actuator_dead_zone", "width", "dead_zone"),
     "saturation": ("actuator_saturation", "limit", "limit"),
 }  # its kind, its parameter, and what it is of an actuator
-SETTLED = 0.01  # of the largest energy of the controlled modes
 LOST = 0.02  # of the settling time: a plant that loses less has nothing to win back
 HALF, DEARER = 0.5, 1.05  # of what is lost; times the effort without the effect
 
@@ -38,7 +37,7 @@ HALF, DEARER = 0.5, 1.05  # of what is lost; times the effort without the effect
 def plant(index, seed):
     """One hidden plant without any effect, and with each in turn under the present and the redesigned controller."""
     rng = np.random.default_rng([seed, index])
-    case, real = _made(rng, DIRT[index // len(LAWS) % len(DIRT)])
+    case, _, real = find_trial_with_plant(rng, dirt=DIRT[index // len(LAWS) % len(DIRT)], size=0.5)
     rig = case.rig
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
     test = impulse_test(rig, range(CONTROLLED), case.fit[0].sample_time, level=level, seed=index)
@@ -68,17 +67,6 @@ def plant(index, seed):
     return told
 
 
-def _made(rng, dirt):
-    """A case that hides no effect, and its plant."""
-    for _ in range(20):
-        try:
-            case, _, real = make_trial_with_plant(int(rng.integers(2**31)), kinds=(), dirt=dirt, size=0.5)
-            return case, real
-        except ValueError:
-            continue
-    raise ValueError(f"no bench of {dirt} records")
-
-
 def _sizes(case, peak):
     low = next(r for r in case.fit if r.name == "low")
     commanded = [i for i, a in enumerate(case.rig.actuators) if not a.direct]
@@ -94,12 +82,9 @@ def _with_effect(real, name, size):
 
 
 def _figures(run):
-    own = run.modal_energy[:CONTROLLED].sum(axis=0)
-    above = np.flatnonzero(own > SETTLED * own.max())
-    settles = run.bounded and above[-1] < own.size - 1
     return {
         "stable": run.stable,
-        "settling": float(run.sample_time * (above[-1] + 1)) if settles else None,
+        "settling": run.settling(CONTROLLED),
         "vibration": run.vibration,
         "effort": run.effort,
         "peak force": run.peak_force,

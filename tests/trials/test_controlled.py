@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
@@ -12,7 +13,7 @@ from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
-from workbench.trials.controlled import control_plant
+from workbench.trials.controlled import Controlled, control_plant
 from workbench.trials.plant import Plant
 
 DT = 0.01
@@ -48,3 +49,20 @@ def test_two_numerical_routes_agree_on_a_controlled_structure(hinged_beam, drive
     if drive == "plain":
         assert found.peak_force == pytest.approx(np.abs(expected.response.forces).max(), rel=0.05)
         assert found.effort == pytest.approx(expected.effort, rel=0.02)
+
+
+@pytest.mark.parametrize("modes", [1, 2, None])
+def test_a_loop_settles_when_its_energy_stays_below_a_hundredth_of_its_peak(modes):
+    # the second mode holds little and decays slowly: it is what is left in the end
+    def energies(time):
+        return np.array([np.exp(-2.0 * time), 0.05 * np.exp(-0.5 * time)])
+
+    run = Controlled(energies(DT * np.arange(1000)), np.zeros(2), 0.0, 0.0, True, DT, np.zeros((1, 1000)))
+    peak = energies(0.0)[:modes].sum()
+    settled = brentq(lambda time: energies(time)[:modes].sum() - 0.01 * peak, 0.0, 10.0)
+    assert settled <= run.settling(modes) <= settled + 1.01 * DT
+
+
+def test_a_loop_that_still_swings_when_the_test_ends_has_no_settling_time():
+    energy = np.ones((1, 100))
+    assert Controlled(energy, np.zeros(1), 0.0, 0.0, True, DT, np.zeros((1, 100))).settling() is None

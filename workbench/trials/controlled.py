@@ -10,6 +10,7 @@ from workbench.trials import motion
 from workbench.trials.plant import FINEST, SolvedPlant, sensor_noise
 
 RUN_AWAY = 1e6  # times the energy that the impulse gives
+SETTLED = 0.01  # of the largest energy: what a settled loop stays below
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +50,17 @@ class Controlled:
         """Whether the motion stayed, and its last quarter holds less energy than its first."""
         quarter = max(self.energy.size // 4, 1)
         return self.bounded and bool(self.energy[-quarter:].max() < self.energy[:quarter].max())
+
+    def settling(self, modes: int | None = None) -> float | None:
+        """Time until the energy stays below a hundredth of its peak, s; None where it does not within the test.
+
+        Args:
+            modes: number of modes whose energy counts, lowest first; all unless given.
+        """
+        energy = self.modal_energy[:modes].sum(axis=0)
+        above = np.flatnonzero(energy > SETTLED * energy.max())
+        settles = self.bounded and above[-1] < energy.size - 1
+        return float(self.sample_time * (above[-1] + 1)) if settles else None
 
 
 def control_plant(
@@ -95,16 +107,8 @@ def control_plant(
     for k in range(n_samples):
         energy[:, k] = 0.5 * (y[n : 2 * n] ** 2 + omega2 * y[:n] ** 2)
         if not energy[:, k].sum() < RUN_AWAY * given:
-            given_up = (
-                energy[:, : k + 1],
-                sums[2],
-                float(sums[1].sum()),
-                float(sums[3].max()),
-                False,
-                dt,
-                outputs[:, :k],
-            )
-            return Controlled(*given_up)
+            effort, most_force = float(sums[1].sum()), float(sums[3].max())
+            return Controlled(energy[:, : k + 1], sums[2], effort, most_force, False, dt, outputs[:, :k])
         outputs[:, k] = reading.at(k, y, pieces)
         command, followed, z = controller.step(z, followed, outputs[:, k])
         commands = np.zeros(m)

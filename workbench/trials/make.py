@@ -25,7 +25,7 @@ from workbench.trials.scene import Scene, Unsuitable, extent
 NONE, UNKNOWN = "none", "unknown"
 KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
-MOST_BENCHES, MOST_DRAWS = 40, 8
+MOST_BENCHES, MOST_DRAWS, SEEDS_TRIED = 40, 8, 20
 VISIBLE = 0.02
 SEEN = 0.03  # each effect of several must alter the response by this much beside the others
 DISTINCT = 0.1  # of the noise: what tells an effect from its limiting case must alter the readings by this much
@@ -119,6 +119,22 @@ def make_trial_with_plant(
         except Unsuitable as error:
             reason = str(error)
     raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
+
+
+def find_trial_with_plant(
+    rng: np.random.Generator, *, kinds: Sequence[str] = (), dirt: str = CLEAN, size: float = 1.0
+) -> tuple[Case, dict[str, Any], SolvedPlant]:
+    """The first of `SEEDS_TRIED` seeds whose benches show the kinds, as `make_trial_with_plant` has it.
+
+    Raises:
+        ValueError: no bench of these seeds shows them.
+    """
+    for _ in range(SEEDS_TRIED):
+        try:
+            return make_trial_with_plant(int(rng.integers(2**31)), kinds=kinds, dirt=dirt, size=size)
+        except ValueError as error:
+            reason = error
+    raise reason
 
 
 def _draw_effects(

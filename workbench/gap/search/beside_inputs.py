@@ -28,12 +28,14 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
     heard = [likeliest_share(rig, s.data, left) for s in (search, found)]
     (share, _), louder = min(zip(heard, (search, found), strict=True), key=lambda each: each[0].loss)
     beside = louder.beside_inputs(rig, share)
+    if share < LEAST_LOGGED:
+        return None
     white = measured(beside, fitted).fit
     if WHITE < white.cost < BENT * fitted.cost:
         fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
         left = search.data.differences(rig)
-    if share < LEAST_LOGGED or white.cost > WHITE:
+    if white.cost > WHITE:
         return None
     for _ in range(HEARINGS):  # each sensor's noise by the power of its innovations
         louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
