@@ -16,7 +16,7 @@ from workbench.gap.effects.effect import (
     place_parameters,
     place_values,
 )
-from workbench.gap.effects.nonlinear import CUBIC_SPRING, QUADRATIC_DAMPER, strength_along, with_element
+from workbench.gap.effects.nonlinear import CUBIC_SPRING, QUADRATIC_DAMPER, with_element
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import EvenSpring, PowerDamper, PowerSpring
 
@@ -37,7 +37,7 @@ def _power_law(element: type, name: str, motion: str, words: str, *, even: bool 
             rms = float(np.sqrt(np.mean(path**2)))
             for exponent in EXPONENTS if rms > 0 else ():
                 basis = (1.0 if even else np.sign(path)) * np.abs(path / rms) ** exponent
-                force = strength_along(place.force, basis)
+                force = place.strength_along(basis)
                 yield {**place_values(place.at), "force_at_rms": force, "exponent": exponent, "rms": rms}
 
     return Kind(

@@ -44,11 +44,6 @@ def with_element(rig: Rig, element: Element) -> Rig:
     return replace(rig, elements=(*rig.elements, element))
 
 
-def strength_along(force: np.ndarray, basis: np.ndarray) -> float:
-    """The k for which -k basis is nearest to a force."""
-    return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
-
-
 def _stiffness(name: str, rig: Rig) -> Parameter:
     unit = Scales.of(rig).stiffness
     return Parameter(name, "N/m", LEAST * unit, MOST * unit, logarithmic=True, neutral=0.0)
@@ -74,7 +69,7 @@ def _distance(name: str, rig: Rig) -> Parameter:
 
 def _cubic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
-        k = strength_along(place.force, place.displacement**3)
+        k = place.strength_along(place.displacement**3)
         for share in (0.3, 1.0, 3.0):
             yield {**place_values(place.at), "stiffness": share * k}
             if share == 1.0:
@@ -179,7 +174,7 @@ def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[di
             levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
             for gap in levels:
                 over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
-                k = strength_along(place.force, over)
+                k = place.strength_along(over)
                 if k > 0:
                     yield {**place_values(place.at), "stiffness": k, "gap": float(gap)}
                     yield {**place_values(place.at), "stiffness": 4 * k, "gap": float(gap)}
@@ -222,7 +217,7 @@ def _friction_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         speed = float(np.sqrt(np.mean(place.velocity**2)))
         for share in (0.02, 0.1, 0.3):
-            force = strength_along(place.force, np.tanh(place.velocity / (share * speed)))
+            force = place.strength_along(np.tanh(place.velocity / (share * speed)))
             if force > 0:
                 yield {**place_values(place.at), "force": force, "smoothing_speed": share * speed}
                 yield {**place_values(place.at), "force": 2 * force, "smoothing_speed": share * speed}
@@ -289,7 +284,7 @@ def _bouc_wen_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks[:most]:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0):
-            k = strength_along(place.force, hysteresis(place.displacement, share * size))
+            k = place.strength_along(hysteresis(place.displacement, share * size))
             if k > 0:
                 yield {**place_values(place.at), "stiffness": k, "yield_displacement": share * size}
                 yield {**place_values(place.at), "stiffness": 2 * k, "yield_displacement": share * size}
@@ -325,7 +320,7 @@ def _slip_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
         size = float(np.sqrt(np.mean(place.displacement**2)))
         for share in (0.03, 0.1, 0.3, 1.0, 3.0) if isinstance(place.at, Between) else ():
-            k = -strength_along(place.force, place.displacement - hysteresis(place.displacement, share * size))
+            k = -place.strength_along(place.displacement - hysteresis(place.displacement, share * size))
             for part in (0.5, 1.0) if k > 0 else ():
                 yield {**place_values(place.at), "stiffness": part * k, "yield_displacement": share * size}
 
@@ -411,7 +406,7 @@ TWO_WAY_FRICTION = Kind(
 
 def _quadratic_starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
     for place in evidence.at_peaks:
-        c = strength_along(place.force, np.abs(place.velocity) * place.velocity)
+        c = place.strength_along(np.abs(place.velocity) * place.velocity)
         for share in (0.4, 1.0, 2.5) if c > 0 else ():
             yield {**place_values(place.at), "coefficient": share * c}
 

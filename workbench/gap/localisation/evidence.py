@@ -44,6 +44,7 @@ class Place:
         at: on the structure.
         force: (n_total,) N.
         displacement, velocity, acceleration: (n_total,) there, of the real structure as far as the records tell.
+        bent: whether errors of the model may have taken linear parts of the force.
     """
 
     at: Where
@@ -51,6 +52,20 @@ class Place:
     displacement: np.ndarray
     velocity: np.ndarray
     acceleration: np.ndarray
+    bent: bool = False
+
+    def strength_along(self, basis: np.ndarray) -> float:
+        """The k for which -k basis (n_total,) is nearest to the force, beside any linear force where that is bent."""
+        force = self.force
+        if self.bent:
+            force, basis = (each - self._linear @ (self._linear.T @ each) for each in (force, basis))
+        return float(-np.dot(force, basis) / max(np.dot(basis, basis), 1e-300))
+
+    @cached_property
+    def _linear(self) -> np.ndarray:
+        """Orthonormal columns (n_total, 3) that span what errors of stiffness, damping and mass do here."""
+        motion = np.column_stack([self.displacement, self.velocity, self.acceleration])
+        return np.asarray(np.linalg.qr(motion)[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +81,7 @@ class Evidence:
         given_places: places of the force, where they are known from elsewhere.
         given_size: its rms, N, and correlation time, in samples, likewise.
         workers: processes that share the work.
+        bent: whether errors of the model were fitted to the records, which may have taken linear parts of the force.
     """
 
     rig: Rig
@@ -76,12 +92,15 @@ class Evidence:
     given_places: tuple[Where, ...] = ()
     given_size: tuple[float, float] | None = None
     workers: Workers = ALONE
+    bent: bool = False
 
     @classmethod
-    def of(cls, rig: Rig, data: FitData, n_places: int = PLACES, workers: Workers = ALONE) -> "Evidence":
+    def of(
+        cls, rig: Rig, data: FitData, n_places: int = PLACES, workers: Workers = ALONE, *, bent: bool = False
+    ) -> "Evidence":
         """Simulate the rig on the fit records."""
         motions = data.motions(rig)
-        return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers)
+        return cls(rig, data, motions, tuple(data.differences(rig)), n_places, workers=workers, bent=bent)
 
     def without(self, names: Collection[str]) -> "Evidence":
         """The same evidence without some of the sensors; with all of them where none would be left."""
@@ -278,7 +297,7 @@ class Evidence:
                     shape @ (motion.acceleration + error_a) + shape @ shape * force,
                 )
             )
-        return Place(where, *(np.concatenate(series) for series in zip(*pieces, strict=True)))
+        return Place(where, *(np.concatenate(series) for series in zip(*pieces, strict=True)), bent=self.bent)
 
 
 def _apart(

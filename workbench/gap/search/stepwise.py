@@ -7,13 +7,13 @@ from functools import cached_property
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all, key_of
-from workbench.gap.effects.limiting_cases import contained, each_left_out, simpler_sets
+from workbench.gap.effects.limiting_cases import contained, each_left_out, simpler_sets, wider_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
-from workbench.gap.search.fit import Fit, fit, slopes
+from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import SETTINGS as JOINTLY
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.outcome import Decision
@@ -165,7 +165,10 @@ class Stepwise:
             if step is None:
                 break
             self.steps.append(step)
+            heard = self.search.logged
             self._hear_inputs(step)
+            if heard and not self.search.logged:  # what stood beside a noise that is none stands anew
+                self.steps[-1] = self._chosen_again(replace(self.last, others=step.others))
             self.steps.append(self._without_needless(self.last))
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
                 break
@@ -282,13 +285,14 @@ class Stepwise:
         rig = apply_all(search.rig, step.fit.effects)
         residual = beside.ahead.residual(rig)
         left = float(residual @ residual) / residual.size
-        evidence = Evidence.of(rig, search.data, workers=search.workers)
+        evidence = Evidence.of(rig, search.data, workers=search.workers, bent=True)
         ahead = one_more(beside, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - SETTINGS.ahead) * left:
             return None
         ahead = spread_over_kinds(ahead, 1)
         enough = left - SETTINGS.promising * (left - ahead[0].cost)
         chosen = [f.effects for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
+        chosen += wider_sets(step.effects)
         tried = self._fitted(chosen, step, self._slopes(step))
         sided = self._on_the_other_side(step, tried)
         if sided is not None:
@@ -321,12 +325,25 @@ class Stepwise:
         """The best on whole records of sets fitted to the most telling ones."""
         # and of what was found before errors could bend to it
         alone = [] if step.effects else self._alone
-        tried = sorted((s for s in tried if not self._is_timing(s)), key=lambda s: s.fit.cost)
+        tried = sorted((s for s in tried if not self._is_timing(s)), key=self._loss)
         near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
-        whole = sorted((*map(self._whole, near), *alone), key=lambda s: s.fit.cost)
-        if not whole:
-            return step
-        return replace(self._simplest(whole[0], whole[1:]), others=tuple(whole))
+        whole = sorted((*(self._without_idle(self._whole(s)) for s in near), *alone), key=self._loss)
+        return self._simplest_of(whole) if whole else step
+
+    def _simplest_of(self, sets: Sequence[Step]) -> Step:
+        """The simplest of sets that are as good as the first of them, the best."""
+        return replace(self._simplest(sets[0], sets[1:]), others=tuple(sets))
+
+    def _chosen_again(self, step: Step) -> Step:
+        """The best of the sets that a step was chosen from, in another search."""
+        others = [self._whole(s) for s in step.others if key_of(s.effects) != key_of(step.effects)]
+        return self._simplest_of(sorted((step, *others), key=self._loss))
+
+    def _loss(self, step: Step) -> float:
+        """What sets of a search are compared by, the less the better."""
+        if not self.search.logged:
+            return step.fit.cost
+        return likeliest_loss(self.search, apply_all(self.search.rig, step.fit.effects))
 
     def _is_worth(self, best: Step, step: Step) -> bool:
         """Whether a set takes enough of what a smaller one leaves, or makes errors small that were too large."""
@@ -358,8 +375,19 @@ class Stepwise:
         losses = [likeliest_loss(self.search, apply_all(self.search.rig, s.fit.effects)) for s in (best, step)]
         return 2.0 * (losses[1] - losses[0]) / self.search.data.n_values
 
+    def _without_idle(self, step: Step) -> Step:
+        """The step without effects that alter nothing any more: another stands in their place."""
+        kept = self._altering(step.effects, step.fit.effects)
+        if len(kept) in (0, len(step.effects)):
+            return step
+        return self._without_idle(fit_jointly(self.search, kept, step.errors, rounds=2))
+
     def _matter(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> bool:
-        """Whether each of some effects of a set alters the readings by more than the tolerance, in some record."""
+        """Whether each of some effects of a set alters the readings."""
+        return len(self._altering(effects, beside)) == len(effects)
+
+    def _altering(self, effects: Sequence[Effect], beside: Sequence[Effect]) -> tuple[Effect, ...]:
+        """Those effects of a set that alter the readings by more than the tolerance, in some record."""
         data, rig = self.search.data, self.search.rig
         scales = [record.outputs.std(axis=1, keepdims=True) for record in data.counted]
         whole = data.predictions(apply_all(rig, beside))
@@ -369,7 +397,7 @@ class Stepwise:
             each = zip(whole, without, scales, strict=True)
             return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
 
-        return all(altered(effect) > self.tolerance for effect in effects)
+        return tuple(effect for effect in effects if altered(effect) > self.tolerance)
 
     def _is_timing(self, step: Step, kinds: Collection[str] = ("sensor_delay",)) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
@@ -423,19 +451,27 @@ class Stepwise:
 
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best, or a set that it comes to at bounds of its parameters, where that leaves hardly more."""
-        fresh = list(simpler_sets(best.effects, self.search.rig))
+        equals = [s for s in tried if len(s.effects) > 1 and not self._tells_apart(best, s)]
+        fresh = [
+            *simpler_sets(best.effects, self.search.rig),
+            *(fewer for s in equals for fewer in each_left_out(s.effects)),
+        ]
         sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
         # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
-        best = min((best, *(s for s in sets if s.fit.n_parameters == best.fit.n_parameters)), key=lambda s: s.fit.cost)
+        best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
         enough = (1.0 + SETTINGS.simpler) * max(best.excess(best.sensor_noise), SETTINGS.simpler)
         fewer = [
             step
             for step in sets
-            if step.fit.n_parameters < best.fit.n_parameters
+            if self._size(step) < self._size(best)
             and step.excess(best.sensor_noise) < enough
             and not self._tells_apart(best, step)
         ]
-        return min(fewer, key=lambda s: (s.fit.n_parameters, s.fit.cost)) if fewer else best
+        return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
+
+    def _size(self, step: Step) -> tuple[int, int]:
+        """How many numbers and effects a set has: of as many numbers, one effect is simpler than two."""
+        return len(parameters_of(self.search.rig, step.effects)), len(step.effects)
 
     def _tells_apart(self, best: Step, simpler: Step) -> bool:
         """Whether, where only noise is left, records surely prefer a set to a simpler one, by more than a trifle."""
