@@ -41,6 +41,7 @@ class StepwiseSettings:
             what others leave as the first does. What is left of a measured gap bends to any law; a servo drive's
             friction varies by a tenth along its rail.
         promising: share of what the best candidate takes away one sample ahead that another must take away to be tried.
+        as_good: likewise, for a kind to be tried at a second place too.
         ahead: share of the cost one sample ahead that the best candidate must take away to be tried at all.
         simpler: share by which a set may leave more above the noise and still be taken for being simpler.
         needless: likewise, for a set with one effect less.
@@ -66,6 +67,7 @@ class StepwiseSettings:
     further_excess: float = 0.25
     least: float = 0.002
     promising: float = 0.2
+    as_good: float = 0.9
     ahead: float = 0.005
     simpler: float = 0.05
     needless: float = 0.3
@@ -289,10 +291,13 @@ class Stepwise:
         ahead = one_more(beside, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - SETTINGS.ahead) * left:
             return None
-        ahead = spread_over_kinds(ahead, 1)
-        enough = left - SETTINGS.promising * (left - ahead[0].cost)
-        chosen = [f.effects for f in ahead[: SETTINGS.candidates] if f.cost <= enough]
-        chosen += wider_sets(step.effects)
+        promising, as_good = (left - share * (left - ahead[0].cost) for share in (SETTINGS.promising, SETTINGS.as_good))
+        chosen: list[tuple[Effect, ...]] = []
+        for candidate in ahead:
+            alike = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
+            if candidate.cost <= promising and alike < (2 if candidate.cost <= as_good else 1):
+                chosen.append(candidate.effects)
+        chosen = [*chosen[: SETTINGS.candidates], *wider_sets(step.effects)]
         tried = self._fitted(chosen, step, self._slopes(step))
         sided = self._on_the_other_side(step, tried)
         if sided is not None:
