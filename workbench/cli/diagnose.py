@@ -47,6 +47,7 @@ def diagnose(
     """
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
+    from workbench.gap.effects.catalogue import in_words
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
@@ -98,7 +99,7 @@ def diagnose(
     for name, before in shown["gap"]["before"].items():
         say(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, noise floor {floor[name]:.4g}")
     for label, probability in verdict.alternatives[:SHOWN_RIVALS]:
-        say(f"  rival      {label} ({probability:.2g})")
+        say(f"  rival      {in_words(label)} ({probability:.2g})")
     for note in verdict.notes:
         say(f"  {note}")
     if json_path is not None:

@@ -12,6 +12,7 @@ from workbench.draw.beam import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.motion import mode_motion
 from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_poles
+from workbench.gap.effects.catalogue import in_words
 from workbench.structure.modes import SampledModes, mac
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study, output_root
@@ -131,7 +132,7 @@ def _verdict(content: dict[str, Any]) -> dict[str, Any]:
         for effect in [*content["effects"], *content.get("nearest", [])]
         for name, value in effect["parameters"].items()
     ]
-    rivals = [[rival["kind"].replace("_", " "), rival["probability"]] for rival in content["alternatives"]]
+    rivals = [[in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]]
     gaps = [[record, *(gap[name].get(record) for name in ("before", "after", "floor"))] for record in gap["before"]]
     tables = [
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]"), effects),

@@ -11,6 +11,7 @@ from workbench.gap.effects.effect import Effect
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import BLOCKS, with_intervals
+from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import simulate
 
 
@@ -35,3 +36,30 @@ def test_a_deviation_is_that_of_fits_that_leave_out_a_block_each(hinged_rig):
     assert found.values["gain"] == pytest.approx(slope, rel=1e-6)
     assert expected > 1.5 * noise[0] / np.sqrt(s @ s)  # white noise of that size would say less
     assert found.deviations["gain"] == pytest.approx(expected, rel=0.01)
+
+
+def test_noise_of_the_inputs_widens_the_interval_of_a_law_as_fits_to_other_draws_of_it_do(hinged_rig):
+    """A strong cubic spring: the scatter of its stiffness over fits to records whose inputs were logged anew."""
+    nominal = hinged_rig(n_modes=2)
+    real = replace(nominal, elements=(CubicSpring(0.3 * nominal.modes.length, 2e5),))
+    rng = np.random.default_rng(1)
+    clean = simulate(real, np.repeat(rng.normal(size=150), 5)[None], sample_time=0.01, substeps=8)
+    noise, share = 1e-4 * clean.outputs.std(axis=1), 0.02
+    rms = np.sqrt((clean.inputs**2).mean())
+    effect = Effect(kind_named("cubic_spring"), None, {"at": 0.3 * nominal.modes.length, "stiffness": 2e5})
+
+    def fitted(seed):
+        draw = np.random.default_rng(seed)
+        inputs = clean.inputs + share * rms * draw.standard_normal(clean.inputs.shape)
+        outputs = clean.outputs + noise[:, None] * draw.standard_normal(clean.outputs.shape)
+        data = FitData((replace(clean, inputs=inputs, outputs=outputs),), noise, substeps=8)
+        return fit(nominal, (effect,), data), data
+
+    values = [fitted(seed)[0].effects[0].values["stiffness"] for seed in range(30)]
+    found, data = fitted(0)
+    told, without = (with_intervals(nominal, found, data, logged=logged) for logged in (share, 0.0))
+    deviation = told.effects[0].deviations["stiffness"]
+    assert deviation == pytest.approx(np.std(values), rel=0.5)
+    assert deviation > 1.5 * without.effects[0].deviations["stiffness"]
+    free = np.diag(told.covariance) / np.diag(without.covariance)
+    assert (free > 1.0 - 1e-9).all() and free.max() > 1.5**2

@@ -38,3 +38,16 @@ def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
         if kind.name == name:
             return kind
     raise KeyError(f"no effect is called {name!r}; the catalogue has {', '.join(k.name for k in catalogue)}")
+
+
+def in_words(labels: str) -> str:
+    """A set as a sentence names it, of its labels: "coulomb_friction + actuator_bias[F2]", say.
+
+    Kinds that the catalogue does not hold are named by their own names.
+    """
+    phrases = {kind.name: kind.words for kind in CATALOGUE}
+    words = []
+    for label in labels.split(" + "):
+        name, _, target = label.rstrip("]").partition("[")
+        words.append(", ".join(filter(None, (phrases.get(name, name.replace("_", " ")), target))))
+    return " and ".join(words)

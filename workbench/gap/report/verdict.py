@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from workbench.gap.effects.beyond import any_beyond
+from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.where import Where
@@ -175,7 +176,7 @@ class Verdict:
     def _not_excluded(self) -> str:
         """The end of the sentence: rivals that remain."""
         near = [label for label, probability in self.alternatives if probability > 0.01]
-        return f"; {' and '.join(near)} cannot be excluded." if near else "."
+        return f"; {', or '.join(map(in_words, near))} cannot be excluded." if near else "."
 
     def __repr__(self) -> str:
         return f"<Verdict on {self.case}: {self.sentence}>"

@@ -208,8 +208,10 @@ def attribute(
     beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
     if beside is not None:
         best = beside_identified(within, best, beside, seen)
+    logged = within.logged
     if random is None:
-        best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None)
+        logged = logged or _logged(search, best, noise_of(search, best) if noise is None else noise)
+        best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
         best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
         if outcome == "explained":
             standing = tuple(e for e in best.effects if e in seen or e.stands_out(search.rig))
@@ -229,7 +231,7 @@ def attribute(
         evidence=found.nominal,
         search=search,
         noise=noise,
-        logged=within.logged or (_logged(search, best, noise) if random is None else 0.0),
+        logged=logged,
     )
 
 

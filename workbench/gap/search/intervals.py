@@ -4,18 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.gap.effects.effect import COORDINATES, Effect, Parameter
+from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.fit import Fit, parameters_of, slopes
+from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 ALIKE = 1e-4  # of a number, or of the extent: how far two numerical routes to the same records put it apart
 MOST_LEVERAGE = 0.5  # of a block on a direction that it alone tells: what there is no telling without it
 BLOCKS = 12  # a record: long beside the correlation of what is left, many enough to scatter
+DRAWS = 48  # of noise of the logged inputs: a standard deviation of 48 is told to a tenth
 
 
-def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE, *, wide: bool = False) -> Fit:
+def with_intervals(
+    rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE, *, wide: bool = False, logged: float = 0.0
+) -> Fit:
     """The fit with standard deviations by which 95 % intervals hold although what is left is not white.
 
     With J the sensitivities, r what is left, in units of the noise, and P the precision of the priors,
@@ -25,8 +29,10 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
 
     or s² A⁻¹ where that is larger, over blocks b of each record: d_b is what the numbers change by without block b, so
     the many numbers that few blocks tell do not make it too small (the jackknife of clusters: MacKinnon, Nielsen &
-    Webb, J. Applied Econometrics 38 (2023) 671). The joint covariance is no smaller than either in any direction. No
-    number of an effect is told to better than a part in ten thousand.
+    Webb, J. Applied Econometrics 38 (2023) 671). Noise of the logged inputs goes through the laws of the structure,
+    which no filter of a linear one makes white, so it is drawn too: each draw changes what is left by δ, and the
+    numbers by A⁻¹ Jᵀ δ. The joint covariance is no smaller than any of these in any direction. No number of an effect
+    is told to better than a part in ten thousand.
 
     Args:
         rig: nominal.
@@ -34,6 +40,7 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
         data: fit records.
         workers: processes that share the work.
         wide: as of `slopes`.
+        logged: noise of the logged inputs, as a share of their rms.
     """
     residual, jacobian = slopes(rig, found.effects, data, workers=workers, wide=wide)
     if jacobian.shape[1] == 0:
@@ -48,13 +55,16 @@ def with_intervals(rig: Rig, found: Fit, data: FitData, workers: Workers = ALONE
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
     without = _without_each_block(residual, jacobian, data, information)
     spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
-    variances = np.maximum(np.diag(spread), level * np.diag(inverse)).clip(0.0)
+    drawn = _by_noise_of_inputs(apply_all(rig, found.effects), data, residual, logged) @ jacobian @ inverse
+    of_inputs = drawn.T @ drawn / DRAWS
+    variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
     deviations: list[dict[str, float]] = [{} for _ in found.effects]
     for (i, parameter), deviation in zip(parameters, np.sqrt(variances / scale**2 + least**2), strict=True):
         value = found.effects[i].values[parameter.name]
         deviations[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
     effects = (replace(e, deviations={**e.deviations, **d}) for e, d in zip(found.effects, deviations, strict=True))
     joint = _joint(information, information @ spread @ information, level, len(without))
+    joint = _no_smaller(joint, of_inputs)
     return replace(found, effects=tuple(effects), covariance=joint / np.outer(scale, scale) + np.diag(least**2))
 
 
@@ -89,9 +99,36 @@ def _joint(information: np.ndarray, scatter: np.ndarray, level: float, n_blocks:
     relative = root.T @ scatter @ root / level
     own = n_blocks / (n_blocks + len(relative))
     relative = own * relative + (1.0 - own) * np.trace(relative) / len(relative) * np.eye(len(relative))
+    return _stretched(np.sqrt(level) * root, relative)
+
+
+def _no_smaller(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """The least covariance no smaller than either in any direction that the first has."""
+    values, vectors = np.linalg.eigh(covariance)
+    there = values > 1e-12 * values[-1]
+    vectors, sizes = vectors[:, there], np.sqrt(values[there])
+    return _stretched(vectors * sizes, (vectors / sizes).T @ other @ (vectors / sizes))
+
+
+def _stretched(root: np.ndarray, relative: np.ndarray) -> np.ndarray:
+    """R max(C, I) Rᵀ, with R `root` and C `relative`."""
     larger, axes = np.linalg.eigh(relative)
-    half = root @ (axes * np.sqrt(level * np.maximum(larger, 1.0)))
+    half = root @ (axes * np.sqrt(np.maximum(larger, 1.0)))
     return np.asarray(half @ half.T)
+
+
+def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: float) -> np.ndarray:
+    """What draws of noise of the logged inputs change a residual by: (DRAWS, n_values); none without such noise."""
+    if not logged:
+        return np.zeros((0, residual.size))
+    rng = np.random.default_rng(0)
+
+    def drawn(record: Record) -> Record:
+        rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
+        return replace(record, inputs=record.inputs + logged * rms * rng.standard_normal(record.inputs.shape))
+
+    draws = (replace(data, records=tuple(map(drawn, data.records))) for _ in range(DRAWS))
+    return np.array([each.residual(rig) - residual for each in draws])
 
 
 def _without_each_block(
