@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from workbench.gap.effects.beyond import POWER_DAMPER, POWER_SPRING, in_catalogue
-from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.catalogue import CATALOGUE, in_words, kind_named
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter
 from workbench.gap.effects.environment import _is_distortion
 from workbench.gap.effects.limiting_cases import contained, simpler_forms
@@ -251,3 +251,17 @@ def test_a_law_of_a_power_of_the_catalogue_is_that_kind(law, exponent, name):
         same = force({**values, "exponent": round(exponent)}, grid)
         np.testing.assert_allclose(known.kind.force_laws[motion](known.values, grid), same, atol=1e-12)
     assert in_catalogue(Effect(law, None, {**values, "exponent": 2.5})) is None
+
+
+@pytest.mark.parametrize("stiffness", [5.0, -5.0])
+def test_a_spring_beside_a_hinge_resists_turning_if_it_resists_at_all(stiffness):
+    spring = Effect(kind_named("ground_spring"), None, {"at": 1e-3, "stiffness": stiffness})
+    turning = simpler_forms(spring, rig())
+    assert [e.values["rotational_stiffness"] for e in turning] == ([pytest.approx(5e-6)] if stiffness > 0 else [])
+
+
+def test_sets_are_named_in_words():
+    assert (
+        in_words("coulomb_friction + actuator_bias[F2]") == "a friction force and a constant force of an actuator, F2"
+    )
+    assert in_words("swapped_outputs[d1, d2]").endswith(", d1, d2") and in_words("own_law") == "own law"

@@ -3,8 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
-from workbench.gap.localisation.evidence import Evidence
+from workbench.gap.localisation.evidence import Evidence, Place
 from workbench.gap.prediction.residuals import FitData
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import CubicSpring
@@ -31,3 +32,15 @@ def test_pairs_of_points_that_move_alike_do_not_crowd_out_others():
     pairs = [{int(name[1]) for name in where} for where in evidence.peaks if isinstance(where, Between)]
     assert {0, 3} in pairs
     assert len({frozenset(pair) for pair in pairs}) == len(pairs) == 4
+
+
+def test_the_strength_of_a_law_is_told_although_errors_have_taken_its_linear_part():
+    """Friction less the damping that errors of the model put in its place, and more: alone it points the other way."""
+    time = np.linspace(0.0, 20.0, 4000)
+    swing = np.exp(-0.05 * time)
+    motion = [swing * np.sin(7.0 * time), 7.0 * swing * np.cos(7.0 * time), -49.0 * swing * np.sin(7.0 * time)]
+    law = np.tanh(motion[1] / 0.3)
+    force = -2.0 * law + 1.4 * (2.0 * (law @ motion[1]) / (motion[1] @ motion[1])) * motion[1] + 0.3 * motion[0]
+    alone, bent = (Place(0.4, force, *motion, bent=bent) for bent in (False, True))
+    assert alone.strength_along(law) < 0.0
+    assert bent.strength_along(law) == pytest.approx(2.0, rel=1e-9)

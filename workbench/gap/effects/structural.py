@@ -270,7 +270,7 @@ def _turning_spring(spring: Effect, rig: Rig) -> tuple[Effect, ...]:
         return ()
     length, v = rig.structure.length, spring.values
     end, arm = ("left", v["at"]) if v["at"] < 0.5 * length else ("right", length - v["at"])
-    if arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
+    if v["stiffness"] <= 0 or arm > BESIDE * length or end not in SUPPORT_ROTATION.targets(rig):
         return ()
     return (Effect(SUPPORT_ROTATION, end, {"rotational_stiffness": v["stiffness"] * arm**2}),)
 

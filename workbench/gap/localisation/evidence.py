@@ -297,7 +297,8 @@ class Evidence:
                     shape @ (motion.acceleration + error_a) + shape @ shape * force,
                 )
             )
-        return Place(where, *(np.concatenate(series) for series in zip(*pieces, strict=True)), bent=self.bent)
+        force, w, v, a = (np.concatenate(series) for series in zip(*pieces, strict=True))
+        return Place(where, force, w, v, a, self.bent)
 
 
 def _apart(
