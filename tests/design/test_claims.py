@@ -104,6 +104,9 @@ def test_sensors_of_a_filter_placed():
     assert best.exhaustive and best.error <= min(every)
     with pytest.raises(DesignError, match="8 sensors cannot stand at 7"):
         place_sensors(found, 3, 8, 1.0, mean_squares=squares, candidates=few)
+    with pytest.warns(DeprecationWarning, match="mass="):
+        former = place_sensors(found, 3, 3, mass_per_length=1.0, mean_squares=squares, candidates=few)
+    assert former.error == best.error
 
 
 def test_the_one_sensor_of_the_first_mode_of_a_plate_stands_at_its_centre():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.arrays import Complexes, Floats, Integers
+from workbench.arrays import Complexes, Flags, Floats, Integers
 from workbench.structure.domain import (
     Between,
     Derivative,
@@ -223,6 +223,11 @@ class Modes(Printed):
             return False
         moved = np.abs(self.phi_at(where, derivative, direction=direction)).max()
         return bool(moved <= HELD * self._largest)
+
+    def are_still(self, places: ArrayLike) -> Flags:
+        """Whether no mode moves each of some places of the domain, (n_places,)."""
+        still: Flags = np.abs(self.phi(places)).max(axis=1) <= HELD * self._largest
+        return still
 
     @cached_property
     def _largest(self) -> float:
