@@ -12,6 +12,7 @@ from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import actuator_force, move, read, simulate
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import PlaceError
 from workbench.structure.member import Beam
 from workbench.structure.modes import Modes
 from workbench.structure.supports import PointDamper
@@ -170,3 +171,14 @@ def test_a_late_or_biased_port_has_no_state_space():
     assert Actuator("F1", 2.0).linear and Sensor("d", 1.0).linear
     assert not Actuator("F1", 2.0, bias=1.0).linear and not Actuator("F1", 2.0, rate_limit=1.0).linear
     assert not Actuator("F1", 2.0, hysteresis_share=0.1).linear and not Sensor("d", 1.0, delay=0.1).linear
+
+
+def test_a_rig_is_refused_whose_actuator_or_sensor_stands_outside_the_structure(square_plate):
+    modes = square_plate.modes(3)
+    inside, outside = (0.3, 0.4), (0.3, 1.4)
+    with pytest.raises(PlaceError, match=r"actuator F: \(x, y\) = \(0.3, 1.4\) lies outside the structure, 0 to 1"):
+        Rig(modes, (Actuator("F", outside),), (Sensor("d", inside),))
+    with pytest.raises(PlaceError, match=r"sensor d: .* give a place on it"):
+        Rig(modes, (Actuator("F", inside),), (Sensor("d", outside),))
+    with pytest.raises(PlaceError, match=r"sensor late: x = 10\.5 lies outside the structure, which runs from 0 to 10"):
+        rig(sensors=(Sensor("late", 10.5),))

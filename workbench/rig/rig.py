@@ -7,7 +7,7 @@ from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import Element
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import PlaceError
+from workbench.structure.domain import Interval, Patch, PlaceError, Rectangle
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
@@ -28,8 +28,12 @@ def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
     try:
         return modes.phi_at(port.at, derivative_of(port), direction=port.direction)
     except PlaceError as error:
-        what = "actuator" if isinstance(port, Actuator) else "sensor"
-        raise PlaceError(f"{what} {port.name}: {error}") from None
+        raise _misplaced(port, error) from None
+
+
+def _misplaced(port: Actuator | Sensor, error: PlaceError) -> PlaceError:
+    what = "actuator" if isinstance(port, Actuator) else "sensor"
+    return PlaceError(f"{what} {port.name}: {error}")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -45,6 +49,10 @@ class Rig(Printed):
         structure: the bar, beam, plate or membrane behind the modes, where it is known; changes of structure are solved
             anew on it.
         by_record: (name, change) of records in which the rig is another one; see `in_record`.
+
+    Raises:
+        ValueError: two actuators or two sensors of one name.
+        PlaceError: an actuator or sensor that stands outside the structure.
     """
 
     modes: Modes
@@ -62,6 +70,13 @@ class Rig(Printed):
             names = [part.name for part in parts]
             if len(set(names)) != len(names):
                 raise ValueError(f"the {name} of a rig must have different names; got {names}")
+        ports: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
+        for port in ports:
+            if isinstance(self.modes.domain, Interval | Rectangle) and not isinstance(port.at, Patch):
+                try:
+                    self.modes.domain.locate(port.at)
+                except PlaceError as error:
+                    raise _misplaced(port, error) from None
 
     def in_record(self, name: str) -> "Rig":
         """The rig as it is in a record of that name: itself, but for what differs from record to record."""
