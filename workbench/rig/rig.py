@@ -70,9 +70,18 @@ class Rig(Printed):
             names = [part.name for part in parts]
             if len(set(names)) != len(names):
                 raise ValueError(f"the {name} of a rig must have different names; got {names}")
-        ports: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
-        for port in ports:
-            if isinstance(self.modes.domain, Interval | Rectangle) and not isinstance(port.at, Patch):
+        if isinstance(self.modes.domain, Interval | Rectangle):
+            self._check_places()
+
+    def _check_places(self) -> None:
+        both: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
+        ports = [port for port in both if not isinstance(port.at, Patch)]
+        if not ports:
+            return
+        try:  # all at once: a search makes a rig for every prediction
+            self.modes.domain.locate([port.at for port in ports])
+        except PlaceError:
+            for port in ports:
                 try:
                     self.modes.domain.locate(port.at)
                 except PlaceError as error:

@@ -167,7 +167,7 @@ def prove(
             controlled=tuple(controlled),
             effort=_finite([run.effort for run in runs]),
             vibration=_finite([e.sum() * dt for e in energies]),
-            settling=np.array([_settling(e, dt) if s else np.inf for e, s in zip(energies, stable, strict=True)]),
+            settling=np.array([settling(e, dt) if s else np.inf for e, s in zip(energies, stable, strict=True)]),
             energy=_band(energies),
             margin=margin,
             margin_frequency_hz=frequency,
@@ -206,7 +206,8 @@ def _grows(energy: np.ndarray) -> bool:
     return bool(energy[-quarter:].max() > GROWN * energy[:quarter].max())
 
 
-def _settling(energy: np.ndarray, sample_time: float) -> float:
+def settling(energy: np.ndarray, sample_time: float) -> float:
+    """Time until an energy (n_samples,) stays below a hundredth of its peak, s; infinite where it does not."""
     above = np.flatnonzero(energy > SETTLED * energy.max())
     return np.inf if above[-1] == energy.size - 1 else float(sample_time * (above[-1] + 1))
 

@@ -6,11 +6,11 @@ import numpy as np
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.rig.sensors import MEASURED, Sensor
+from workbench.robust.proof import settling
 from workbench.trials import motion
 from workbench.trials.plant import FINEST, SolvedPlant, sensor_noise
 
 RUN_AWAY = 1e6  # times the energy that the impulse gives
-SETTLED = 0.01  # of the largest energy: what a settled loop stays below
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,10 +57,8 @@ class Controlled:
         Args:
             modes: number of modes whose energy counts, lowest first; all unless given.
         """
-        energy = self.modal_energy[:modes].sum(axis=0)
-        above = np.flatnonzero(energy > SETTLED * energy.max())
-        settles = self.bounded and above[-1] < energy.size - 1
-        return float(self.sample_time * (above[-1] + 1)) if settles else None
+        time = settling(self.modal_energy[:modes].sum(axis=0), self.sample_time)
+        return time if self.bounded and np.isfinite(time) else None
 
 
 def control_plant(

@@ -32,11 +32,16 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
     rng = np.random.default_rng(0)
     rows = []
     for record in data.counted:
-        rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
-        noise = rms * rng.standard_normal(record.inputs.shape)
-        response = predict(replace(rig, elements=()), replace(record, inputs=noise))
+        response = predict(replace(rig, elements=()), replace(record, inputs=noise_of_inputs(record, rng)))
         rows.append((response**2).mean(axis=1) / data.noise**2)
     return np.array(rows)
+
+
+def noise_of_inputs(record: Record, rng: np.random.Generator) -> Floats:
+    """A draw of white noise of each input (n_inputs, n_samples), as strong as the input itself, N."""
+    rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
+    noise: Floats = rms * rng.standard_normal(record.inputs.shape)
+    return noise
 
 
 def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np.ndarray) -> float:

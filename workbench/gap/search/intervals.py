@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all
+from workbench.gap.prediction.logged_inputs import noise_of_inputs
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.fit import Fit, parameters_of, slopes
@@ -124,8 +125,7 @@ def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: f
     rng = np.random.default_rng(0)
 
     def drawn(record: Record) -> Record:
-        rms = np.sqrt((record.inputs**2).mean(axis=1, keepdims=True))
-        return replace(record, inputs=record.inputs + logged * rms * rng.standard_normal(record.inputs.shape))
+        return replace(record, inputs=record.inputs + logged * noise_of_inputs(record, rng))
 
     draws = (replace(data, records=tuple(map(drawn, data.records))) for _ in range(DRAWS))
     return np.array([each.residual(rig) - residual for each in draws])

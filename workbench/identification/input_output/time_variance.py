@@ -18,6 +18,7 @@ from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
 from workbench.identification.input_output.model_order import evidence_of
 from workbench.identification.signal.least_squares import Budget
+from workbench.structure.modes import mac
 
 SURE = 5.0  # standard errors that a change must have
 NEAR, ALIKE = 3.0, 0.9  # half-power bandwidths apart, and modal assurance, of modes that may be one
@@ -96,7 +97,8 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
     if fit.amplitudes.shape[0] * data.n_inputs == 1:
         return None  # one signal does not tell whether shapes are alike
     strength = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
-    alike = _assurance(fit.amplitudes) * _assurance(fit.participation[:, : data.n_inputs].T) > ALIKE
+    participation = fit.participation[:, : data.n_inputs].T
+    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > ALIKE
     beside: list[Floats] = []
     changing: list[complex] = []
     out = np.zeros(fit.poles.size, bool)
@@ -152,15 +154,9 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
     return found
 
 
-def _assurance(vectors: np.ndarray) -> Floats:
-    """Modal assurance of columns among themselves, (n_modes, n_modes)."""
-    shapes = vectors / np.maximum(np.linalg.norm(vectors, axis=0), 1e-300)
-    return np.asarray(np.abs(shapes.conj().T @ shapes) ** 2)
-
-
 def _pairs(fit: Fit) -> list[tuple[int, int]]:
     """Modes near each other with shapes alike, the nearest first."""
-    poles, alike = fit.poles, _assurance(fit.amplitudes) > ALIKE
+    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > ALIKE
     apart = np.abs(np.subtract.outer(poles.imag, poles.imag))
     near = apart < NEAR * np.add.outer(np.abs(poles.real), np.abs(poles.real))
     both = zip(*np.nonzero(np.triu(alike & near, 1)), strict=True)
