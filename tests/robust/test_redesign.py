@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import workbench as wb
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
@@ -13,9 +14,11 @@ from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.rig.sensors import Sensor
+from workbench.robust.on_rig import impulse_test
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.proof import Proof
 from workbench.robust.redesign import redesign
+from workbench.structure.domain import Patch
 
 DT = 0.01
 
@@ -150,6 +153,23 @@ def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, 
         replace(sure, unexplained=0.5), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False
     )
     assert not unsure.safe and "off by 50 %" in unsure.sentence and "not sure" in unsure.sentence
+
+
+def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():
+    beam = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    motor, sensor = wb.Actuator("motor", 0.0, kind="moment"), wb.Sensor("tip", 0.6, "displacement")
+    modes = beam.modes(4)
+    test = impulse_test(wb.Rig(modes, (motor,), (sensor,)), (0, 1), 0.01)
+    shape = np.abs(modes.phi([test.impulse_at])[0, :2]) / np.sqrt(2.0)
+    assert shape.min() > 0.7  # sin πx and sin 2πx are both 0.77 of their most at 0.28 and 0.72
+
+    plate = wb.Plate(
+        length=(1.0, 0.8), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="simply supported"
+    )
+    patch = wb.Actuator("patch", Patch(0.3, 0.3, 0.2, 0.2), kind="moment")
+    rig = wb.Rig(plate.modes(4), (patch,), (wb.Sensor("a", (0.6, 0.3), "displacement"),))
+    struck = impulse_test(rig, (0, 1), 0.001).impulse_at
+    assert np.abs(rig.modes.phi([struck])[0, :2]).min() > 0.5
 
 
 def test_what_cannot_be_redesigned_is_named(rig, controller):

@@ -23,7 +23,7 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
 from workbench.robust.compensation import Loop, check_rate, without
 from workbench.robust.small_motion import loop_poles
-from workbench.structure.domain import Where
+from workbench.structure.domain import Patch, Where
 from workbench.structure.modes import Modes, mac
 
 Design = Law | OnOffLaw | Controller | PlacementTask
@@ -60,7 +60,8 @@ def impulse_test(
         rig: nominal.
         controlled: zero-based modes.
         sample_time: s.
-        impulse_at: the place; that of a hammer, or of the first actuator, unless given.
+        impulse_at: the place; unless given, that of a hammer or of the first actuator, or where that moves none of the
+            controlled modes, as at a clamp that a motor turns, the place that moves all of them most.
         level: (n_outputs,) readings that the nominal rig without control then peaks at, in the median of the sensors;
             None for a unit impulse.
         seed: of the noise.
@@ -70,19 +71,12 @@ def impulse_test(
         ValueError: a place that the structure does not have.
     """
     check_rate(rig.modes, controlled, sample_time)
-    if impulse_at is None:
-        struck = next((a for a in rig.actuators if a.direct), rig.actuators[0])
-        impulse_at = struck.at
     omega = rig.modes.omega[list(controlled)]
     omega = omega[omega > 0]
     if not omega.size:
         raise DesignError("the controlled modes are all rigid, so they have no period: give a test of your own")
+    impulse_at = _struck_at(rig, controlled, impulse_at)
     shape = rig.modes.phi_at(impulse_at)
-    if not np.abs(shape[list(controlled)]).max() > UNMOVED * np.abs(rig.modes.phi(rig.modes.domain.grid(GRID))).max():
-        raise DesignError(
-            f"an impulse at {rig.modes.domain.text(impulse_at)} moves none of the controlled modes, so it tests no"
-            " controller; strike elsewhere"
-        )
     n_samples = int(min(max(PERIODS * 2.0 * np.pi / omega.min() / sample_time, 64), MOST_SAMPLES))
     test = LoopTest(n_samples, sample_time, impulse_at, seed=seed)
     if level is None:
@@ -100,6 +94,26 @@ def impulse_test(
             row = rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
             peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
     return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
+
+
+def _struck_at(rig: Rig, controlled: Sequence[int], given: Where | None) -> Where:
+    """Where an impulse moves the controlled modes: the place given, or one that suits."""
+    places = rig.modes.domain.grid(GRID)
+    shapes = np.abs(rig.modes.phi(places))
+    at = given
+    if at is None:
+        at = next((a for a in rig.actuators if a.direct), rig.actuators[0]).at
+    turns = isinstance(at, Patch)  # it has moments along its edges, and no displacement
+    if not turns and np.abs(rig.modes.phi_at(at)[list(controlled)]).max() > UNMOVED * shapes.max():
+        return at
+    if given is not None:
+        raise DesignError(
+            f"an impulse at {rig.modes.domain.text(at)} moves none of the controlled modes, so it tests no"
+            " controller; strike elsewhere"
+        )
+    moved = shapes[:, list(controlled)]
+    most: Where = places[int((moved / np.maximum(moved.max(axis=0), 1e-300)).min(axis=1).argmax())]
+    return most
 
 
 def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
