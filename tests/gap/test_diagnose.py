@@ -91,9 +91,30 @@ def nothing_hidden():
     return make_trial(3)[0]
 
 
-def test_nothing_hidden_nothing_told(nothing_hidden):
-    verdict = verdict_on(nothing_hidden)
+@pytest.fixture(scope="module")
+def quiet_verdict(nothing_hidden):
+    return verdict_on(nothing_hidden)
+
+
+def test_nothing_hidden_nothing_told(quiet_verdict):
+    verdict = quiet_verdict
     assert verdict.outcome == "none" and verdict.to_json()["effects"] == []
+
+
+def test_a_rival_of_the_users_own_is_told_by_its_phrase(quiet_verdict):
+    verdict = quiet_verdict
+    mine = replace(kind_named("cubic_spring"), name="own_law", phrase="a quadratic spring")
+    rival = replace(verdict.attribution.best, effects=(Effect(mine, None, {"at": 0.3, "stiffness": 1.0}),))
+    rivals = ((rival, 0.2),)
+    told = replace(
+        verdict,
+        outcome="explained",
+        alternatives=(("own_law", 0.2),),
+        attribution=replace(verdict.attribution, rivals=rivals),
+    )
+    assert "a quadratic spring cannot be excluded" in told.sentence
+    (shown,) = told.to_json()["alternatives"]
+    assert shown == {"kind": "own_law", "words": "a quadratic spring", "probability": 0.2}
 
 
 def quadratic(w, v, p):

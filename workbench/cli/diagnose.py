@@ -47,7 +47,6 @@ def diagnose(
     """
     from workbench.cases.case import read_case
     from workbench.gap.diagnose import diagnose as run
-    from workbench.gap.effects.catalogue import in_words
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
@@ -98,8 +97,8 @@ def diagnose(
     after, floor = shown["gap"]["after"], shown["gap"]["floor"]
     for name, before in shown["gap"]["before"].items():
         say(f"  {name:<10} gap {before:.4g} → {after[name]:.4g}, noise floor {floor[name]:.4g}")
-    for label, probability in verdict.alternatives[:SHOWN_RIVALS]:
-        say(f"  rival      {in_words(label)} ({probability:.2g})")
+    for words, probability in verdict.rivals[:SHOWN_RIVALS]:
+        say(f"  rival      {words} ({probability:.2g})")
     for note in verdict.notes:
         say(f"  {note}")
     if json_path is not None:

@@ -221,12 +221,15 @@ class Modes(Printed):
             return any(held == derivative and abs(where - at) <= slack for at, held in self.essential)  # type: ignore
         if derivative:
             return False
-        moved = np.abs(self.phi_at(where, derivative, direction=direction)).max()
-        return bool(moved <= HELD * self._largest)
+        return bool(self._hardly_move(self.phi_at(where, derivative, direction=direction)))
 
     def are_still(self, places: ArrayLike) -> Flags:
         """Whether no mode moves each of some places of the domain, (n_places,)."""
-        still: Flags = np.abs(self.phi(places)).max(axis=1) <= HELD * self._largest
+        return self._hardly_move(self.phi(places))
+
+    def _hardly_move(self, phi: Floats) -> Flags:
+        """Whether all of some mode shapes' values (..., n_modes) are nothing beside the largest displacement, (...)."""
+        still: Flags = np.abs(phi).max(axis=-1) <= HELD * self._largest
         return still
 
     @cached_property

@@ -132,7 +132,9 @@ def _verdict(content: dict[str, Any]) -> dict[str, Any]:
         for effect in [*content["effects"], *content.get("nearest", [])]
         for name, value in effect["parameters"].items()
     ]
-    rivals = [[in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]]
+    rivals = [
+        [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
+    ]
     gaps = [[record, *(gap[name].get(record) for name in ("before", "after", "floor"))] for record in gap["before"]]
     tables = [
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]"), effects),

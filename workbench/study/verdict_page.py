@@ -12,7 +12,6 @@ from workbench.cases.case import Case
 from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.draw.spectra import plot_distortion
-from workbench.gap.effects.catalogue import in_words
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
@@ -97,7 +96,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         )
         for name, value in effect["parameters"].items()
     ]
-    rivals = [(in_words(r["kind"]), r["probability"]) for r in shown["alternatives"]]
+    rivals = [(r["words"], r["probability"]) for r in shown["alternatives"]]
     tables: list[Table] = [
         ("Gap on held-out records", ("record", "before", "after", "floor", "share closed"), gaps),
         ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),

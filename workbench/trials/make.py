@@ -129,12 +129,7 @@ def find_trial_with_plant(
     Raises:
         ValueError: no bench of these seeds shows them.
     """
-    for _ in range(SEEDS_TRIED):
-        try:
-            return make_trial_with_plant(int(rng.integers(2**31)), kinds=kinds, dirt=dirt, size=size)
-        except ValueError as error:
-            reason = error
-    raise reason
+    return _first_possible(rng, SEEDS_TRIED, kinds, dirt=dirt, size=size)
 
 
 def _draw_effects(
@@ -422,7 +417,9 @@ def write_trials(
     told = {}
     for i, draw in enumerate(draws):
         name = f"case-{i + 1:03d}"
-        case, told[name] = _first_possible(seed, i, draw, like, structure, name)
+        pool = [k for k in KINDS if k not in MIMICS[draw.dirt] | NOT_ON[structure] | {"truncated_modes"}]
+        how = {"like": like, "structure": structure, "name": name, "dirt": draw.dirt, "size": draw.size}
+        case, told[name], _ = _first_possible(np.random.default_rng([seed, i]), 100, draw.kinds, pool, **how)
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
@@ -430,17 +427,19 @@ def write_trials(
 
 
 def _first_possible(
-    seed: int, i: int, draw: DirtyDraw, like: Case | None, structure: str, name: str
-) -> tuple[Case, dict[str, Any]]:
-    """The trial, or with kinds that this rig cannot show, one of kinds that it can."""
-    rng, kinds = np.random.default_rng([seed, i]), draw.kinds
-    pool = [k for k in KINDS if k not in MIMICS[draw.dirt] | NOT_ON[structure] | {"truncated_modes"}]
-    for _ in range(100):
+    rng: np.random.Generator, tries: int, kinds: Sequence[str], others: Sequence[str] = (), **how: Any
+) -> tuple[Case, dict[str, Any], SolvedPlant]:
+    """The first of some seeds that makes a trial of the kinds; after one that does not, of kinds among the others.
+
+    Raises:
+        ValueError: none of these seeds makes one.
+    """
+    for _ in range(tries):
         case_seed = int(rng.integers(2**31))
         try:
-            return make_trial(
-                case_seed, kinds=kinds, like=like, structure=structure, name=name, dirt=draw.dirt, size=draw.size
-            )
-        except ValueError:
-            kinds = tuple(str(k) for k in rng.choice(pool, len(kinds), replace=False))
-    raise ValueError("this bench shows none of the effects; are its sensors and levels right?")
+            return make_trial_with_plant(case_seed, kinds=kinds, **how)
+        except ValueError as error:
+            reason = error  # a variable of `except` ends with it
+        if others:
+            kinds = tuple(str(k) for k in rng.choice(others, len(kinds), replace=False))
+    raise ValueError(f"none of {tries} seeds makes a trial: {reason}; are the sensors and levels of the bench right?")

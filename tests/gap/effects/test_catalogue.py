@@ -265,3 +265,5 @@ def test_sets_are_named_in_words():
         in_words("coulomb_friction + actuator_bias[F2]") == "a friction force and a constant force of an actuator, F2"
     )
     assert in_words("swapped_outputs[d1, d2]").endswith(", d1, d2") and in_words("own_law") == "own law"
+    mine = replace(kind_named("cubic_spring"), name="own_law", phrase="a quadratic spring")
+    assert in_words("own_law", [mine]) == "a quadratic spring"

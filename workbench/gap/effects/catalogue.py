@@ -19,6 +19,8 @@ A kind of your own is one more `Kind`; hand `(*CATALOGUE, mine)` to the diagnosi
     )
 """
 
+from collections.abc import Iterable
+
 from workbench.gap.effects.effect import Kind
 from workbench.gap.effects.environment import KINDS as OF_THE_ENVIRONMENT
 from workbench.gap.effects.nonlinear import KINDS as NONLINEAR
@@ -40,12 +42,12 @@ def kind_named(name: str, catalogue: tuple[Kind, ...] = CATALOGUE) -> Kind:
     raise KeyError(f"no effect is called {name!r}; the catalogue has {', '.join(k.name for k in catalogue)}")
 
 
-def in_words(labels: str) -> str:
+def in_words(labels: str, catalogue: Iterable[Kind] = CATALOGUE) -> str:
     """A set as a sentence names it, of its labels: "coulomb_friction + actuator_bias[F2]", say.
 
     Kinds that the catalogue does not hold are named by their own names.
     """
-    phrases = {kind.name: kind.words for kind in CATALOGUE}
+    phrases = {kind.name: kind.words for kind in catalogue}
     words = []
     for label in labels.split(" + "):
         name, _, target = label.rstrip("]").partition("[")

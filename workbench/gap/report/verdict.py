@@ -173,10 +173,18 @@ class Verdict:
         return f" ({', '.join(words)})" if words else ""
 
     @property
+    def rivals(self) -> tuple[tuple[str, float], ...]:
+        """The alternatives in words, by the phrases of their kinds: (set, probability), best first."""
+        return tuple(
+            (in_words(fit.named, [effect.kind for effect in fit.effects]), probability)
+            for fit, probability in self.attribution.rivals
+        )
+
+    @property
     def _not_excluded(self) -> str:
         """The end of the sentence: rivals that remain."""
-        near = [label for label, probability in self.alternatives if probability > 0.01]
-        return f"; {', or '.join(map(in_words, near))} cannot be excluded." if near else "."
+        near = [words for words, probability in self.rivals if probability > 0.01]
+        return f"; {', or '.join(near)} cannot be excluded." if near else "."
 
     def __repr__(self) -> str:
         return f"<Verdict on {self.case}: {self.sentence}>"
@@ -186,13 +194,16 @@ class Verdict:
         known = self.outcome in ("none", "explained")
         effects = [effect_json(effect, self.nominal) for effect in self._told]
         shrink = self.shrinkage
+        rivals = zip(self.alternatives, self.rivals, strict=True)
         return {
             "case": self.case,
             "outcome": self.outcome,
             "sentence": self.sentence,
             "effects": effects if known else [{"kind": "unknown", "parameters": {}}],
             "nearest": [] if known else effects,
-            "alternatives": [{"kind": label, "probability": _rounded(p)} for label, p in self.alternatives],
+            "alternatives": [
+                {"kind": label, "words": words, "probability": _rounded(p)} for (label, p), (words, _) in rivals
+            ],
             "where": where_json(self.where),
             "gap": {
                 "before": _rounded_all(shrink.before if shrink else {}),
