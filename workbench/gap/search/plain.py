@@ -15,7 +15,7 @@ from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.jointly import on_their_sides, surely_late
 from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import Search
+from workbench.gap.search.search import WORTHWHILE, Search
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
@@ -86,9 +86,11 @@ def in_place_of_errors(
     late = _late(search, errors)
     if not effects:
         both = _explaining(search, [(*common, *late)])
-        if both is not None:
-            return _one_common(search, common, late, both)
-        return _one_more(search, (*common, *late), ())
+        if both is not None and SENSOR_DELAY in {effect.kind for effect in both.effects}:
+            return both  # one sensor late alone is an effect beside common errors
+        # beside noise of the inputs that an effect made seem louder, common errors may explain what they do not cause
+        more = _one_more(search, (*common, *late), ()) if both is None or search.logged else None
+        return _one_common(search, common, late, both) if more is None and both is not None else more
     sets = [s for given in (effects, *rivals) for s in (given, *((*given, e) for e in common), (*given, *common))]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
@@ -172,4 +174,5 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
     rest = [e for e in found.effects if e.kind in COMMON or any(e.label == other.label for other in given)]
     without = fit(search.rig, rest, search.data.stepped(FINE), iterations=PLAINLY)
     extra = found.n_parameters - without.n_parameters
-    return found if search.surely_better(found, without.cost, extra) else None
+    worth = without.cost - found.cost > WORTHWHILE and search.surely_better(found, without.cost, extra)
+    return found if worth else None

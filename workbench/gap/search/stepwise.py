@@ -494,7 +494,7 @@ class Stepwise:
 
     def _without_errors(self, step: Step) -> Fit | None:
         """Few effects that explain the records without errors of the nominal model as well as a step beside them."""
-        if self.unexplained > SETTINGS.explained:
+        if not self.is_closed:
             return None
         search = self.search.with_noise(np.sqrt(step.sensor_noise) * self.search.data.noise)
         if step.logged > LEAST_LOGGED and not self.search.logged:
