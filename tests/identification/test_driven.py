@@ -7,6 +7,7 @@ from scipy.optimize import approx_fprime
 from scipy.signal import lfilter
 
 from workbench.identification.driven import identify_driven
+from workbench.identification.input_output import time_variance
 from workbench.identification.rig_from import rig_from
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
@@ -384,6 +385,21 @@ def test_a_mode_that_changes_within_the_record_is_one_mode_with_a_remark(change,
     by = float(said.split("mode 2 (")[1].split("about ")[1].split(" %")[0])
     assert "mode 1" not in said and "mode 3" not in said
     assert by == pytest.approx(100 * change, rel=0.25)
+
+
+def test_the_change_of_modes_is_found_once_for_each_fit(monkeypatch):
+    """The remark asked for it again where the check for two modes in place of one had it."""
+    asked, found = [], time_variance.changes_in_time
+    both = drifting(-0.005, 3)
+    record = Record(DT, both.outputs[:1], both.output_channels[:1], both.inputs, both.input_channels, name="one sensor")
+
+    def counted(data, fit):
+        asked.append(fit)
+        return found(data, fit)
+
+    monkeypatch.setattr(time_variance, "changes_in_time", counted)
+    assert identify_driven(record).modes.frequencies_hz == pytest.approx([1.3, 4.1, 9.7], rel=2e-3)
+    assert asked and len({id(fit) for fit in asked}) == len(asked)
 
 
 @pytest.mark.slow

@@ -238,12 +238,12 @@ def identify_driven(
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
-    fit = joined(data, selected.fit, budget)
+    fit, change = joined(data, selected.fit, budget)
     if fit is not selected.fit:
         selected = replace(selected, fit=fit, evidence=np.array([evidence_of(fit, r) for r in range(fit.poles.size)]))
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
-    changes = () if late else change_remarks(data, fit, changing)
+    changes = () if late else change_remarks(data, fit, change, changing)
     return _report(records, data, selected, (*remarks, *overlap, *changes, *budget.remarks))
 
 

@@ -71,8 +71,14 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     return Change(change[n:] / omega, error / omega, sure)
 
 
-def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
-    """The fit with one mode for two that are alike, where a change of the one within the record explains the other."""
+def joined(data: KnownInputs, fit: Fit, budget: Budget, change: Change | None = None) -> tuple[Fit, Change | None]:
+    """The fit with one mode for two that are alike, where a change of the one within the record explains the other.
+
+    With it the change of its modes, where that is known.
+
+    Args:
+        change: of the modes of the fit, where it is known.
+    """
     for r, s in _pairs(fit):
         if budget.spent("check of modes that change within the record"):
             break
@@ -80,11 +86,11 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
         strong, weak = (r, s) if evidence[0] > evidence[1] else (s, r)
         kept = np.delete(np.arange(fit.poles.size), weak)
         one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), budget=budget)
-        change, at = changes_in_time(data, one), int(np.searchsorted(kept, strong))
+        of_one, at = changes_in_time(data, one), int(np.searchsorted(kept, strong))
         worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / one.noise**2).sum())
-        if change.sure[at] and (change.frequency[at] / change.deviation[at]) ** 2 > INSTEAD * worth:
-            return joined(data, one, budget)
-    return fit
+        if of_one.sure[at] and (of_one.frequency[at] / of_one.deviation[at]) ** 2 > INSTEAD * worth:
+            return joined(data, one, budget, of_one)
+    return fit, change
 
 
 def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit] | None:
@@ -163,11 +169,17 @@ def _pairs(fit: Fit) -> list[tuple[int, int]]:
     return sorted(((int(r), int(s)) for r, s in both), key=lambda pair: apart[pair])
 
 
-def change_remarks(data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()) -> tuple[str, ...]:
-    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way."""
+def change_remarks(
+    data: KnownInputs, fit: Fit, change: Change | None, changing: tuple[complex, ...] = ()
+) -> tuple[str, ...]:
+    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way.
+
+    Args:
+        change: of the modes of the fit; None where it is not known yet.
+    """
     if not fit.poles.size:
         return ()
-    change = changes_in_time(data, fit)
+    change = changes_in_time(data, fit) if change is None else change
     names = [f"mode {r + 1} ({np.abs(pole) / (2.0 * np.pi):.4g} Hz)" for r, pole in enumerate(fit.poles)]
     sure = change.sure & (np.abs(change.frequency) < REACH)
     words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure)]
