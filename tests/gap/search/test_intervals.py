@@ -10,7 +10,8 @@ from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import fit
-from workbench.gap.search.intervals import BLOCKS, with_intervals
+from workbench.gap.search.intervals import with_intervals
+from workbench.gap.search.settings import INTERVALS
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import simulate
 
@@ -30,7 +31,7 @@ def test_a_deviation_is_that_of_fits_that_leave_out_a_block_each(hinged_rig):
     (found,) = with_intervals(rig, fit(rig, (start,), data, tolerance=1e-12), data).effects
 
     slope = s @ y / (s @ s)
-    kept = [np.setdiff1d(np.arange(s.size), block) for block in np.array_split(np.arange(s.size), BLOCKS)]
+    kept = [np.setdiff1d(np.arange(s.size), block) for block in np.array_split(np.arange(s.size), INTERVALS.blocks)]
     without = np.array([s[k] @ y[k] / (s[k] @ s[k]) for k in kept])
     expected = np.sqrt(((without - slope) ** 2).sum())
     assert found.values["gain"] == pytest.approx(slope, rel=1e-6)

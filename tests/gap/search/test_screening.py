@@ -14,9 +14,10 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.pairs import Pairs, _evidence
-from workbench.gap.search.pursuit import HOPEFUL, one_more, pairs_at_once
+from workbench.gap.search.pursuit import one_more, pairs_at_once
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import Search
+from workbench.gap.search.settings import PURSUIT
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import follow
 from workbench.structure.domain import Interval
@@ -134,7 +135,7 @@ def test_what_one_half_of_a_wrong_pair_leaves_tells_the_other(search):
     )
     pairs = Pairs(search)
     pairs.ahead = [fit(search.rig, wrong, search.ahead, iterations=4)]
-    assert pairs.ahead[0].cost > HOPEFUL
+    assert pairs.ahead[0].cost > PURSUIT.hopeful
     assert pairs.by_exchange()
     found = pairs.found[0]
     assert found.key == ("cubic_spring", "sensor_gain[d3]")

@@ -27,22 +27,15 @@ from workbench.gap.search.one_law import one_law, unless_another, weighed_agains
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors
-from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
+from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.record_to_record import beside_records
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
+from workbench.gap.search.search import Search, most_telling, spread_over_kinds
+from workbench.gap.search.settings import ATTRIBUTION, PURSUIT, SEARCH
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.threads import one_blas_thread
-
-FINALISTS = 8  # single effects that are fitted to whole records
-TOGETHER = 8  # iterations of effects and errors of an identified rig
-BRIEFLY = 2  # iterations, where there may be no effect at all
-SHOWN = 7  # others that are, where they are to be shown beside them
-A_TENTH = 1.1**2 - 1.0  # of the noise by amplitude, as a share of its power
-VERY_NEAR = 0.01  # of the gap's power: what is left by an effect that explains all but louder noise
-ALIKE = 0.01  # of a cost: nearer, two look the same on an axis of decades
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,10 +78,10 @@ class Attribution:
     def singles(self) -> tuple[Fit, ...]:
         """The likeliest kinds alone on whole records, best first; those that were no rivals are fitted now."""
         kinds = {f.effects[0].kind for f in self.tried if f.effects}
-        others = [f for f in spread_over_kinds(self.ahead, 1) if f.effects[0].kind not in kinds][:SHOWN]
+        others = [f for f in spread_over_kinds(self.ahead, 1) if f.effects[0].kind not in kinds][: ATTRIBUTION.shown]
 
         def on_all(candidate: Fit) -> Fit:
-            return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ALIKE)
+            return fit(self.search.rig, candidate.effects, self.search.data, iterations=5, tolerance=ATTRIBUTION.alike)
 
         fitted = one_blas_thread(self.search.workers.map)(on_all, others)
         return tuple(sorted((*self.tried, *fitted), key=lambda f: f.cost))
@@ -245,7 +238,7 @@ def beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, se
         return best
 
     def beside(effects: Sequence[Effect], errors: Effect) -> Fit:
-        return fit(search.rig, (*effects, errors), search.data, iterations=TOGETHER, workers=search.workers)
+        return fit(search.rig, (*effects, errors), search.data, iterations=ATTRIBUTION.together, workers=search.workers)
 
     found = beside(others, nominal_errors(search.rig, identified))
     while len(found.effects) > 2:
@@ -262,7 +255,7 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
     for record, residual in zip(nominal.data.counted, nominal.residuals, strict=True):
         scale = record.outputs.std(axis=1, keepdims=True)
         floor = float(((nominal.data.noise[:, None] / scale) ** 2).mean())
-        if float(((residual / scale) ** 2).mean()) - floor > max(tolerance**2, A_TENTH * floor):
+        if float(((residual / scale) ** 2).mean()) - floor > max(tolerance**2, ATTRIBUTION.a_tenth * floor):
             return False
     return tolerance > 0
 
@@ -270,7 +263,7 @@ def _is_small(nominal: Evidence, tolerance: float) -> bool:
 def _logged(search: Search, best: Fit, noise: np.ndarray) -> float:
     """Noise of the logged inputs, as a share of their rms, by what a set leaves above the noise of the sensors."""
     left = search.data.by_channel(search.data.residual(apply_all(search.rig, best.effects)))
-    if (left.mean(axis=1) < (1.0 + A_TENTH) * ((noise / search.data.noise) ** 2).mean()).all():
+    if (left.mean(axis=1) < (1.0 + ATTRIBUTION.a_tenth) * ((noise / search.data.noise) ** 2).mean()).all():
         return 0.0
     return logging_noise(left, (noise / search.data.noise) ** 2, search.logging_noise)
 
@@ -289,12 +282,12 @@ def noise_of(search: Search, best: Fit) -> np.ndarray:
 
 def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
     """Single effects on whole records, best first."""
-    hopeful = [f for f in ahead if f.cost < HOPEFUL] or ahead[:1]
+    hopeful = [f for f in ahead if f.cost < PURSUIT.hopeful] or ahead[:1]
     if not search.explains(start):
-        return on_whole_records(search, hopeful, FINALISTS)
+        return on_whole_records(search, hopeful, ATTRIBUTION.finalists)
     # only what leaves far less is of use, and there may be none
-    enough = start.cost - WORTHWHILE
-    return on_whole_records(search, hopeful, FINALISTS, to_cost=enough, at_first=BRIEFLY)
+    enough = start.cost - SEARCH.worthwhile
+    return on_whole_records(search, hopeful, ATTRIBUTION.finalists, to_cost=enough, at_first=ATTRIBUTION.briefly)
 
 
 def _of_one_sensor(start: Fit) -> bool:
@@ -358,8 +351,8 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
     """
     stated, best = search.data.noise, singles[0] if singles else start
     under_errors = np.sqrt(beside.last.sensor_noise) * stated
-    noise = np.clip(noise_of(search, best), stated, (1.0 + A_TENTH) ** 0.5 * under_errors)
-    if np.median(noise / stated) ** 2 < 1.0 + A_TENTH:
+    noise = np.clip(noise_of(search, best), stated, (1.0 + ATTRIBUTION.a_tenth) ** 0.5 * under_errors)
+    if np.median(noise / stated) ** 2 < 1.0 + ATTRIBUTION.a_tenth:
         return None
     louder = search.with_noise(noise)
 
@@ -367,7 +360,7 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
         by_channel = candidate.cost_by_channel * (stated / noise) ** 2
         return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
-    hopeful = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, VERY_NEAR)]
+    hopeful = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
     decision = decide(louder, heard(start), hopeful) if hopeful else None
     if decision is None or decision.outcome != "explained":
         return None

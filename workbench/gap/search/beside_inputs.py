@@ -7,11 +7,8 @@ from workbench.gap.prediction.logged_inputs import LEAST_LOGGED, likeliest_share
 from workbench.gap.search.fit import Fit
 from workbench.gap.search.jointly import fit_jointly, measured
 from workbench.gap.search.search import Search
+from workbench.gap.search.settings import INPUTS
 from workbench.rig.rig import Rig
-
-WHITE = 2.0  # mean square, white, that a set may leave beside that noise for a search to go on beside it
-BENT = 0.1  # of what a set leaves without that noise: errors of the model that bent to it may leave so much beside it
-HEARINGS = 2  # rounds of learning the sensors' noise beside it
 
 
 def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Search | None:
@@ -31,13 +28,13 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
     if share < LEAST_LOGGED:
         return None
     white = measured(beside, fitted).fit
-    if WHITE < white.cost < BENT * fitted.cost:
+    if INPUTS.white < white.cost < INPUTS.bent * fitted.cost:
         fitted = white = fit_jointly(beside, fitted.effects[:-1], fitted.effects[-1]).fit
         rig = apply_all(search.rig, fitted.effects)
         left = search.data.differences(rig)
-    if white.cost > WHITE:
+    if white.cost > INPUTS.white:
         return None
-    for _ in range(HEARINGS):  # each sensor's noise by the power of its innovations
+    for _ in range(INPUTS.hearings):  # each sensor's noise by the power of its innovations
         louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
         beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
         white = measured(beside, fitted).fit

@@ -17,21 +17,11 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import on_their_sides
 from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pursuit import on_whole_records, one_more
-from workbench.gap.search.search import WORTHWHILE, Search, spread_over_kinds
+from workbench.gap.search.search import Search, spread_over_kinds
+from workbench.gap.search.settings import RANDOM, SEARCH
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, NamedPoints
-
-NEAR = 0.1  # of the gap's power left: a set this near may only stand in the wrong valley
-RIVAL = 0.05  # of the noise power: what is farther behind the best effect beside it is no rival
-STARTS, POINTS = 2, 4  # places that the fit of a random force starts from; named points that it is tried at
-FINALISTS, TRIED = 4, 3  # effects beside it that are fitted to whole records, and those fitted with it
-LIKELIEST_SETS = 2  # of other effects, that a random force is tried beside
-WHITENED_BESIDE = 0.2  # of unit power: what small errors of the model leave after a fit of them
-TOGETHER = 6  # iterations of errors of the nominal model beside it
-SPREAD = 0.5  # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
-DRIFTING = 0.1  # of the first elastic frequency: sensors of rates hardly see a force below, and its estimate drifts
-FOLLOWS = 0.3  # share of it that inputs and motion account for: friction is as strong at every level
 
 
 def looks_random(evidence: Evidence) -> bool:
@@ -39,16 +29,16 @@ def looks_random(evidence: Evidence) -> bool:
     records, place = evidence.data.counted, evidence.at_peaks[0]
     forces = np.split(place.force, np.cumsum([record.n_samples for record in records])[:-1])
     elastic = evidence.rig.modes.omega[evidence.rig.modes.omega > 0] / (2.0 * np.pi)
-    slowest = DRIFTING * float(elastic[0]) if elastic.size else 0.0
+    slowest = RANDOM.drifting * float(elastic[0]) if elastic.size else 0.0
     levels = np.array([_rms_above(slowest, force, records[0].sample_time) for force in forces])
-    if len(forces) < 2 or np.ptp(levels) > SPREAD * levels.mean():
+    if len(forces) < 2 or np.ptp(levels) > RANDOM.spread * levels.mean():
         return False
     if min(tonal(force, records[0].sample_time) for force in forces) > TONAL:
         return False
     shape = evidence.rig.modes.phi_at(place.at)
     motions = [shape @ np.array([motion.displacement, motion.velocity]) for motion in evidence.motions]
     each = zip(forces, records, motions, strict=True)
-    return max(followed(force, record.inputs, motion) for force, record, motion in each) < FOLLOWS
+    return max(followed(force, record.inputs, motion) for force, record, motion in each) < RANDOM.follows
 
 
 def _rms_above(frequency: float, force: Floats, sample_time: float) -> float:
@@ -68,26 +58,26 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
     if not looks_random(evidence):
         return None, []
     alone = with_random(search, _nothing(search), evidence)
-    if not search.near(alone[0], NEAR) or alone[1].tonal > TONAL:
+    if not search.near(alone[0], RANDOM.near) or alone[1].tonal > TONAL:
         return None, []
     beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _follower(search, search.rig, alone[1]))
     search.report("beside a random disturbance", 0.2)
-    gaining = beside.side_by_side(simplest, _gaining(beside, evidence)[:TRIED])
+    gaining = beside.side_by_side(simplest, _gaining(beside, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]
     found = _likeliest(search, tried)
     if found is None:
         errors = on_their_sides(beside, nominal_errors(search.rig, search.prior))
-        off = with_random(search, fit(search.rig, (errors,), beside.data, iterations=TOGETHER))
-        found = Decision("explained", *off) if off[1].holds_within(WHITENED_BESIDE) else None
+        off = with_random(search, fit(search.rig, (errors,), beside.data, iterations=RANDOM.together))
+        found = Decision("explained", *off) if off[1].holds_within(RANDOM.whitened_beside) else None
     return found, [each[0] for each in tried]
 
 
 def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
     """A random disturbance beside stronger effects that leave what looks random; None where none holds."""
     tried = []
-    for given in spread_over_kinds(found, 1)[:LIKELIEST_SETS]:
+    for given in spread_over_kinds(found, 1)[: RANDOM.likeliest_sets]:
         evidence = search.evidence_of(apply_all(search.rig, given.effects))
         hearing, evidence = _heard(search, given.effects, evidence)
         evidence = _by_laws_on_measured_motion(hearing, evidence)
@@ -105,14 +95,14 @@ def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
     cost = cost_of(beside.rig, (), beside.data)
 
     def fitted(evidence: Evidence) -> list[Fit]:
-        fits = on_whole_records(beside, one_more(beside, (), evidence), FINALISTS)
+        fits = on_whole_records(beside, one_more(beside, (), evidence), RANDOM.finalists)
         return [f for f in fits if beside.surely_better(f, cost, f.n_parameters)]
 
     found = fitted(evidence)
     places = [f.effects[0].at for f in found if f.effects[0].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
-    return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RIVAL]
+    return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RANDOM.rival]
 
 
 def _nothing(search: Search) -> Fit:
@@ -136,7 +126,7 @@ def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> D
         return None
     fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
     worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
-    plain = plainest(search, [found[0] for found in worth], worth=WORTHWHILE)
+    plain = plainest(search, [found[0] for found in worth], worth=SEARCH.worthwhile)
     best, rivals = ranked(search, plain)
     return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
 
@@ -155,7 +145,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         evidence = search.evidence_of(apply_all(search.rig, given.effects))
         evidence = _by_laws_on_measured_motion(search, evidence)
     found = _random_beside(search, given, evidence)
-    if given.effects and not found[1].holds and search.near(found[0], NEAR):
+    if given.effects and not found[1].holds and search.near(found[0], RANDOM.near):
         follower = _follower(search, evidence.rig, found[1])
         data = search.data.through(model_filter(evidence.model, evidence.rig, found[1]), follower)
         refitted = fit(search.rig, given.effects, data, iterations=8)
@@ -184,7 +174,7 @@ def _by_laws_on_measured_motion(search: Search, evidence: Evidence, follower: Fo
 
 def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit, RandomForceFit]:
     domain = evidence.domain
-    most = POINTS if isinstance(domain, NamedPoints) else STARTS
+    most = RANDOM.points if isinstance(domain, NamedPoints) else RANDOM.starts
     places = [where for where in evidence.peaks if not isinstance(where, Between)][:most]
     found = fit_random_force(evidence.rig, search.data, evidence.residuals, places, evidence.data.force_rms)
     rms, rms_std = found.seen_rms

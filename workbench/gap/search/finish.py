@@ -9,40 +9,29 @@ import numpy as np
 from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of, place_values
 from workbench.gap.effects.limiting_cases import simpler_sets, wider_sets, with_one_simpler
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
-from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.search import Search, promise
+from workbench.gap.search.settings import FINISH, PURSUIT
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
-
-FINEST, ALL_BUT = 32, 1.5  # substeps of a sample, and the cost from which on they are tried
-STEPPING = 1e-4  # of the gap's power: what coarser substeps may leave of it
-IDLE = 0.5  # of the noise power: what an effect may take away and still be none
-NO_NEARER = 0.9
-AT_FIRST, TOO_FAR = 4, 30.0  # iterations of a simpler form on the quick records, and times a set's cost: it is none
-TRIED = 2  # iterations at each other place, before the likeliest are chosen
-LOWER = 0.98  # of the cost on the quick records: no lower, another place is the same valley or a worse one
-APART = 0.02  # of the extent: nearer, a place is the same valley
-WIDENING = 8  # iterations
-FACTORS = (1.0, 0.01, 0.1, 10.0, 100.0)
 
 
 def finished(search: Search, candidate: Fit) -> Fit:
     """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
     if candidate.falling == 0 and not search.explains(candidate):
-        finely = cost_of(search.rig, candidate.effects, search.data.stepped(FINE))
-        if finely - 1.0 > NO_NEARER * (candidate.cost - 1.0):
+        finely = cost_of(search.rig, candidate.effects, search.data.stepped(PURSUIT.fine))
+        if finely - 1.0 > FINISH.no_nearer * (candidate.cost - 1.0):
             return _by_finest_steps(search, candidate)
-    ended = fit(search.rig, candidate.effects, search.data.stepped(FINE), iterations=25, tolerance=1e-7)
+    ended = fit(search.rig, candidate.effects, search.data.stepped(PURSUIT.fine), iterations=25, tolerance=1e-7)
     return _by_finest_steps(search, ended)
 
 
 def _by_finest_steps(search: Search, ended: Fit) -> Fit:
     """The fit by the finest substeps, where it explains the records but for errors of stepping."""
-    near = ended.cost < ALL_BUT or search.near(ended, STEPPING)
+    near = ended.cost < FINISH.all_but or search.near(ended, FINISH.stepping)
     if search.explains(ended) or not near or not is_stepped(apply_all(search.rig, ended.effects)):
         return ended
     # its numbers have made up for errors of stepping, so its cost by finer steps tells nothing before a fit
-    finely = fit(search.rig, ended.effects, search.data.stepped(FINEST), iterations=6, tolerance=1e-5)
+    finely = fit(search.rig, ended.effects, search.data.stepped(FINISH.finest), iterations=6, tolerance=1e-5)
     return _with_stepping(search, finely) if finely.cost < ended.cost else ended
 
 
@@ -53,7 +42,9 @@ def _with_stepping(search: Search, finely: Fit) -> Fit:
     """
     if search.explains(finely):
         return finely
-    fine, half = (finite_residual(search.rig, finely.effects, search.data.stepped(n)) for n in (FINEST, FINEST // 2))
+    fine, half = (
+        finite_residual(search.rig, finely.effects, search.data.stepped(n)) for n in (FINISH.finest, FINISH.finest // 2)
+    )
     if fine is None or half is None:
         return finely
     return replace(finely, stepping=search.data.by_channel(fine - half).mean(axis=1))
@@ -64,10 +55,10 @@ def widened(search: Search, found: Fit) -> Fit:
     sets = list(wider_sets(found.effects))
     if not sets:
         return found
-    data = search.data.stepped(FINE)
+    data = search.data.stepped(PURSUIT.fine)
     cost = cost_of(search.rig, found.effects, data)
     for effects in sets:
-        trial = fit(search.rig, effects, data, iterations=WIDENING, workers=search.workers, chord=True)
+        trial = fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=True)
         if search.tells_apart(trial.cost, cost, trial.n_parameters - found.n_parameters):
             return trial
     return found
@@ -96,7 +87,7 @@ def relocated(search: Search, candidate: Fit) -> Fit:
         here = fit(search.rig, candidate.effects, search.quick, iterations=6)
         for moved in _elsewhere(search, candidate.effects, i):
             started = fit(search.rig, moved, search.quick, iterations=6)
-            if promise(started) > LOWER * here.cost:
+            if promise(started) > FINISH.lower * here.cost:
                 continue
             trial = fit(search.rig, started.effects, search.data, iterations=10)
             if trial.cost < candidate.cost:
@@ -116,14 +107,14 @@ def _elsewhere(search: Search, effects: tuple[Effect, ...], i: int) -> list[tupl
 
     strength = next((p for p in effect.parameters(search.rig) if p.logarithmic and p.name not in COORDINATES), None)
     # where the structure moves less, the same effect takes more strength
-    factors = FACTORS if strength is not None else (1.0,)
+    factors = FINISH.factors if strength is not None else (1.0,)
     tried = []
     for where in _other_places(effect, domain):
         there = [moved(where, factor) for factor in factors]
         likeliest = min(there, key=lambda s: cost_of(search.rig, s, search.first))
-        tried.append(fit(search.rig, likeliest, search.first, iterations=TRIED))
+        tried.append(fit(search.rig, likeliest, search.first, iterations=FINISH.tried))
     tried.sort(key=lambda f: f.cost)
-    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > APART]
+    elsewhere = [f for f in tried if domain.separation(f.effects[i].at, effect.at) > FINISH.apart]
     # the mirrored places are always worth a fit of their own, whatever their cost before it
     return [*(f.effects for f in elsewhere[:2]), *map(moved, _mirrored(effect.at, domain))]
 
@@ -174,9 +165,9 @@ def simplest(search: Search, candidate: Fit) -> Fit:
     here = cost_of(search.rig, candidate.effects, search.quick)
 
     def tried(effects: tuple[Effect, ...]) -> Fit | None:
-        if promise(fit(search.rig, effects, search.quick, iterations=AT_FIRST)) > TOO_FAR * here:
+        if promise(fit(search.rig, effects, search.quick, iterations=FINISH.at_first)) > FINISH.too_far * here:
             return None
-        trial = fit(search.rig, effects, search.data.stepped(FINE), iterations=12, tolerance=1e-7)
+        trial = fit(search.rig, effects, search.data.stepped(PURSUIT.fine), iterations=12, tolerance=1e-7)
         return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
 
     simpler = next(filter(None, search.workers.map(tried, _simpler_sets(search, candidate))), None)
@@ -186,7 +177,7 @@ def simplest(search: Search, candidate: Fit) -> Fit:
 def _simpler_sets(search: Search, candidate: Fit) -> Iterator[tuple[Effect, ...]]:
     for effect in candidate.effects if len(candidate.effects) > 1 else ():
         rest = tuple(other for other in candidate.effects if other is not effect)
-        if cost_of(search.rig, rest, search.data) < 1.0 + IDLE:
+        if cost_of(search.rig, rest, search.data) < 1.0 + FINISH.idle:
             yield rest
     yield from simpler_sets(candidate.effects, search.rig)
 

@@ -10,14 +10,11 @@ from workbench.arrays import Flags, Floats
 from workbench.gap.effects.effect import COORDINATES, Effect, Parameter, apply_all, key_of
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.search.settings import FIT
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 
 HOPELESS = 1e300
-BENT, MOST_BENT = 0.1, 0.75
-SLOPE_SUBSTEPS = 2
-WIDER, WIDER_PLACE = 30.0, 1000.0  # times the steps of a fit: of numbers a hundredth, of a place a thousandth of it
-PROMISED = 0.1  # of the tolerance: a step that promises less is not worth trying
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +96,7 @@ class _Problem:
     ):
         self.workers, self.known, self.chord = workers, known, chord
         self.rig, self.data, self.effects, self.held = rig, data, tuple(effects), tuple(held)
-        self.coarse = data.stepped(min(SLOPE_SUBSTEPS, data.substeps))
+        self.coarse = data.stepped(min(FIT.slope_substeps, data.substeps))
         self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
         floor = [
@@ -116,7 +113,7 @@ class _Problem:
     @cached_property
     def is_coarsened(self) -> bool:
         """Whether slopes are taken by coarser steps of time than residuals."""
-        return self.data.substeps > SLOPE_SUBSTEPS and is_stepped(apply_all(self.rig, (*self.effects, *self.held)))
+        return self.data.substeps > FIT.slope_substeps and is_stepped(apply_all(self.rig, (*self.effects, *self.held)))
 
     def at(self, free: np.ndarray) -> tuple[Effect, ...]:
         values = [dict(effect.values) for effect in self.effects]
@@ -192,7 +189,7 @@ def slopes(
     """
     problem = _Problem(rig, effects, data, held, workers)
     if wide:
-        problem.steps *= [WIDER_PLACE if p.name in COORDINATES else WIDER for _, p in problem.parameters]
+        problem.steps *= [FIT.wider_place if p.name in COORDINATES else FIT.wider for _, p in problem.parameters]
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")
@@ -254,7 +251,7 @@ def fit(
             damped = normal + damping * np.diag(diagonal)
             straight, moving = _straight(problem, free, gradient, damped)
             promised = -(2.0 * gradient + normal @ straight) @ straight
-            if promised < PROMISED * tolerance * cost:
+            if promised < FIT.promised * tolerance * cost:
                 break
             bend = _bend(problem, free, nearly, coarsely, jacobian, normal, damped, straight, moving)
             step = _bounded(problem, free, straight + bend)
@@ -316,14 +313,14 @@ def _bend(
     turn = np.zeros_like(step)
     if moving.sum() < 2:
         return turn
-    beside = problem.residual(free + BENT * step, coarsely=coarsely)
+    beside = problem.residual(free + FIT.bent * step, coarsely=coarsely)
     if beside is None:
         return turn
     # J' times the second derivative along the step
-    curvature = 2.0 / BENT * (jacobian.T @ (beside - residual) / BENT - normal @ step)
+    curvature = 2.0 / FIT.bent * (jacobian.T @ (beside - residual) / FIT.bent - normal @ step)
     turn[moving] = -0.5 * np.linalg.solve(damped[np.ix_(moving, moving)], curvature[moving])
     with np.errstate(over="ignore"):
-        small = 2.0 * np.linalg.norm(turn) < MOST_BENT * np.linalg.norm(step)
+        small = 2.0 * np.linalg.norm(turn) < FIT.most_bent * np.linalg.norm(step)
     return turn if small else np.zeros_like(step)
 
 

@@ -9,13 +9,9 @@ from workbench.gap.prediction.logged_inputs import noise_of_inputs
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.fit import Fit, parameters_of, slopes
+from workbench.gap.search.settings import INTERVALS
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
-
-ALIKE = 1e-4  # of a number, or of the extent: how far two numerical routes to the same records put it apart
-MOST_LEVERAGE = 0.5  # of a block on a direction that it alone tells: what there is no telling without it
-BLOCKS = 12  # a record: long beside the correlation of what is left, many enough to scatter
-DRAWS = 48  # of noise of the logged inputs: a standard deviation of 48 is told to a tenth
 
 
 def with_intervals(
@@ -57,7 +53,7 @@ def with_intervals(
     without = _without_each_block(residual, jacobian, data, information)
     spread = without.T @ without + level**2 * inverse @ np.diag(priors) @ inverse
     drawn = _by_noise_of_inputs(apply_all(rig, found.effects), data, residual, logged) @ jacobian @ inverse
-    of_inputs = drawn.T @ drawn / DRAWS
+    of_inputs = drawn.T @ drawn / INTERVALS.draws
     variances = np.max([np.diag(spread), level * np.diag(inverse), np.diag(of_inputs)], axis=0).clip(0.0)
     deviations: list[dict[str, float]] = [{} for _ in found.effects]
     for (i, parameter), deviation in zip(parameters, np.sqrt(variances / scale**2 + least**2), strict=True):
@@ -83,10 +79,10 @@ def _least(effect: Effect, parameter: Parameter) -> float:
     if parameter.prior_std is not None:
         return 0.0
     if parameter.logarithmic:
-        return ALIKE
+        return INTERVALS.alike
     value = effect.values[parameter.name]
     size = parameter.high if parameter.name in COORDINATES else abs(value - (parameter.neutral or 0.0))
-    return ALIKE * size / parameter.scale
+    return INTERVALS.alike * size / parameter.scale
 
 
 def _joint(information: np.ndarray, scatter: np.ndarray, level: float, n_blocks: int) -> np.ndarray:
@@ -119,7 +115,7 @@ def _stretched(root: np.ndarray, relative: np.ndarray) -> np.ndarray:
 
 
 def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: float) -> np.ndarray:
-    """What draws of noise of the logged inputs change a residual by: (DRAWS, n_values); none without such noise."""
+    """What draws of noise of the logged inputs change a residual by: (n_draws, n_values); none without such noise."""
     if not logged:
         return np.zeros((0, residual.size))
     rng = np.random.default_rng(0)
@@ -127,7 +123,7 @@ def _by_noise_of_inputs(rig: Rig, data: FitData, residual: np.ndarray, logged: f
     def drawn(record: Record) -> Record:
         return replace(record, inputs=record.inputs + logged * noise_of_inputs(record, rng))
 
-    draws = (replace(data, records=tuple(map(drawn, data.records))) for _ in range(DRAWS))
+    draws = (replace(data, records=tuple(map(drawn, data.records))) for _ in range(INTERVALS.draws))
     return np.array([each.residual(rig) - residual for each in draws])
 
 
@@ -143,10 +139,10 @@ def _without_each_block(
         n_outputs, n_samples = record.outputs.shape
         part = slice(start, start + n_outputs * n_samples)
         left, along = residual[part].reshape(n_outputs, -1), (jacobian[part] @ root).reshape(n_outputs, n_samples, -1)
-        for block in np.array_split(np.arange(n_samples), min(BLOCKS, n_samples)):
+        for block in np.array_split(np.arange(n_samples), min(INTERVALS.blocks, n_samples)):
             within = along[:, block].reshape(-1, root.shape[1])
             leverage, axes = np.linalg.eigh(within.T @ within)
             score = axes.T @ (within.T @ left[:, block].ravel())
-            changes.append(root @ (axes @ (score / (1.0 - np.minimum(leverage, MOST_LEVERAGE)))))
+            changes.append(root @ (axes @ (score / (1.0 - np.minimum(leverage, INTERVALS.most_leverage)))))
         start = part.stop
     return np.array(changes)

@@ -7,10 +7,9 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.outcome import Decision
-from workbench.gap.search.pursuit import HOPEFUL, on_whole_records, one_more
-from workbench.gap.search.search import RIVAL, Search
-
-TRIED = 2
+from workbench.gap.search.pursuit import on_whole_records, one_more
+from workbench.gap.search.search import Search
+from workbench.gap.search.settings import LAW, PURSUIT, SEARCH
 
 
 def one_law(search: Search, evidence: Evidence) -> Fit | None:
@@ -20,8 +19,8 @@ def one_law(search: Search, evidence: Evidence) -> Fit | None:
     """
     search.report("one force of another law", 0.35)
     beyond = replace(search, catalogue=BEYOND)
-    hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < HOPEFUL]
-    fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
+    hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < PURSUIT.hopeful]
+    fits = on_whole_records(beyond, hopeful, LAW.tried, to_cost=search.enough)
     return next((f for f in (_named(search, f) for f in fits) if search.explains(f)), None)
 
 
@@ -45,9 +44,9 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
         return decision
     search.report("one force of another law", 0.9)
     beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
-    as_near = cost_of(search.rig, best.effects, search.ahead) + RIVAL
+    as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
     hopeful = [f for f in one_more(beyond, (), there) if f.cost < as_near]
-    fits = on_whole_records(beyond, hopeful, TRIED, to_cost=search.enough)
+    fits = on_whole_records(beyond, hopeful, LAW.tried, to_cost=search.enough)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)

@@ -7,26 +7,14 @@ import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.search.beside_random import NEAR
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
 from workbench.gap.search.outcome import Decision, unexplained
 from workbench.gap.search.pursuit import is_hopeful, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.screening import Weighed
 from workbench.gap.search.search import Search, in_one_valley
+from workbench.gap.search.settings import PAIRS, RANDOM
 from workbench.structure.domain import Between
-
-FINALISTS, MORE = 4, 2  # pairs that are fitted to whole records: of all at once, and of those with one given
-ASTRAY = 1e4  # times the gap's power
-MOVED = 0.1  # of a number: what makes the half of a pair another one than it was alone
-NEARER = 0.5  # of what another near miss leaves: what makes one worth the same search again
-SAME = 1.1  # of the gap left by a set: nearer, its fits end alike
-VERY_NEAR = 0.2 * NEAR  # what is tried in simpler forms, and from other places before beside other single effects
-MOST = 0.3  # of the gap's power left: a pair that leaves less may be two of three
-LEAST = 0.002  # likewise: what is left of a measured gap bends to any law
-EXCHANGES = 2  # rounds of keeping either half of the best pair ahead
-TRIED_FURTHER = 2  # pairs, best first, that are tried from other places too
-TOLD = 4  # sets, best first, that may be named or be rivals
 
 
 @dataclass(eq=False)
@@ -65,14 +53,14 @@ class Pairs:
     def with_a_third(self) -> bool:
         """Whether the best pair and one more effect explain the records, where the pair leaves enough for one."""
         search = self.search
-        if not self.found or not search.near(self.found[0], MOST) or search.near(self.found[0], LEAST):
+        if not self.found or not search.near(self.found[0], PAIRS.most) or search.near(self.found[0], PAIRS.least):
             return False
         search.report("the best pair and another", 0.45)
         pair = self.found[0].effects
         if self._and_another(pair):
             return True
         best = self.found[0]
-        if len(best.effects) <= len(pair) or not search.near(best, VERY_NEAR):
+        if len(best.effects) <= len(pair) or not search.near(best, PAIRS.very_near):
             return False
         # with a third beside them, one of the two may have stood in for another
         return self._and_another(tuple(_weightiest_first(search, best)[:-1]))
@@ -87,15 +75,15 @@ class Pairs:
 
         A strong effect is found beside whatever stands in for the other; what it leaves tells the other's place.
         """
-        for _ in range(EXCHANGES):
+        for _ in range(PAIRS.exchanges):
             if not self.ahead:
                 return False
             best = self.ahead[0]
             if self._beside_any(_weightiest_first(self.search, best)):
                 return True
-            if self.ahead[0].cost > NEARER * best.cost:
+            if self.ahead[0].cost > PAIRS.nearer * best.cost:
                 break
-        return self._from_elsewhere(VERY_NEAR)
+        return self._from_elsewhere()
 
     def beside(self, effect: Effect) -> bool:
         """Whether a pair with this effect explains the records."""
@@ -109,7 +97,7 @@ class Pairs:
         Args:
             start: what is there with no effect.
         """
-        likeliest = best_of_each(self.found or [start])[:TOLD]
+        likeliest = best_of_each(self.found or [start])[: PAIRS.told]
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
             plain = plainest(self.search, explaining)
@@ -119,17 +107,17 @@ class Pairs:
         return unexplained(start, best, rivals)
 
     def _near(self) -> bool:
-        return bool(self.found) and self.search.near(self.found[0], NEAR)
+        return bool(self.found) and self.search.near(self.found[0], RANDOM.near)
 
     def _explained_by(self, ahead: Sequence[Fit]) -> bool:
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
         domain = self.search.rig.modes.domain
         hopeful = [f for f in ahead if is_hopeful(self.search, f)]
         fresh = [f for f in hopeful if not any(in_one_valley(f, other, domain) for other in self.followed)]
-        most = MORE if self.found else FINALISTS
+        most = PAIRS.more if self.found else PAIRS.finalists
         self.followed += fresh[:most]
         self._add(on_whole_records(self.search, fresh, most))
-        near = [pair for pair in self.found[:TRIED_FURTHER] if not _done(pair, self.ended)]
+        near = [pair for pair in self.found[: PAIRS.tried_further] if not _done(pair, self.ended)]
         taken = _to_their_ends(self.search, near)
         self.ended += [*near, *taken]
         self._add(taken)
@@ -144,17 +132,17 @@ class Pairs:
         """Whether a pair with one of these effects explains the records; those given before are not tried again."""
         return any(self.beside(h) for h in halves if not any(_unmoved(h, other) for other in self.given))
 
-    def _from_elsewhere(self, share: float = NEAR) -> bool:
+    def _from_elsewhere(self) -> bool:
         """Whether one of the best pairs explains the records with other places, or leads to one that does."""
         search = self.search
-        likeliest = best_of_each(self.found)[:TRIED_FURTHER]
-        fresh = [f for f in likeliest if search.near(f, share) and not _done(f, self.moved)]
+        likeliest = best_of_each(self.found)[: PAIRS.tried_further]
+        fresh = [f for f in likeliest if search.near(f, PAIRS.very_near) and not _done(f, self.moved)]
         elsewhere = search.side_by_side(relocated, fresh)
         self.moved += [*fresh, *elsewhere]
         self._add(elsewhere)
         if any(search.explains(pair) for pair in elsewhere):
             return True
-        nearer = all(self.found[0].cost - 1.0 < NEARER * (missed.cost - 1.0) for missed in self.missed)
+        nearer = all(self.found[0].cost - 1.0 < PAIRS.nearer * (missed.cost - 1.0) for missed in self.missed)
         return self._near() and nearer and self._by_halves()
 
     def _add(self, pairs: Sequence[Fit]) -> None:
@@ -163,7 +151,7 @@ class Pairs:
 
 def _evidence(search: Search, effect: Effect) -> Evidence:
     """Of the rig with the effect; without it where the motion of whole records would run away with it alone."""
-    astray = cost_of(search.rig, (effect,), search.data) > ASTRAY * search.nominal.mean()
+    astray = cost_of(search.rig, (effect,), search.data) > PAIRS.astray * search.nominal.mean()
     rig = search.rig if astray else apply_all(search.rig, (effect,))
     return search.evidence_of(rig)
 
@@ -182,12 +170,12 @@ def _unmoved(one: Effect, other: Effect) -> bool:
     if one.label != other.label or (isinstance(one.at, str | Between) and one.at != other.at):
         return False
     numbers = [name for name, value in one.values.items() if isinstance(value, float)]
-    return all(np.isclose(one.values[n], other.values[n], rtol=MOVED) for n in numbers)
+    return all(np.isclose(one.values[n], other.values[n], rtol=PAIRS.moved) for n in numbers)
 
 
 def _done(pair: Fit, ended: Sequence[Fit]) -> bool:
     """Whether the same set was taken to its end before, from hardly another place."""
-    return any(pair.key == other.key and other.cost - 1.0 < SAME * (pair.cost - 1.0) for other in ended)
+    return any(pair.key == other.key and other.cost - 1.0 < PAIRS.same * (pair.cost - 1.0) for other in ended)
 
 
 def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
@@ -195,5 +183,5 @@ def _to_their_ends(search: Search, pairs: Sequence[Fit]) -> list[Fit]:
     ended = search.side_by_side(finished, pairs)
     if any(search.explains(pair) for pair in ended):
         return ended
-    near = [pair for pair in ended if search.near(pair, VERY_NEAR)]
+    near = [pair for pair in ended if search.near(pair, PAIRS.very_near)]
     return [*search.side_by_side(simplified, near), *(pair for pair in ended if pair not in near)]

@@ -13,26 +13,18 @@ from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.finish import finished
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.jointly import on_their_sides, surely_late
-from workbench.gap.search.pursuit import FINE
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import WORTHWHILE, Search
+from workbench.gap.search.search import Search
+from workbench.gap.search.settings import PLAIN, PURSUIT, SEARCH
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
-MOST_COMMON = {"modulus_error": 0.05, "modal_damping": 0.5}  # logarithms: more is an effect of its own
-MOST_ALONE = {"modulus_error": 0.015, "modal_damping": 0.25}  # likewise, where only one of them is there
-PLAINLY = 8  # iterations without errors
-PUNCTUAL = 0.01  # of a sample: sensors that are late by less are not
-NEAR = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
-NEEDLESS = 6.0  # twice the log-likelihood that one number more may gain by chance
-SEVERAL = 3  # sensors, of which one alone is hardly late by chance
-LIKELIEST = 4  # kinds of the one more that are tried
 
 
 def are_common(effects: Sequence[Effect]) -> bool:
     """Whether effects are the errors common to all modes and all along, each no larger than errors may be."""
     return {effect.kind for effect in effects} == set(COMMON) and all(
-        abs(np.log(effect.values["factor"])) < MOST_COMMON[effect.kind.name] for effect in effects
+        abs(np.log(effect.values["factor"])) < dict(PLAIN.most_common)[effect.kind.name] for effect in effects
     )
 
 
@@ -48,7 +40,7 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
     others = [e for e in found.effects if e.kind not in COMMON]
     late = next((e for e in others if e.kind is NOMINAL_ERRORS), None)
     named = [e for e in others if e is not late]
-    most = MOST_ALONE if len(common) == 1 else MOST_COMMON
+    most = dict(PLAIN.most_alone if len(common) == 1 else PLAIN.most_common)
     if (
         len(common) < (1 if alone else len(COMMON))
         or not named
@@ -103,7 +95,7 @@ def _one_common(search: Search, common: tuple[Effect, ...], late: tuple[Effect, 
 
     A model that is a little off is so in both.
     """
-    most = both.cost + NEEDLESS / search.data.n_values
+    most = both.cost + PLAIN.needless / search.data.n_values
     alone = [found for one in common if (found := _explaining(search, [(one, *late)])) and found.cost < most]
     return min(alone, key=lambda f: f.cost, default=None)
 
@@ -111,7 +103,7 @@ def _one_common(search: Search, common: tuple[Effect, ...], late: tuple[Effect, 
 def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:
     """What the errors say of the timing of the sensors, where they say anything of it."""
     prior = errors.target
-    if prior.delay <= PUNCTUAL:
+    if prior.delay <= PLAIN.punctual:
         return ()
     timing = NominalPrior(delay=prior.delay, sample_time=prior.sample_time, late=prior.late, early=prior.early)
     return (nominal_errors(search.rig, timing, errors.values),)
@@ -119,13 +111,13 @@ def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:
 
 def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | None:
     """The simplest of sets that leaves only noise, or another that is surely likelier and no more of the same."""
-    quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAINLY), list(sets))
+    quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.plainly), list(sets))
     best: Fit | None = None
-    for candidate in sorted((f for f in quickly if f.cost < NEAR), key=lambda f: f.n_parameters):
+    for candidate in sorted((f for f in quickly if f.cost < PLAIN.near), key=lambda f: f.n_parameters):
         if best is not None and _labels(best) <= _labels(candidate):
             continue
         effects = _on_their_sides(search, candidate.effects)
-        found = fit(search.rig, effects, search.data.stepped(FINE), iterations=PLAINLY)
+        found = fit(search.rig, effects, search.data.stepped(PURSUIT.fine), iterations=PLAIN.plainly)
         more = 0 if best is None else found.n_parameters - best.n_parameters
         if search.explains(found) and (best is None or search.surely_better(found, best.cost, more)):
             best = found
@@ -147,14 +139,14 @@ def _on_their_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect
 def _with_one_late(search: Search, found: Fit) -> Fit:
     """The fit with a delay as the effect that it is where one of several sensors is late alone."""
     late = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
-    if late is None or len(late.values) < SEVERAL:
+    if late is None or len(late.values) < PLAIN.several:
         return found
     delays = {name.removeprefix("delay_"): float(value) for name, value in late.values.items()}
-    off = [name for name, delay in delays.items() if abs(delay) > PUNCTUAL]
+    off = [name for name, delay in delays.items() if abs(delay) > PLAIN.punctual]
     if len(off) != 1 or delays[off[0]] < 0:
         return found
     delay = Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * late.target.sample_time})
-    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(FINE))
+    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(PURSUIT.fine))
     return alone if search.explains(alone) else found
 
 
@@ -163,16 +155,16 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
     alike = tuple(kind for kind in search.catalogue if kind.path == "structure" and not kind.nonlinear)
     if not alike:
         return None
-    given = fit(search.rig, effects, search.quick, iterations=PLAINLY).effects
+    given = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly).effects
     evidence = search.evidence_of(apply_all(search.rig, given))
     weighed = Weighed.of(replace(search, catalogue=alike), given, evidence).likeliest()
     likeliest = {effect.kind: effect for effect in reversed(weighed)}  # the best of each kind
-    more = [(*given, effect) for effect in weighed if effect is likeliest[effect.kind]][:LIKELIEST]
+    more = [(*given, effect) for effect in weighed if effect is likeliest[effect.kind]][: PLAIN.likeliest]
     found = _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))])
     if found is None:
         return None
     rest = [e for e in found.effects if e.kind in COMMON or any(e.label == other.label for other in given)]
-    without = fit(search.rig, rest, search.data.stepped(FINE), iterations=PLAINLY)
+    without = fit(search.rig, rest, search.data.stepped(PURSUIT.fine), iterations=PLAIN.plainly)
     extra = found.n_parameters - without.n_parameters
-    worth = without.cost - found.cost > WORTHWHILE and search.surely_better(found, without.cost, extra)
+    worth = without.cost - found.cost > SEARCH.worthwhile and search.surely_better(found, without.cost, extra)
     return found if worth else None

@@ -5,26 +5,13 @@ from collections.abc import Sequence
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import contained
 from workbench.gap.localisation.evidence import Evidence
-from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import FURTHER, RIVAL, WORTHWHILE, Search, in_one_valley, promise, spread_over_kinds
+from workbench.gap.search.search import Search, in_one_valley, promise, spread_over_kinds
+from workbench.gap.search.settings import PURSUIT, SEARCH
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import NamedPoints
-
-FINE = 8  # substeps of a sample
-TARGETS_A_KIND = 3  # of single effects that are tried
-TRIED, LIKELY, LIKELIEST = 16, 10, 5  # sets that are fitted ahead: to one record, to two, to their end
-EXCHANGED = 2  # likeliest effects in whose places other kinds are tried
-FAR_BEHIND = 10.0  # times the least promise: what is not fitted to its end
-HOPEFUL = 5.0  # times the noise one sample ahead: more is left by no set that explains the records, or this share of
-HOPEFUL_SHARE = 0.05  # what the nominal rig leaves there, where steps of half a sample cost more than a small noise
-LETTING_GO = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)  # how loosely rigs are held beside the records, one after the other
-AT_HAND = 10.0  # times the noise: so near, whole records tell the way
-CLOSE = 2.0  # times the least cost ahead: what may still come first on whole records
-AT_FIRST = 5  # iterations on whole records, before it is seen which sets go on
-RUNNING = 2.0  # times the least promise on whole records: what is fitted to its end
 
 
 def one_more(
@@ -39,7 +26,7 @@ def one_more(
     weighed = Weighed.of(search, given, evidence) if weighed is None else weighed
     chosen: list[Effect] = []
     for effect in weighed.likeliest():
-        if sum(effect.kind is other.kind for other in chosen) < TARGETS_A_KIND:
+        if sum(effect.kind is other.kind for other in chosen) < PURSUIT.targets_a_kind:
             chosen.append(effect)
     found = fitted_ahead(search, [(*given, effect) for effect in chosen])
     if not (search.held and found):
@@ -57,7 +44,7 @@ def _exchanged(found: Sequence[Fit], weighed: Weighed) -> list[Effect]:
 
     if isinstance(weighed.domain, NamedPoints):
         return []
-    likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][:EXCHANGED]
+    likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][: PURSUIT.exchanged]
     starts = {effect.kind: effect for effect in reversed(weighed.likeliest()) if is_linear(effect)}
     return [e.moved_to(one.at) for one in likeliest for e in starts.values() if e.kind is not one.kind]
 
@@ -68,12 +55,12 @@ def pairs_at_once(search: Search, weighed: Weighed) -> list[Fit]:
     Args:
         weighed: with nothing given.
     """
-    return fitted_ahead(search, weighed.likeliest_pairs(TRIED))
+    return fitted_ahead(search, weighed.likeliest_pairs(PURSUIT.tried))
 
 
 def is_hopeful(search: Search, candidate: Fit) -> bool:
     """Whether a fit one sample ahead may explain whole records."""
-    return candidate.cost < max(HOPEFUL, HOPEFUL_SHARE * search.nominal_ahead)
+    return candidate.cost < max(PURSUIT.hopeful, PURSUIT.hopeful_share * search.nominal_ahead)
 
 
 def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
@@ -86,12 +73,12 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
     def ahead(effects: tuple[Effect, ...], data: FitData, iterations: int) -> Fit:
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
-    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[:TRIED])
-    likely = sorted(tried, key=promise)[:LIKELY]
+    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[: PURSUIT.tried])
+    likely = sorted(tried, key=promise)[: PURSUIT.likely]
     fits = distinct_valleys(
         search, sorted(search.workers.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
     )
-    falling = [f for f in fits[:LIKELIEST] if f.falling and promise(f) < FAR_BEHIND * promise(fits[0])]
+    falling = [f for f in fits[: PURSUIT.likeliest] if f.falling and promise(f) < PURSUIT.far_behind * promise(fits[0])]
     longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8), falling)
     return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
 
@@ -106,7 +93,7 @@ def distinct_valleys(search: Search, fits: Sequence[Fit]) -> list[Fit]:
 
 
 def on_whole_records(
-    search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf"), at_first: int = AT_FIRST
+    search: Search, ahead: Sequence[Fit], most: int, *, to_cost: float = float("inf"), at_first: int | None = None
 ) -> list[Fit]:
     """The best of fits ahead, fitted to whole records, best first.
 
@@ -114,28 +101,29 @@ def on_whole_records(
         ahead: best first.
         most: at most so many, and none that is far behind.
         to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
-        at_first: iterations before that is asked.
+        at_first: iterations before that is asked; as the settings have it unless given.
     """
-    close = [f for f in ahead[:most] if f.cost < CLOSE * ahead[0].cost]
+    at_first = PURSUIT.at_first if at_first is None else at_first
+    close = [f for f in ahead[:most] if f.cost < PURSUIT.close * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
     fits = search.workers.map(lambda f: followed(search, f.effects, at_first), first)
     rest = [f for f in close if f not in first]
     if any(search.explains(f) for f in fits):
-        rest = [f for f in rest if f.cost < ahead[0].cost + RIVAL]
+        rest = [f for f in rest if f.cost < ahead[0].cost + SEARCH.rival]
     others = _none_that_contains(search, fits, rest)
     fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, at_first), others)), key=promise)
     fits = _none_that_contains(search, fits, fits)
-    to_cost = min([to_cost, *(f.cost + RIVAL for f in fits if search.explains(f))])
-    running = [f for f in fits if f.falling and promise(f) < RUNNING * promise(fits[0])]
-    running = [f for f in running if promise(f, FURTHER) < to_cost]
+    to_cost = min([to_cost, *(f.cost + SEARCH.rival for f in fits if search.explains(f))])
+    running = [f for f in fits if f.falling and promise(f) < PURSUIT.running * promise(fits[0])]
+    running = [f for f in running if promise(f, SEARCH.further) < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
 
 
 def _none_that_contains(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
     """The others but those that come, at bounds of their numbers, to a fit that leaves nothing worth an effect."""
-    enough = {f.key for f in fits if f.cost < 1.0 + WORTHWHILE and search.explains(f)}
+    enough = {f.key for f in fits if f.cost < 1.0 + SEARCH.worthwhile and search.explains(f)}
     return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
 
 
@@ -150,16 +138,19 @@ def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
     """
     rig = apply_all(search.rig, effects)
     if is_stepped(rig) and not search.held and search.data.follower is None:
-        for loose in LETTING_GO:
-            data = search.data.following(rig, loose).stepped(FINE)
+        for loose in PURSUIT.letting_go:
+            data = search.data.following(rig, loose).stepped(PURSUIT.fine)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
             effects = held.effects
-            if held.cost > HOPEFUL or cost_of(search.rig, effects, search.data.stepped(FINE)) < AT_HAND:
+            if (
+                held.cost > PURSUIT.hopeful
+                or cost_of(search.rig, effects, search.data.stepped(PURSUIT.fine)) < PURSUIT.at_hand
+            ):
                 break
     return whole(search, effects, iterations)
 
 
 def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to whole records."""
-    data = search.data.stepped(FINE)
+    data = search.data.stepped(PURSUIT.fine)
     return fit(search.rig, effects, data, held=search.held, iterations=iterations)

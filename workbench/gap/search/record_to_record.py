@@ -10,14 +10,8 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.record_to_record import differing, figures_of
 from workbench.gap.search.jointly import Step
 from workbench.gap.search.search import Search
+from workbench.gap.search.settings import RECORDS
 from workbench.gap.search.stepwise import Stepwise
-
-TRIED = np.array([-0.02, -0.01, -0.005, -0.002, 0.0, 0.002, 0.005, 0.01, 0.02])  # deviations, a parabola between them
-ENOUGH = 0.3  # share of what a step leaves above the noise that deviations of records must take away
-HALF = 0.5  # of what is left without: what a figure that differs must leave, at most
-CLEARLY = 0.9  # of what another figure leaves: the first is preferred to what leaves more
-BLOCKS = 12  # a record, whose scatter tells how sure its deviation is
-SURE = 4.0  # standard deviations that two records must be apart by, for the scatter to be more than chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +35,7 @@ class Deviations:
     def is_sure(self) -> bool:
         """Whether the two records that are farthest apart differ by more than chance."""
         i, j = int(self.values.argmin()), int(self.values.argmax())
-        return bool(self.values[j] - self.values[i] > SURE * np.hypot(self.spread[i], self.spread[j]))
+        return bool(self.values[j] - self.values[i] > RECORDS.sure * np.hypot(self.spread[i], self.spread[j]))
 
 
 def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviations:
@@ -57,8 +51,8 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
     names = [record.name for record in data.records]
     ends = np.cumsum([record.outputs.size for record in data.counted])[:-1]
     residuals = []  # by deviation tried, by record
-    for tried in TRIED:
-        residual = data.residual(differing(rig, figure, dict.fromkeys(names, float(tried))))
+    for deviation in RECORDS.tried:
+        residual = data.residual(differing(rig, figure, dict.fromkeys(names, deviation)))
         residuals.append(np.split(residual, ends))
     costs = np.array([[float(r @ r) / r.size for r in each] for each in residuals])
     least = [_least(cost) for cost in costs.T]
@@ -73,21 +67,22 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
 
 
 def _least(costs: Floats) -> tuple[float, float]:
-    """Where a parabola through the least of the costs at `TRIED` and its neighbours is least, and how small."""
-    i = int(np.clip(costs.argmin(), 1, len(TRIED) - 2))
-    x = TRIED[i - 1 : i + 2]
+    """Where a parabola through the least of the costs at deviations tried, and its neighbours, is least; how small."""
+    tried = np.array(RECORDS.tried)
+    i = int(np.clip(costs.argmin(), 1, tried.size - 2))
+    x = tried[i - 1 : i + 2]
     curve = np.polyfit(x, costs[i - 1 : i + 2], 2)
-    at = float(np.clip(-0.5 * curve[1] / curve[0], *TRIED[[0, -1]])) if curve[0] > 0 else float(TRIED[costs.argmin()])
+    at = float(np.clip(-0.5 * curve[1] / curve[0], *tried[[0, -1]])) if curve[0] > 0 else float(tried[costs.argmin()])
     return at, float(np.clip(np.polyval(curve, at), 0.0, costs.min()))
 
 
 def _spread(residuals: Sequence[Floats], n_outputs: int) -> float:
-    """Standard deviation of a record's deviation, by its residuals (n_values,) at each of `TRIED`."""
-    i = int(np.clip(np.argmin([r @ r for r in residuals]), 1, len(TRIED) - 2))
-    along = (residuals[i + 1] - residuals[i - 1]) / (TRIED[i + 1] - TRIED[i - 1])
+    """Standard deviation of a record's deviation, by its residuals (n_values,) at each deviation tried."""
+    i = int(np.clip(np.argmin([r @ r for r in residuals]), 1, len(RECORDS.tried) - 2))
+    along = (residuals[i + 1] - residuals[i - 1]) / (RECORDS.tried[i + 1] - RECORDS.tried[i - 1])
     # by time, all sensors together
     gradient = (along * residuals[i]).reshape(n_outputs, -1).sum(axis=0)
-    blocks = np.array([block.sum() for block in np.array_split(gradient, BLOCKS)])
+    blocks = np.array([block.sum() for block in np.array_split(gradient, RECORDS.blocks)])
     return float(np.sqrt(((blocks - blocks.mean()) ** 2).sum()) / max(float(along @ along), 1e-300))
 
 
@@ -100,8 +95,8 @@ def likeliest(search: Search, step: Step) -> Deviations | None:
         return None
     noise = float(step.noise_power.mean())
     found = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
-    hopeful = [d for d in found if d.is_sure and d.in_common - d.left > ENOUGH * (d.in_common - noise)]
-    return min(hopeful, key=lambda d: d.left * (CLEARLY if d is found[0] else 1.0), default=None)
+    hopeful = [d for d in found if d.is_sure and d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
+    return min(hopeful, key=lambda d: d.left * (RECORDS.clearly if d is found[0] else 1.0), default=None)
 
 
 def beside_records(before: Stepwise) -> Stepwise | None:
@@ -123,7 +118,7 @@ def beside_records(before: Stepwise) -> Stepwise | None:
     search.report(f"{asked.figure} that differs from record to record", 0.5)
     beside = Stepwise(replace(search, differs=asked.figure), before.tolerance, before.singles)
     noise = nearest.noise_power
-    if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < HALF * nearest.excess(noise):
+    if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < RECORDS.half * nearest.excess(noise):
         beside.run()
         return beside
     return None

@@ -12,14 +12,13 @@ from workbench.gap.effects.effect import ALL, Effect, Kind, apply_all
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.workers import shared_array
 from workbench.gap.search.fit import finite_residual, slopes
-from workbench.gap.search.search import ELSEWHERE, Search, apart
+from workbench.gap.search.search import Search, apart
+from workbench.gap.search.settings import SCREENING, SEARCH
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, NamedPoints
 
-WEAKER, STRONGER = 0.03, 30.0  # than at its start: what an effect may turn out to be
 RUNAWAY = 1e10  # mean square, in noise units, of errors that tell nothing
 NOTHING = 1e-300  # square of a move that given effects make up for whole
-MOST_VALUES = 20_000  # of the errors that are weighed
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +55,7 @@ class Weighed:
         before = finite_residual(search.rig, (*given, *search.held), data)
         if before is None:
             return cls((), np.zeros((0, 0)), np.zeros(0), np.zeros(0), np.zeros(0), search.rig.modes.domain)
-        thin = slice(None, None, max(1, before.size // MOST_VALUES))
+        thin = slice(None, None, max(1, before.size // SCREENING.most_values))
 
         tasks = _starts(search, given, evidence)
         starts = [start for task in tasks for start in task]
@@ -134,7 +133,7 @@ class Weighed:
             alike: Flags = names[:, None] == names
             return alike
         at = np.array([[start.values.get(name, 0.0) for name in self.domain.coordinates] for start in self.starts])
-        beside: Flags = np.linalg.norm(at[:, None] - at, axis=2) <= ELSEWHERE * self.domain.size
+        beside: Flags = np.linalg.norm(at[:, None] - at, axis=2) <= SEARCH.elsewhere * self.domain.size
         return beside
 
     def _of_pairs(self) -> np.ndarray:
@@ -157,7 +156,7 @@ def _bounds(starts: list[Effect]) -> tuple[float, float]:
     """Of the strength of one kind and target, in units of a start's."""
     if not starts[0].values:
         return 1.0, 1.0
-    return (-STRONGER if starts[0].kind.signed else WEAKER), STRONGER
+    return (-SCREENING.stronger if starts[0].kind.signed else SCREENING.weaker), SCREENING.stronger
 
 
 def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> list[list[Effect]]:

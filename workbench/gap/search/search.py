@@ -18,20 +18,10 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import HOPELESS, Fit, cost_of, sensitivity
+from workbench.gap.search.settings import SEARCH
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain
 from workbench.structure.member import Structure
-
-SLACK = 0.03  # of the noise power: what two good finite-element models may differ by
-INTEGRATION_SHARE = 2e-6  # of the gap's power: errors of stepping
-SURE = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
-TRIFLE = 0.005  # of the noise power: no set is preferred to a simpler one for less, whatever the likelihood says
-WORTHWHILE = 0.01  # of the noise power: less is no effect but an imperfect model
-ELSEWHERE = 0.1  # of the extent: nearer, two places are in one valley of the cost at first
-SAME_PLACE = 0.02  # of the extent: nearer, fits go on to the same end
-RIVAL = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
-FURTHER = 100  # iterations like the last: a cost that they leave too high comes no lower in time
-COARSE = 2.0  # times the noise: below, rounding errors are all but white and of no signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,14 +63,14 @@ class Search:
             return False
         left = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
-        slack = SLACK + 5.0 * np.sqrt(2.0 / per_record) + INTEGRATION_SHARE * self.nominal.mean(axis=1)
+        slack = SEARCH.slack + 5.0 * np.sqrt(2.0 / per_record) + SEARCH.integration_share * self.nominal.mean(axis=1)
         slack = slack + candidate.stepping
         return bool((left < 1.0 + slack).all() and left.mean() < self.enough + np.mean(candidate.stepping))
 
     @property
     def enough(self) -> float:
         """The cost of a set that explains the records, at most."""
-        return float(1.0 + SLACK + INTEGRATION_SHARE * self.nominal.mean())
+        return float(1.0 + SEARCH.slack + SEARCH.integration_share * self.nominal.mean())
 
     def crowded(self, effects: Sequence[Effect]) -> bool:
         """Whether nonlinear effects stand for one law: two of a kind, or three of any, side by side."""
@@ -95,11 +85,11 @@ class Search:
     def surely_better(self, candidate: Fit, than: float, extra: int) -> bool:
         """Whether the gain in likelihood pays for `extra` more numbers."""
         n = self.data.n_values
-        return bool(n * (than - candidate.cost) > SURE + extra * np.log(n))
+        return bool(n * (than - candidate.cost) > SEARCH.sure + extra * np.log(n))
 
     def worthwhile(self, candidate: Fit, than: float) -> bool:
         """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
-        return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > WORTHWHILE
+        return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > SEARCH.worthwhile
 
     def tells_apart(self, better: float, cost: float, extra: int) -> bool:
         """Whether records surely prefer the lower of two costs, for `extra` more numbers, and by more than a trifle."""
@@ -108,7 +98,7 @@ class Search:
     def pays(self, gain: float, extra: int) -> bool:
         """The same of a gain: twice the log-likelihood, a value."""
         n = self.data.n_values
-        return gain > TRIFLE and n * gain > SURE + extra * np.log(n)
+        return gain > SEARCH.trifle and n * gain > SEARCH.sure + extra * np.log(n)
 
     def near(self, candidate: Fit, share: float) -> bool:
         """Whether at most this share of the gap's power is left."""
@@ -143,7 +133,7 @@ class Search:
 
     def hearing(self) -> "Search":
         """The same search without sensors that clip or round coarsely: what they do not show would pass for a force."""
-        kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < COARSE * s.noise_std]
+        kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < SEARCH.coarse * s.noise_std]
         if not kept or len(kept) == len(self.rig.sensors):
             return self
         sensors = tuple(self.rig.sensors[j] for j in kept)
@@ -231,7 +221,7 @@ def spread_over_kinds(fits: Sequence[Fit], most: int) -> list[Fit]:
 
 def apart(one: Effect, other: Effect, domain: Domain) -> bool:
     """Whether two effects stand far enough apart to be in different valleys; those of no place always do."""
-    return one.at is None or domain.separation(one.at, other.at) > ELSEWHERE
+    return one.at is None or domain.separation(one.at, other.at) > SEARCH.elsewhere
 
 
 def in_one_valley(one: Fit, other: Fit, domain: Domain) -> bool:
@@ -243,7 +233,7 @@ def in_one_valley(one: Fit, other: Fit, domain: Domain) -> bool:
     if one.key != other.key:
         return False
     both = ((here.at, there.at) for here, there in zip(in_order(one), in_order(other), strict=True))
-    return all(here is None or domain.separation(here, there) < SAME_PLACE for here, there in both)
+    return all(here is None or domain.separation(here, there) < SEARCH.same_place for here, there in both)
 
 
 def _sorted_by(where: Any) -> tuple[Any, ...]:

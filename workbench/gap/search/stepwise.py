@@ -1,7 +1,7 @@
 """Effects added one after the other, each beside a nominal model that is a little wrong everywhere."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -14,75 +14,14 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
-from workbench.gap.search.jointly import SETTINGS as JOINTLY
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.outcome import Decision
-from workbench.gap.search.plain import COMMON, MOST_COMMON, in_place_of_errors
+from workbench.gap.search.plain import COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import one_more
-from workbench.gap.search.search import WORTHWHILE, Search, most_telling, spread_over_kinds
+from workbench.gap.search.search import Search, most_telling, spread_over_kinds
+from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, STEPWISE
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
-
-
-@dataclass(frozen=True)
-class StepwiseSettings:
-    """Constants of the stepwise selection.
-
-    Attributes:
-        shorter: description length, nats, that such an effect must save.
-        singles: effects alone, as they were found without errors, that are tried as the first.
-        candidates: sets fitted on whole records at each step.
-        finalists, near: how many of them are fitted to all records, and times the least cost of what may come first.
-        most: effects of a set; no case of the format hides more than three.
-        excess: share of what errors of the nominal model leave above the noise that the first effect must take away. On
-            practice cases the right one takes over 0.9, the best wrong one under 0.1.
-        further_excess: likewise of what other effects leave, for one more beside them: of three, two leave much.
-        least: share of the nominal gap's power above the noise: one more that takes away less must take away as much of
-            what others leave as the first does. What is left of a measured gap bends to any law; a servo drive's
-            friction varies by a tenth along its rail.
-        promising: share of what the best candidate takes away one sample ahead that another must take away to be tried.
-        as_good: likewise, for a kind to be tried at a second place too.
-        ahead: share of the cost one sample ahead that the best candidate must take away to be tried at all.
-        simpler: share by which a set may leave more above the noise and still be taken for being simpler.
-        needless: likewise, for a set with one effect less.
-        explained: share of the nominal gap's power above the noise that an explanation may leave.
-        further: likewise, that a further effect is looked for to explain.
-        in_part: likewise, for effects that are named although something else is there.
-        no_gap: share of the noise power above it that is no gap: a tenth of the noise by amplitude is 0.2 of its power.
-        spotless: likewise, that errors of the model alone leave in trials that hide nothing: under 0.02 in 40 of them.
-        excluded: probability below which another set that explains the records is no rival.
-        astray: share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray.
-        loud: times the noise of the sensors that a set must leave above it for noise of the inputs to be heard in it;
-            less of it does no harm to a mean square.
-        too_white: mean square, white, beside noise of the inputs, for less of which that was not what was left.
-    """
-
-    shorter: float = 30.0
-    singles: int = 3
-    candidates: int = 4
-    finalists: int = 2
-    near: float = 2.0
-    most: int = 4
-    excess: float = 0.5
-    further_excess: float = 0.25
-    least: float = 0.002
-    promising: float = 0.2
-    as_good: float = 0.9
-    ahead: float = 0.005
-    simpler: float = 0.05
-    needless: float = 0.3
-    explained: float = 0.01
-    further: float = 1e-3
-    in_part: float = 0.2
-    no_gap: float = 0.15
-    spotless: float = 0.05
-    excluded: float = 1e-3
-    astray: float = 0.02
-    loud: float = 0.5
-    too_white: float = 0.8
-
-
-SETTINGS = StepwiseSettings()
 
 
 class Stepwise:
@@ -107,7 +46,7 @@ class Stepwise:
             comes_to = contained(single.effects, search.rig)
             if single.effects[0].kind not in COMMON and not any(f.key in comes_to for f in self.singles):
                 self.singles.append(single)
-        self.singles = self.singles[: SETTINGS.singles]
+        self.singles = self.singles[: STEPWISE.singles]
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
@@ -143,7 +82,7 @@ class Stepwise:
         if not self.explains(best):
             best = self._hear_inputs(best) or best
         left = best.excess(best.noise_power)
-        if not self.explains(best) and left > SETTINGS.further * float(self.search.nominal.mean()):
+        if not self.explains(best) and left > STEPWISE.further * float(self.search.nominal.mean()):
             return False
         best = replace(self._simplest(best, self._alone[1:]), others=tuple(self._alone))
         if not (best.is_plausible and self._is_worth(best, self.last)):
@@ -161,7 +100,7 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
-        while len(self.last.effects) < SETTINGS.most and not (self.is_enough and self._is_spotless):
+        while len(self.last.effects) < STEPWISE.most and not (self.is_enough and self._is_spotless):
             before = self.last
             step = self._with_one_more(before)
             if step is None:
@@ -184,13 +123,13 @@ class Stepwise:
     @property
     def is_enough(self) -> bool:
         """Whether the last set leaves nothing that is worth another effect."""
-        left = self.explains(self.last) or (self.last.effects and self.unexplained < SETTINGS.further)
+        left = self.explains(self.last) or (self.last.effects and self.unexplained < STEPWISE.further)
         return bool(left and self.last.is_plausible and (self.is_tried or not self.search.logged))
 
     @property
     def _is_spotless(self) -> bool:
         """Whether what the last set leaves above the noise is less than any effect would."""
-        return self.last.excess(self.last.noise_power) < SETTINGS.spotless * float(self.last.noise_power.mean())
+        return self.last.excess(self.last.noise_power) < STEPWISE.spotless * float(self.last.noise_power.mean())
 
     def _hear_inputs(self, step: Step) -> Step | None:
         """The step beside noise of the logged inputs, where that makes what it leaves all but white; None elsewhere.
@@ -200,14 +139,14 @@ class Stepwise:
         """
         search = self.at_first
         plain = fit_jointly(search, step.effects, step.errors) if self.search.logged else measured(search, step.fit)
-        loud = plain.excess(plain.sensor_noise) > SETTINGS.loud * float(plain.sensor_noise.mean())
+        loud = plain.excess(plain.sensor_noise) > STEPWISE.loud * float(plain.sensor_noise.mean())
         if plain.logged < LEAST_LOGGED or not loud:
             return self._go_on(search, step, plain) if self.search.logged else None
         beside = beside_inputs(search, step.fit, plain.sensor_noise)
         if beside is None:
             return None
         fitted = fit_jointly(beside, step.effects, step.errors)
-        return None if fitted.fit.cost < SETTINGS.too_white else self._go_on(beside, step, fitted)
+        return None if fitted.fit.cost < STEPWISE.too_white else self._go_on(beside, step, fitted)
 
     def _go_on(self, search: Search, step: Step, fitted: Step) -> Step:
         """The step as it was fitted in another search, which goes on in that."""
@@ -217,7 +156,7 @@ class Stepwise:
 
     def explains(self, step: Step) -> bool:
         """Whether next to nothing is left but noise of the sensors."""
-        return step.excess(step.sensor_noise) < SETTINGS.no_gap * float(step.sensor_noise.mean())
+        return step.excess(step.sensor_noise) < STEPWISE.no_gap * float(step.sensor_noise.mean())
 
     @property
     def unexplained(self) -> float:
@@ -236,12 +175,12 @@ class Stepwise:
     @property
     def is_closed(self) -> bool:
         """Whether the last set leaves next to nothing but noise, or next to nothing of the gap."""
-        return self.is_quiet or self.unexplained < SETTINGS.explained
+        return self.is_quiet or self.unexplained < STEPWISE.explained
 
     @property
     def is_quiet(self) -> bool:
         """Whether next to nothing is left but noise of sensors and logged inputs."""
-        return self.last.excess(self.last.noise_power) < SETTINGS.no_gap * float(self.last.noise_power.mean())
+        return self.last.excess(self.last.noise_power) < STEPWISE.no_gap * float(self.last.noise_power.mean())
 
     def decision(self) -> Decision:
         """What the effects of the last set explain."""
@@ -250,7 +189,7 @@ class Stepwise:
             return Decision("explained", self.plain, noise=self.search.data.noise, beside=beside)
         effects, left = self.last.effects, self.unexplained
         noise = np.sqrt(self.last.sensor_noise) * self.search.data.noise
-        closed = self.is_closed or (len(effects) > 1 and left < SETTINGS.in_part)
+        closed = self.is_closed or (len(effects) > 1 and left < STEPWISE.in_part)
         if effects and closed and not self.is_beyond:
             return Decision("explained", self.last.fit, rivals=self._rivals(), noise=noise, beside=beside)
         if self.is_nothing:
@@ -274,7 +213,7 @@ class Stepwise:
         length = [s.description(sets[0].sensor_noise) + a_number * s.fit.n_parameters for s in sets]
         odds = np.exp(min(length) - np.array(length))
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
-        return tuple((s.fit, float(p)) for s, p in likely if p > SETTINGS.excluded)
+        return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
 
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
@@ -289,15 +228,15 @@ class Stepwise:
         left = float(residual @ residual) / residual.size
         evidence = Evidence.of(rig, search.data, workers=search.workers, bent=True)
         ahead = one_more(beside, step.effects, evidence)
-        if not ahead or ahead[0].cost > (1.0 - SETTINGS.ahead) * left:
+        if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * left:
             return None
-        promising, as_good = (left - share * (left - ahead[0].cost) for share in (SETTINGS.promising, SETTINGS.as_good))
+        promising, as_good = (left - share * (left - ahead[0].cost) for share in (STEPWISE.promising, STEPWISE.as_good))
         chosen: list[tuple[Effect, ...]] = []
         for candidate in ahead:
             alike = sum(candidate.effects[-1].kind is others[-1].kind for others in chosen)
             if candidate.cost <= promising and alike < (2 if candidate.cost <= as_good else 1):
                 chosen.append(candidate.effects)
-        chosen = [*chosen[: SETTINGS.candidates], *wider_sets(step.effects)]
+        chosen = [*chosen[: STEPWISE.candidates], *wider_sets(step.effects)]
         tried = self._fitted(chosen, step, self._slopes(step))
         sided = self._on_the_other_side(step, tried)
         if sided is not None:
@@ -331,7 +270,7 @@ class Stepwise:
         # and of what was found before errors could bend to it
         alone = [] if step.effects else self._alone
         tried = sorted((s for s in tried if not self._is_timing(s)), key=self._loss)
-        near = [s for s in tried if s.fit.cost < SETTINGS.near * tried[0].fit.cost][: SETTINGS.finalists]
+        near = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
         whole = sorted((*(self._without_idle(self._whole(s)) for s in near), *alone), key=self._loss)
         return self._simplest_of(whole) if whole else step
 
@@ -360,17 +299,17 @@ class Stepwise:
             return True
         noise = np.minimum(best.sensor_noise, step.sensor_noise)
         before, after = step.excess(noise), best.excess(noise)
-        trifle = bool(step.effects) and before - after < SETTINGS.least * self._gap
-        worth = SETTINGS.further_excess if step.effects and not trifle else SETTINGS.excess
+        trifle = bool(step.effects) and before - after < STEPWISE.least * self._gap
+        worth = STEPWISE.further_excess if step.effects and not trifle else STEPWISE.excess
         if not self.explains(step) and before - after > worth * before:
             return True
         saved = step.description(noise, of_errors_alone=trifle) - best.description(noise, of_errors_alone=trifle)
-        return not step.is_plausible and saved > SETTINGS.shorter
+        return not step.is_plausible and saved > STEPWISE.shorter
 
     def _is_likelier(self, best: Step, step: Step) -> bool:
         """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
         more, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
-        return gain > WORTHWHILE and self.search.pays(gain, more)
+        return gain > SEARCH.worthwhile and self.search.pays(gain, more)
 
     def _gain(self, best: Step, step: Step) -> float:
         """Twice the log-likelihood that one step has more than another, a value."""
@@ -406,7 +345,7 @@ class Stepwise:
 
     def _is_timing(self, step: Step, kinds: Collection[str] = ("sensor_delay",)) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
-        least = dict(JOINTLY.widest)["delay"] * self.search.data.records[0].sample_time
+        least = dict(JOINT.widest)["delay"] * self.search.data.records[0].sample_time
         return any(effect.values[TIMING[e]] < least for effect in step.effects if (e := effect.kind.name) in kinds)
 
     def _slopes(self, step: Step) -> np.ndarray:
@@ -434,14 +373,14 @@ class Stepwise:
         if again.target.late != none.target.late:
             ahead = min(ahead, self._ahead(others, again), key=lambda each: each.cost)
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
-        if found.excess(found.noise_power) < SETTINGS.astray * float(search.nominal.mean()):
+        if found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
             return found
         return min(found, fit_jointly(search, effects, none), key=lambda s: s.fit.cost)
 
     def _ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
         """Effects and errors fitted to predictions one sample ahead."""
         search = self.search
-        return fit(search.rig, (*effects, errors), search.ahead, iterations=JOINTLY.iterations, chord=True)
+        return fit(search.rig, (*effects, errors), search.ahead, iterations=JOINT.iterations, chord=True)
 
     def _whole(self, step: Step) -> Step:
         """The step fitted to all records.
@@ -464,7 +403,7 @@ class Stepwise:
         sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
         # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
         best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
-        enough = (1.0 + SETTINGS.simpler) * max(best.excess(best.sensor_noise), SETTINGS.simpler)
+        enough = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
         fewer = [
             step
             for step in sets
@@ -489,7 +428,7 @@ class Stepwise:
             return step
         fewer = self._fitted(list(each_left_out(step.effects)), step, self._slopes(step))
         best = min(fewer, key=lambda s: s.fit.cost)
-        enough = (1.0 + SETTINGS.needless) * max(step.excess(step.sensor_noise), SETTINGS.simpler)
+        enough = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
         return self._without_needless(best) if best.excess(step.sensor_noise) < enough else step
 
     def _without_errors(self, step: Step) -> Fit | None:
@@ -518,11 +457,11 @@ class Stepwise:
         damping = float(np.mean([v for n, v in values.items() if group_of(n) == "damping"] or [0.0]))
         stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
         named = {effect.kind for effect in step.effects}
-        added, reset = [], dict(values)
-        if abs(damping) > MOST_COMMON["modal_damping"] and MODAL_DAMPING not in named:
+        added, reset, most = [], dict(values), dict(PLAIN.most_common)
+        if abs(damping) > most["modal_damping"] and MODAL_DAMPING not in named:
             added.append(Effect(MODAL_DAMPING, None, {"factor": float(np.exp(damping))}))
             reset.update({n: v - damping for n, v in values.items() if group_of(n) == "damping"})
-        if abs(stiffness) > MOST_COMMON["modulus_error"] and MODULUS_ERROR not in named:
+        if abs(stiffness) > most["modulus_error"] and MODULUS_ERROR not in named:
             added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
             reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
         if not added:
