@@ -13,9 +13,8 @@ from workbench.cases.case import Case
 from workbench.cases.writing import write_case
 from workbench.records.record import Channel, Record
 from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
-from workbench.trials.chance import draw_effect
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
-from workbench.trials.draws import DRAWS
+from workbench.trials.draws import DRAWS, draw_effect
 from workbench.trials.hidden import HIDE, OUTSIDE, hide
 from workbench.trials.laws import POINT_LAWS
 from workbench.trials.plant import Plant, SolvedPlant

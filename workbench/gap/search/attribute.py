@@ -19,22 +19,21 @@ from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
 from workbench.gap.search.beside_random import decide_on_random, random_beside
-from workbench.gap.search.decide import decide
-from workbench.gap.search.finish import widened
+from workbench.gap.search.finish import finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.one_law import one_law, unless_another, weighed_against
-from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors
 from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.record_to_record import beside_records
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import Search, most_telling, spread_over_kinds
-from workbench.gap.search.settings import ATTRIBUTION, PURSUIT, SEARCH
+from workbench.gap.search.search import Decision, Search, most_telling, promise, spread_over_kinds
+from workbench.gap.search.settings import ATTRIBUTION, PURSUIT, RANDOM, SEARCH
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
+from workbench.rig.simulate import is_stepped
 from workbench.threads import one_blas_thread
 
 
@@ -186,7 +185,7 @@ def attribute(
         ahead = one_more(search, (), evidence, weighed)
         report("one effect, on whole records", 0.3)
         singles = _alone(search, start, ahead)
-        alone = decide(search, start, singles)
+        alone = _without_a_second(search, start, singles)
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
@@ -301,6 +300,35 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
     return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
 
 
+def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> Decision | None:
+    """What needs no second effect; None where nothing alone explains the records."""
+    good = [f for f in singles if search.worthwhile(f, start.cost)]
+    if search.explains(start) and not good:
+        return Decision("none", start)
+    ended = _ended(search, good[:4])
+    explaining = [f for f in ended if search.explains(f)]
+    if not explaining:
+        near = [f for f in ended[:2] if search.near(f, RANDOM.near)]
+        explaining = [f for f in search.side_by_side(relocated, near) if search.explains(f)]
+    if explaining:
+        best, rivals = ranked(search, [simplest(search, f) for f in explaining])
+        return Decision("explained", best, rivals=rivals)
+    if search.explains(start):
+        return Decision("none", start)
+    return None
+
+
+def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
+    """The fits, best first; those that more or finer steps may bring to the noise floor are taken to their end."""
+    hopeful = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
+    if fits and search.explains(fits[0]):
+        near = fits[0].cost + SEARCH.rival
+        hopeful = [
+            f for f in hopeful if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
+        ]
+    return [*search.side_by_side(finished, hopeful), *(f for f in fits if f not in hopeful)]
+
+
 def _with_a_second(
     search: Search, start: Fit, singles: Sequence[Fit], weighed: Weighed, evidence: Evidence, tolerance: float
 ) -> Decision:
@@ -361,7 +389,7 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
         return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
     hopeful = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
-    decision = decide(louder, heard(start), hopeful) if hopeful else None
+    decision = _without_a_second(louder, heard(start), hopeful) if hopeful else None
     if decision is None or decision.outcome != "explained":
         return None
     return decision._replace(noise=noise)

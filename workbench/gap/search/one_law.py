@@ -6,9 +6,8 @@ from workbench.gap.effects.beyond import BEYOND, any_beyond, in_catalogue
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
-from workbench.gap.search.outcome import Decision
 from workbench.gap.search.pursuit import on_whole_records, one_more
-from workbench.gap.search.search import Search
+from workbench.gap.search.search import Decision, Search
 from workbench.gap.search.settings import LAW, PURSUIT, SEARCH
 
 

@@ -9,10 +9,9 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
-from workbench.gap.search.outcome import Decision, unexplained
 from workbench.gap.search.pursuit import is_hopeful, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import Search, in_one_valley
+from workbench.gap.search.search import Decision, Search, in_one_valley, unexplained
 from workbench.gap.search.settings import PAIRS, RANDOM
 from workbench.structure.domain import Between
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from workbench.gap.effects.record_to_record import STIFFNESS
 from workbench.gap.localisation.evidence import FEWER_PLACES, Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.logged_inputs import input_filters, logging_noise_power
+from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
@@ -244,3 +245,30 @@ def _sorted_by(where: Any) -> tuple[Any, ...]:
 def promise(candidate: Fit, iterations: int = 1) -> float:
     """The cost that one more iteration like the last would come to, or so many more."""
     return candidate.cost * (1.0 - candidate.falling) ** iterations
+
+
+class Decision(NamedTuple):
+    """What is claimed; see `Attribution` for its parts.
+
+    Attributes:
+        beside: the search that it was found in, where that was beside noise of the logged inputs.
+    """
+
+    outcome: str
+    best: Fit
+    random: RandomForceFit | None = None
+    rivals: tuple[tuple[Fit, float], ...] = ()
+    noise: np.ndarray | None = None
+    beside: Search | None = None
+
+
+def unexplained(start: Fit, best: Fit, rivals: tuple[tuple[Fit, float], ...]) -> Decision:
+    """What is said where no set reaches the noise floor: in part, or not at all.
+
+    Args:
+        start: what is there with no effect.
+        best: the nearest set.
+        rivals: others, with their probabilities.
+    """
+    closed = 1.0 - np.sqrt(max(best.cost - 1.0, 0.0) / max(start.cost - 1.0, 1e-12))
+    return Decision("part" if closed > 0.5 else "unknown", best, rivals=rivals)

@@ -266,18 +266,12 @@ class LawSettings:
 
 
 @dataclass(frozen=True)
-class DecisionSettings:
-    """Constants of the choice among single effects."""
-
-    # finer steps bring no set this many times as costly as another to the noise floor before it
-    far_behind: float = 2.0
-
-
-@dataclass(frozen=True)
 class AttributionSettings:
     """Constants of the course of a search, from single effects to the verdict."""
 
     finalists: int = 8  # single effects that are fitted to whole records
+    # finer steps bring no set this many times as costly as another to the noise floor before it
+    far_behind: float = 2.0
     together: int = 8  # iterations of effects and errors of an identified rig
     briefly: int = 2  # iterations, where there may be no effect at all
     shown: int = 7  # others that are, where they are to be shown beside them
@@ -309,6 +303,5 @@ JOINT = JointSettings()
 STEPWISE = StepwiseSettings()
 PAIRS = PairSettings()
 LAW = LawSettings()
-DECISION = DecisionSettings()
 ATTRIBUTION = AttributionSettings()
 INTERVALS = IntervalSettings()

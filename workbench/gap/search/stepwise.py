@@ -15,10 +15,9 @@ from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
-from workbench.gap.search.outcome import Decision
 from workbench.gap.search.plain import COMMON, in_place_of_errors
 from workbench.gap.search.pursuit import one_more
-from workbench.gap.search.search import Search, most_telling, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, most_telling, spread_over_kinds
 from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, STEPWISE
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
