@@ -111,9 +111,11 @@ def _(result: Refined) -> Figure:
     return figure
 
 
-@plot.register
-def _(result: Bands) -> Figure:
-    return plot_bands(result)
+plot.register(Bands, plot_bands)
+plot.register(Explanation, plot_spillover_paths)
+plot.register(Verdict, plot_where)
+plot.register(Redesign, plot_redesign)
+plot.register(Prediction, plot_prediction)
 
 
 @plot.register
@@ -138,11 +140,6 @@ def _(result: Placement) -> Figure:
 
 
 @plot.register
-def _(result: Explanation) -> Figure:
-    return plot_spillover_paths(result)
-
-
-@plot.register
 def _(result: HowMany) -> Figure:
     return plot_how_many({"energy left of this disturbance": result})
 
@@ -160,23 +157,8 @@ def _(result: ModalFilter) -> Figure:
 
 
 @plot.register
-def _(result: Verdict) -> Figure:
-    return plot_where(result)
-
-
-@plot.register
 def _(result: Distortion) -> Figure:
     return plot_distortion([result])
-
-
-@plot.register
-def _(result: Redesign) -> Figure:
-    return plot_redesign(result)
-
-
-@plot.register
-def _(result: Prediction) -> Figure:
-    return plot_prediction(result)
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:

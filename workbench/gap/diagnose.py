@@ -148,7 +148,7 @@ def _outcome(
     beyond: float | Floats = found.logged**2 * power_of_inputs(rig, unseen, settle) if found.logged else 0.0
     if any(effect not in found.best.effects for effect in accounted):
         rigs = [apply_all(rig, effects) for effects in (found.best.effects, accounted)]
-        common, own = (np.array([mean_square(r, record, settle, 8) for record in unseen]) for r in rigs)
+        common, own = (np.array([mean_square(r, record, settle) for record in unseen]) for r in rigs)
         beyond = beyond + common - own
     return "part" if _fails_unseen(found, shrinkage, beyond) else found.outcome
 

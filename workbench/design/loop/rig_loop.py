@@ -148,9 +148,7 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
     return LoopRun(response, u, np.array(elements), bool(bounded), into)
 
 
-def run_loops(
-    rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, *, substeps: int = SUBSTEPS
-) -> list[LoopRun]:
+def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest) -> list[LoopRun]:
     """The same of many rigs, each with noise of its own, on all cores."""
     seeds = [test.seed if test.seed is None else test.seed + i for i in range(len(rigs))]
     tests = [
@@ -158,7 +156,7 @@ def run_loops(
         for s in seeds
     ]
     with ThreadPoolExecutor(cpu_count() or 1) as pool:
-        return list(pool.map(lambda rig, one: run_loop(rig, controller, one, substeps=substeps), rigs, tests))
+        return list(pool.map(lambda rig, one: run_loop(rig, controller, one), rigs, tests))
 
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:

@@ -14,7 +14,7 @@ from workbench.threads import one_blas_thread
 
 BATCH = 20_000
 MOST_TRIED = 5_000_000
-DRAWN = 2000  # choices of which the best are exchanged
+DRAWN, STARTS = 2000, 12  # choices drawn at random, and how many of them, best first, exchanges start from
 
 
 @takes_former_limits
@@ -58,11 +58,8 @@ def scan(task: PlacementTask, limits: Limits, *, n_places: int = 60) -> tuple[Pl
     return task.placed(best_at, f"best of {tried} placements"), tried
 
 
-def best_of_candidates(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
+def best_of_candidates(task: PlacementTask, limits: Limits) -> Placement:
     """The best of all choices of candidate places; where they are too many, the best that exchanges come to.
-
-    Args:
-        starts: random choices that exchanges start from.
 
     Raises:
         DesignError: limits that no choice met keeps, with the one that conflicts.
@@ -72,12 +69,12 @@ def best_of_candidates(task: PlacementTask, limits: Limits, *, starts: int = 12,
     if comb(len(grid), n) <= MOST_TRIED:
         return scan(task, limits)[0]
     shapes, at = task.shapes(grid), coordinates(task.modes.domain, grid)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     drawn = np.sort(rng.random((DRAWN, len(grid))).argpartition(n, axis=1)[:, :n], axis=1)
-    first = drawn[np.argsort(rated(task, limits, shapes, at, drawn), kind="stable")[:starts]]
+    first = drawn[np.argsort(rated(task, limits, shapes, at, drawn), kind="stable")[:STARTS]]
     found = [_exchanged(task, limits, shapes, at, choice) for choice in first]
     for rating, choice in sorted(found, key=lambda pair: pair[0]):
-        placement = task.placed(grid[choice], f"best of exchanges from {starts} choices")
+        placement = task.placed(grid[choice], f"best of exchanges from {STARTS} choices")
         if np.isfinite(rating) and limits.satisfied_by(placement):
             return placement
     raise DesignError(conflict(task, limits, grid))

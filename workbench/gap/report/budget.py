@@ -86,7 +86,6 @@ def budget_of(
     noise_found: np.ndarray,
     logged: float = 0.0,
     settle: float = 0.0,
-    substeps: int = 8,
 ) -> Budget:
     """Take the mean square of the nominal residual apart.
 
@@ -102,13 +101,12 @@ def budget_of(
         noise_found: (n_outputs,).
         logged: noise of the logged inputs, as a share of their rms.
         settle: seconds at the start of each record that do not count.
-        substeps: of a sample, where the rig is not linear.
     """
 
     def squares(chosen: Sequence[Effect]) -> np.ndarray:
         """Mean square (n_records,) of what is left with these effects."""
         real = apply_all(rig, chosen)
-        return np.array([mean_square(real, record, settle, substeps) for record in records])
+        return np.array([mean_square(real, record, settle) for record in records])
 
     labels, causes = [effect.label for effect in effects], list(effects)
     alike, between = (None, None) if errors is None else parted(errors)
@@ -149,12 +147,12 @@ def budget_of(
     )
 
 
-def mean_square(rig: Rig, record: Record, settle: float, substeps: int) -> float:
+def mean_square(rig: Rig, record: Record, settle: float) -> float:
     """Mean square of what a rig leaves of a record, each sensor by the standard deviation of its readings."""
     lead = round(settle / record.sample_time)
     measured = record.outputs[:, lead:]
     with np.errstate(over="ignore", invalid="ignore"):  # one effect of two that balance each other may run away
-        predicted = predict(rig, record, substeps=substeps)[:, lead:]
+        predicted = predict(rig, record)[:, lead:]
         left = (((measured - predicted) / scale_of(measured)) ** 2).mean()
     return float(left) if left < RUNAWAY else RUNAWAY
 

@@ -69,7 +69,7 @@ class RecordToRecord:
 
 
 def with_unseen(
-    rig: Rig, effects: Sequence[Effect], records: Sequence[Record], *, settle: float = 0.0, substeps: int = 8
+    rig: Rig, effects: Sequence[Effect], records: Sequence[Record], *, settle: float = 0.0
 ) -> tuple[Effect, ...]:
     """The effects, and what a figure that differs from record to record deviates by in records that no fit has seen.
 
@@ -89,7 +89,7 @@ def with_unseen(
 
         def left(deviation: float, record: Record = record, name: str = name) -> float:
             own = replace(errors, values={**errors.values, name: deviation})
-            return mean_square(apply_all(rig, (*others, own)), record, settle, substeps)
+            return mean_square(apply_all(rig, (*others, own)), record, settle)
 
         found = minimize_scalar(left, bounds=(-reach, reach), method="bounded", options={"xatol": SURELY * reach})
         values[name] = float(found.x)

@@ -31,9 +31,7 @@ class Shrinkage:
     ci95: tuple[float, float]
 
 
-def measure(
-    nominal: Rig, corrected: Rig, records: Sequence[Record], *, seed: int = 0, substeps: int = 8, settle: float = 0.0
-) -> Shrinkage | None:
+def measure(nominal: Rig, corrected: Rig, records: Sequence[Record], *, settle: float = 0.0) -> Shrinkage | None:
     """Gaps of both rigs on validation records, with the interval from resampled blocks; None without records.
 
     Blocks are three decay times of the slowest elastic mode long, or a twentieth of a record where that is shorter
@@ -46,7 +44,7 @@ def measure(
         lead = round(settle / record.sample_time)
         measured = record.outputs[:, lead:]
         scale = scale_of(measured)
-        predicted = [predict(rig, record, substeps=substeps)[:, lead:] for rig in (nominal, corrected)]
+        predicted = [predict(rig, record)[:, lead:] for rig in (nominal, corrected)]
         errors = [((measured - prediction) / scale) ** 2 for prediction in predicted]
         noise = np.array([s.noise_std for s in nominal.sensors])[:, None] / scale
         before[record.name], after[record.name] = (float(np.sqrt(e.mean())) for e in errors)
@@ -56,7 +54,7 @@ def measure(
             piece = slice(start, start + length)
             blocks.append([errors[0][:, piece].mean(), errors[1][:, piece].mean(), (noise**2).mean()])
     table = np.array(blocks)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     draws = [_closed(*table[rng.integers(0, len(table), len(table))].mean(axis=0)) for _ in range(DRAWS)]
     return Shrinkage(
         before=before,

@@ -155,7 +155,7 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
     return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)
 
 
-def in_coloured_noise(refined: Refined, records: Record | Sequence[Record], *, offset: bool = True) -> Refined:
+def in_coloured_noise(refined: Refined, records: Record | Sequence[Record]) -> Refined:
     """The same modes with standard errors that hold in noise of any smooth spectrum.
 
     A mode is disturbed by noise within its own band only. Where output j has noise of spectrum S_j, a least squares fit
@@ -167,12 +167,11 @@ def in_coloured_noise(refined: Refined, records: Record | Sequence[Record], *, o
     for modes r and s. Where the noise may be white κ is one: the Cramér-Rao bound.
 
     Args:
-        refined: of `refine`, made for white noise.
+        refined: of `refine` with a constant in each output, made for white noise.
         records: that it was identified from.
-        offset: as in `refine`.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    fits = [project(record, refined.modes.poles, offset) for record in records]
+    fits = [project(record, refined.modes.poles, True) for record in records]
     ratios = np.array(
         [
             noise_near(refined.modes.poles, fit.residual / noise, record.sample_time)
