@@ -100,7 +100,7 @@ def plot_surface_motion(
             if actuators is not None:
                 ax.plot(*actuators.T, "x", color="black", markersize=6, label="actuator")
             if struck is not None:
-                ax.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=11, label="struck here")
+                ax.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=11, label="impulse")
             ax.set_title(f"{time:.3g} s", fontsize=10)
         row[0].set_ylabel(name, fontsize=11)
     for ax in grid.flat:

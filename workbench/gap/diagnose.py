@@ -15,11 +15,11 @@ from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import Budget, budget_of, mean_square, power_of_inputs
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
-from workbench.gap.report.record_to_record import with_unseen
+from workbench.gap.report.record_to_record import with_held_out
 from workbench.gap.report.shrinkage import Shrinkage, measure
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
-from workbench.gap.search.attribute import Attribution, attribute, opened
+from workbench.gap.search.attribute import Attribution, attribute, baseline
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.threads import one_blas_thread
@@ -79,7 +79,7 @@ def diagnose(
     faults = () if settle else wiring(rig, records)
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     report("looking for the unmodelled force", 0.02)
-    found = opened(rig, records, settle=settle, workers=sharing)
+    found = baseline(rig, records, settle=settle, workers=sharing)
     nominal = found.nominal
     with (
         sharing.in_background(lambda: locate_force(nominal.without(_faulty(found.seen)))) as place,
@@ -95,7 +95,7 @@ def diagnose(
         )
         corrected = apply_all(rig, attribution.best.effects)
         shrinkage = measure(rig, corrected, validation, settle=settle)
-        accounted = with_unseen(rig, attribution.best.effects, validation, settle=settle)
+        accounted = with_held_out(rig, attribution.best.effects, validation, settle=settle)
         outcome = _outcome(rig, attribution, shrinkage, validation, settle, accounted)
         errors = next((e for e in accounted if e.kind is NOMINAL_ERRORS), None)
         named = tuple(e for e in accounted if e is not errors)

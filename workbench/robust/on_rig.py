@@ -181,7 +181,7 @@ def default_estimator(rig: Rig, law: Law, test: LoopTest) -> Controller:
     if best is None:
         raise DesignError(
             f"no Kalman filter on {', '.join(s.name for s in sensors)} leaves the loop of all modes stable; hand a"
-            " controller, weigh the forces more, or control fewer modes"
+            " controller, weight the forces more, or control fewer modes"
         )
     return best
 

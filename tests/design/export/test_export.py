@@ -181,7 +181,9 @@ def test_the_delay_margin_is_that_of_the_bode_plot():
     bears = 0.5 * np.pi / crossing - 0.5 * period
     design = export(modes, controller, sample_rate_hz=1 / period, computing_delay=bears - 0.02)
     assert design.delay_margin == pytest.approx(0.02, abs=1e-4)
-    assert design.phase_lost == pytest.approx([omega * (0.5 * period + bears - 0.02)])
+    assert design.phase_lag == pytest.approx([omega * (0.5 * period + bears - 0.02)])
+    with pytest.warns(DeprecationWarning, match="phase_lag"):
+        assert design.phase_lost == design.phase_lag
 
 
 def test_a_rate_too_slow_is_refused_with_one_that_holds(modes, observer):

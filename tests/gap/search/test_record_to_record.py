@@ -11,7 +11,7 @@ from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.report.record_to_record import RecordToRecord, with_unseen
+from workbench.gap.report.record_to_record import RecordToRecord, with_held_out
 from workbench.gap.search.record_to_record import deviations
 from workbench.gap.search.search import Search
 from workbench.records.record import Channel, Record
@@ -96,7 +96,7 @@ def test_records_alike_do_not_ask_for_a_stiffness_each(rig):
 def test_a_record_that_no_fit_has_seen_is_accounted_for_and_not_predicted(rig):
     prior = NominalPrior(record=0.005, records=FITTED)
     errors = nominal_errors(rig, prior, {f"record_{name}": STIFFNESS[name] for name in FITTED})
-    (found,) = with_unseen(rig, (errors,), [of_stiffness(rig, name) for name in LEVELS])
+    (found,) = with_held_out(rig, (errors,), [of_stiffness(rig, name) for name in LEVELS])
     assert found.values["record_other"] == pytest.approx(STIFFNESS["other"], abs=5e-5)
     assert {name: found.values[name] for name in errors.values} == errors.values
     other = of_stiffness(rig, "other")

@@ -1,4 +1,4 @@
-"""What sets of effects can come to, weighed by how predictions one sample ahead move with each."""
+"""What sets of effects can come to, screened by how predictions one sample ahead move with each."""
 
 from dataclasses import replace
 
@@ -14,10 +14,10 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import Fit, fit, slopes
 from workbench.gap.search.pairs import Pairs, _evidence
-from workbench.gap.search.pursuit import one_more, pairs_at_once
-from workbench.gap.search.screening import Weighed
+from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import PURSUIT
+from workbench.gap.search.selection import one_more, pairs_at_once
+from workbench.gap.search.settings import SELECTION
 from workbench.rig.elements import CubicSpring
 from workbench.rig.simulate import follow
 from workbench.structure.domain import Interval
@@ -47,16 +47,16 @@ def search(rig, record_of):
     return Search(rig, data, quick, quick.only(("1.0",)), CATALOGUE, lambda text, share: None, ALONE, nominal)
 
 
-def weighed(n_starts: int, seed: int) -> Weighed:
+def screened(n_starts: int, seed: int) -> Screening:
     rng = np.random.default_rng(seed)
     starts = tuple(Effect(CLEARANCE, None, {"at": float(i)}) for i in range(n_starts))
     moves = rng.normal(size=(n_starts, 40))
     least = np.where(rng.random(n_starts) < 0.3, -30.0, 0.03)
-    return Weighed(starts, moves, 3.0 * rng.normal(size=40), least, np.full(n_starts, 30.0), domain=Interval(1.0))
+    return Screening(starts, moves, 3.0 * rng.normal(size=40), least, np.full(n_starts, 30.0), domain=Interval(1.0))
 
 
 def test_what_two_effects_come_to_is_least_squares_within_bounds():
-    one = weighed(12, 3)
+    one = screened(12, 3)
     costs = one._of_pairs()
     for i in range(12):
         for j in range(i):
@@ -68,7 +68,7 @@ def test_what_two_effects_come_to_is_least_squares_within_bounds():
 
 def test_both_halves_of_a_pair_are_found_at_once(rig, search):
     evidence = Evidence.of(rig, search.data)
-    best = pairs_at_once(search, Weighed.of(search, (), evidence))[0]
+    best = pairs_at_once(search, Screening.of(search, (), evidence))[0]
     named = {effect.label: effect.values for effect in best.effects}
     assert set(named) == {"cubic_spring", "sensor_gain[d3]"} and best.cost < 1.05
     assert named["cubic_spring"]["at"] == pytest.approx(0.62, abs=1e-3)
@@ -78,7 +78,7 @@ def test_both_halves_of_a_pair_are_found_at_once(rig, search):
 def test_what_the_numbers_of_a_given_effect_make_up_for_is_no_move(rig, search):
     given = (Effect(kind_named("cubic_spring"), None, {"at": 0.62, "stiffness": 2000.0}),)
     evidence = Evidence.of(given[0].apply(rig), search.data, 20)
-    found = Weighed.of(search, given, evidence)
+    found = Screening.of(search, given, evidence)
     along = slopes(rig, given, search.first_ahead)[1]
     assert np.abs(found.left @ along).max() < 1e-6 * np.linalg.norm(found.left) * np.linalg.norm(along)
     assert found.likeliest()[0].label == "sensor_gain[d3]"
@@ -115,7 +115,7 @@ def test_a_sensor_that_rounds_coarsely_is_not_heard_beside_a_random_force(search
     sensors = search.rig.sensors
     steps = (0.0, 10.0 * NOISE, 0.5 * NOISE, 0.0)
     rounded = tuple(replace(sensor, step=step) for sensor, step in zip(sensors, steps, strict=True))
-    heard = replace(search, rig=replace(search.rig, sensors=rounded)).hearing()
+    heard = replace(search, rig=replace(search.rig, sensors=rounded)).without_clipped()
     assert [sensor.name for sensor in heard.rig.sensors] == ["d1", "d3", "d4"]
     assert heard.data.records[0].output_names == ("d1", "d3", "d4")
 
@@ -135,7 +135,7 @@ def test_what_one_half_of_a_wrong_pair_leaves_tells_the_other(search):
     )
     pairs = Pairs(search)
     pairs.ahead = [fit(search.rig, wrong, search.ahead, iterations=4)]
-    assert pairs.ahead[0].cost > PURSUIT.hopeful
+    assert pairs.ahead[0].cost > SELECTION.promising
     assert pairs.by_exchange()
     found = pairs.found[0]
     assert found.key == ("cubic_spring", "sensor_gain[d3]")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from warnings import warn
 
 import numpy as np
 
@@ -54,10 +55,16 @@ class SampledDesign(Printed):
         return float(-np.log(np.abs(self.poles).max()) / self.controller.sample_time)
 
     @property
-    def phase_lost(self) -> np.ndarray:
+    def phase_lag(self) -> np.ndarray:
         """Phase lag (n_controlled,) of the held command and the computer at each controlled mode, ω (T/2 + τ), rad."""
         own = self.modes.omega[list(self.source.law.controlled)]
         return np.asarray(own * (0.5 * self.controller.sample_time + self.computing_delay))
+
+    @property
+    def phase_lost(self) -> np.ndarray:
+        """The earlier name of `phase_lag`."""
+        warn("phase_lost is now phase_lag; the old name goes with the next version", DeprecationWarning, 2)
+        return self.phase_lag
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -79,10 +86,10 @@ class SampledDesign(Printed):
         line = f"{self.controller.name} at {self.sample_rate_hz:.6g} Hz{late}"
         own = self.source.law.controlled
         rows = [
-            (str(r + 1), f"{f:.5g}", f"{self.sample_rate_hz / f:.3g}" if f else "", f"{np.degrees(lost):.3g}")
-            for r, f, lost in zip(own, self.modes.frequencies_hz[list(own)], self.phase_lost)
+            (str(r + 1), f"{f:.5g}", f"{self.sample_rate_hz / f:.3g}" if f else "", f"{np.degrees(lag):.3g}")
+            for r, f, lag in zip(own, self.modes.frequencies_hz[list(own)], self.phase_lag)
         ]
-        return line, ("mode", "frequency [Hz]", "samples a period", "phase lost [°]"), rows, self.remarks
+        return line, ("mode", "frequency [Hz]", "samples a period", "phase lag [°]"), rows, self.remarks
 
     @property
     def remarks(self) -> tuple[str, ...]:

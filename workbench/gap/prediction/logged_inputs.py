@@ -82,14 +82,14 @@ def _variances(record: Record, share: float) -> Floats:
     return np.maximum(power, max(QUIETEST * power.max(), 1e-300))
 
 
-class Heard(NamedTuple):
+class LikeliestShare(NamedTuple):
     """Noise of the logged inputs, as a share of their rms, and minus the log-likelihood of what is left beside it."""
 
     share: float
     loss: float
 
 
-def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) -> Heard:
+def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) -> LikeliestShare:
     """Noise of the logged inputs by maximum likelihood of what is left.
 
     Args:
@@ -106,7 +106,7 @@ def likeliest_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray]) ->
     losses = np.array([loss(share) for share in SHARES])
     best = int(np.argmin(losses))
     if best in (0, len(SHARES) - 1):
-        return Heard(SHARES[best], float(losses[best]))
+        return LikeliestShare(SHARES[best], float(losses[best]))
     before, at, after = losses[best - 1 : best + 2]
     turn = 0.5 * (before - after) / (before - 2.0 * at + after)
-    return Heard(float(SHARES[best] * 0.5**turn), float(at))
+    return LikeliestShare(float(SHARES[best] * 0.5**turn), float(at))

@@ -96,7 +96,7 @@ def budget_of(
     Args:
         rig: nominal.
         effects: that were named.
-        errors: of the nominal model, where they were fitted; see `with_unseen` for what differs from record to record.
+        errors: of the nominal model, where they were fitted; see `with_held_out` for what differs by record.
         records: held out of the fit, or those fitted where none were.
         noise_found: (n_outputs,).
         logged: noise of the logged inputs, as a share of their rms.

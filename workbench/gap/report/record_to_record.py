@@ -68,7 +68,7 @@ class RecordToRecord:
         return {"figure": self.figure, "std": float(f"{self.spread:.4g}"), "by_record": by_record}
 
 
-def with_unseen(
+def with_held_out(
     rig: Rig, effects: Sequence[Effect], records: Sequence[Record], *, settle: float = 0.0
 ) -> tuple[Effect, ...]:
     """The effects, and what a figure that differs from record to record deviates by in records that no fit has seen.

@@ -22,14 +22,14 @@ from workbench.gap.search.beside_random import decide_on_random, random_beside
 from workbench.gap.search.finish import finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
-from workbench.gap.search.one_law import one_law, unless_another, weighed_against
+from workbench.gap.search.one_law import compared_with, one_law, unless_another
 from workbench.gap.search.pairs import Pairs
 from workbench.gap.search.plain import are_common, common_as_errors
-from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.record_to_record import beside_records
-from workbench.gap.search.screening import Weighed
-from workbench.gap.search.search import Decision, Search, most_telling, promise, spread_over_kinds
-from workbench.gap.search.settings import ATTRIBUTION, PURSUIT, RANDOM, SEARCH
+from workbench.gap.search.screening import Screening
+from workbench.gap.search.search import Decision, Search, most_informative, promise, spread_over_kinds
+from workbench.gap.search.selection import on_whole_records, one_more
+from workbench.gap.search.settings import ATTRIBUTION, RANDOM, SEARCH, SELECTION
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -87,7 +87,7 @@ class Attribution:
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class Baseline:
     """Records laid beside a rig, before any effect is guessed.
 
     Attributes:
@@ -101,7 +101,7 @@ class Opened:
     evidence: Evidence
 
 
-def opened(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers: Workers = ALONE) -> Opened:
+def baseline(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers: Workers = ALONE) -> Baseline:
     """What a rig leaves of its fit records, where a force is missing and what it does there.
 
     Args:
@@ -118,10 +118,10 @@ def opened(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers:
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
     _ = evidence.at_peaks  # found once, before the work parts
     if not seen:
-        return Opened(seen, evidence, evidence)
+        return Baseline(seen, evidence, evidence)
     nominal = replace(Evidence.of(rig, data, workers=workers), given_size=evidence.size)
     _ = nominal.at_peaks
-    return Opened(seen, nominal, evidence)
+    return Baseline(seen, nominal, evidence)
 
 
 def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]:
@@ -142,7 +142,7 @@ def _plain_to_see(rig: Rig, data: FitData) -> tuple[tuple[Effect, ...], FitData]
 
 
 def attribute(
-    found: Opened,
+    found: Baseline,
     *,
     catalogue: tuple[Kind, ...] = CATALOGUE,
     report: Callable[[str, float], None] = lambda text, share: None,
@@ -169,7 +169,7 @@ def attribute(
     rig, data, workers = evidence.rig, evidence.data, evidence.workers
     nominal = data.by_channel(data.residual(found.nominal.rig))
     start = Fit(seen, cost_of(rig, (), data), data.by_channel(data.residual(rig)), 0, "read off the records")
-    search = Search(rig, data, *most_telling(data, start.cost_by_channel), catalogue, report, workers, nominal)
+    search = Search(rig, data, *most_informative(data, start.cost_by_channel), catalogue, report, workers, nominal)
     decision: Decision | None = None
     singles: list[Fit] = []
     ahead: list[Fit] = []
@@ -181,14 +181,14 @@ def attribute(
         decision, singles = decide_on_random(search, evidence)
     if decision is None:
         report("one effect", 0.1)
-        weighed = Weighed.of(search, (), evidence)
-        ahead = one_more(search, (), evidence, weighed)
+        screened = Screening.of(search, (), evidence)
+        ahead = one_more(search, (), evidence, screened)
         report("one effect, on whole records", 0.3)
         singles = _alone(search, start, ahead)
         alone = _without_a_second(search, start, singles)
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
-        decision = decision or _with_a_second(search, start, singles, weighed, evidence, tolerance)
+        decision = decision or _with_a_second(search, start, singles, screened, evidence, tolerance)
     outcome, best, random, rivals, noise, beside_inputs = decision
     within = beside_inputs or search
     best = common_as_errors(search, best, alone=random is not None)
@@ -281,12 +281,12 @@ def noise_of(search: Search, best: Fit) -> np.ndarray:
 
 def _alone(search: Search, start: Fit, ahead: list[Fit]) -> list[Fit]:
     """Single effects on whole records, best first."""
-    hopeful = [f for f in ahead if f.cost < PURSUIT.hopeful] or ahead[:1]
+    promising = [f for f in ahead if f.cost < SELECTION.promising] or ahead[:1]
     if not search.explains(start):
-        return on_whole_records(search, hopeful, ATTRIBUTION.finalists)
+        return on_whole_records(search, promising, ATTRIBUTION.finalists)
     # only what leaves far less is of use, and there may be none
-    enough = start.cost - SEARCH.worthwhile
-    return on_whole_records(search, hopeful, ATTRIBUTION.finalists, to_cost=enough, at_first=ATTRIBUTION.briefly)
+    enough = start.cost - SEARCH.significant
+    return on_whole_records(search, promising, ATTRIBUTION.finalists, to_cost=enough, at_first=ATTRIBUTION.briefly)
 
 
 def _of_one_sensor(start: Fit) -> bool:
@@ -302,7 +302,7 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
 
 def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> Decision | None:
     """What needs no second effect; None where nothing alone explains the records."""
-    good = [f for f in singles if search.worthwhile(f, start.cost)]
+    good = [f for f in singles if search.significant(f, start.cost)]
     if search.explains(start) and not good:
         return Decision("none", start)
     ended = _ended(search, good[:4])
@@ -320,17 +320,17 @@ def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> Decisio
 
 def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
     """The fits, best first; those that more or finer steps may bring to the noise floor are taken to their end."""
-    hopeful = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
+    promising = [f for f in fits if f.cost < ATTRIBUTION.far_behind * fits[0].cost]
     if fits and search.explains(fits[0]):
         near = fits[0].cost + SEARCH.rival
-        hopeful = [
-            f for f in hopeful if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
+        promising = [
+            f for f in promising if promise(f, SEARCH.further) < near or is_stepped(apply_all(search.rig, f.effects))
         ]
-    return [*search.side_by_side(finished, hopeful), *(f for f in fits if f not in hopeful)]
+    return [*search.side_by_side(finished, promising), *(f for f in fits if f not in promising)]
 
 
 def _with_a_second(
-    search: Search, start: Fit, singles: Sequence[Fit], weighed: Weighed, evidence: Evidence, tolerance: float
+    search: Search, start: Fit, singles: Sequence[Fit], screened: Screening, evidence: Evidence, tolerance: float
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
     beside = Stepwise(search, tolerance, singles)
@@ -355,10 +355,10 @@ def _with_a_second(
         if decision.outcome == "none" and beside.is_quiet:
             return decision
     pairs = Pairs(search)
-    explained = pairs.at_once(weighed) or (law is None and pairs.with_a_third())
+    explained = pairs.at_once(screened) or (law is None and pairs.with_a_third())
     decision = pairs.decision(start)
     if law is not None:
-        return weighed_against(law, search, decision)
+        return compared_with(law, search, decision)
     if explained and not (are_common(decision.best.effects) and beside.is_nothing):
         return decision
     if len(beside.steps) == 1:
@@ -388,8 +388,8 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
         by_channel = candidate.cost_by_channel * (stated / noise) ** 2
         return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
-    hopeful = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
-    decision = _without_a_second(louder, heard(start), hopeful) if hopeful else None
+    promising = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
+    decision = _without_a_second(louder, heard(start), promising) if promising else None
     if decision is None or decision.outcome != "explained":
         return None
     return decision._replace(noise=noise)

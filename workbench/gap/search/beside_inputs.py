@@ -34,7 +34,7 @@ def beside_inputs(search: Search, fitted: Fit, sensor_noise: np.ndarray) -> Sear
         left = search.data.differences(rig)
     if white.cost > INPUTS.white:
         return None
-    for _ in range(INPUTS.hearings):  # each sensor's noise by the power of its innovations
+    for _ in range(INPUTS.rounds):  # each sensor's noise by the power of its innovations
         louder = louder.with_noise(louder.data.noise * np.sqrt(white.cost_by_channel.mean(axis=0)))
         beside = louder.beside_inputs(rig, likeliest_share(rig, louder.data, left).share)
         white = measured(beside, fitted).fit

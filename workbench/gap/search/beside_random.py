@@ -15,8 +15,8 @@ from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_ran
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import on_their_sides
-from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search, spread_over_kinds
+from workbench.gap.search.selection import on_whole_records, one_more
 from workbench.gap.search.settings import RANDOM, SEARCH
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
@@ -52,7 +52,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
 
     It takes much upon itself: where an effect explains the records without it, there is none.
     """
-    search, evidence = _heard(search, (), evidence)
+    search, evidence = _without_clipped(search, (), evidence)
     evidence = _by_laws_on_measured_motion(search, evidence)
     if not looks_random(evidence):
         return None, []
@@ -78,11 +78,11 @@ def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
     tried = []
     for given in spread_over_kinds(found, 1)[: RANDOM.likeliest_sets]:
         evidence = search.evidence_of(apply_all(search.rig, given.effects))
-        hearing, evidence = _heard(search, given.effects, evidence)
-        evidence = _by_laws_on_measured_motion(hearing, evidence)
+        unclipped, evidence = _without_clipped(search, given.effects, evidence)
+        evidence = _by_laws_on_measured_motion(unclipped, evidence)
         if looks_random(evidence):
-            heard = replace(given, cost_by_channel=hearing.data.by_channel(hearing.data.residual(evidence.rig)))
-            tried.append(with_random(hearing, heard, evidence))
+            heard = replace(given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig)))
+            tried.append(with_random(unclipped, heard, evidence))
     return _likeliest(search, tried)
 
 
@@ -109,13 +109,13 @@ def _nothing(search: Search) -> Fit:
     return Fit((), float(left.mean()), left, 0, "nothing added")
 
 
-def _heard(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
+def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
     """The search and its evidence without the sensors that clip."""
-    hearing = search.hearing()
-    deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in hearing.rig.sensors}
+    unclipped = search.without_clipped()
+    deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
     if not deaf or any(effect.target in deaf for effect in effects):
         return search, evidence
-    return hearing, hearing.evidence_of(apply_all(hearing.rig, effects))
+    return unclipped, unclipped.evidence_of(apply_all(unclipped.rig, effects))
 
 
 def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> Decision | None:
@@ -125,7 +125,7 @@ def _likeliest(search: Search, tried: Sequence[tuple[Fit, RandomForceFit]]) -> D
         return None
     fewest = min(holding, key=lambda found: (len(found[0].effects), found[0].cost))
     worth = [f for f in holding if len(f[0].effects) == len(fewest[0].effects) or _pays(search, f[0], fewest[0])]
-    plain = plainest(search, [found[0] for found in worth], worth=SEARCH.worthwhile)
+    plain = plainest(search, [found[0] for found in worth], worth=SEARCH.significant)
     best, rivals = ranked(search, plain)
     return Decision("explained", best, next(random for found, random in worth if found is best), rivals)
 

@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import COORDINATES, Effect, apply_all, key_of,
 from workbench.gap.effects.limiting_cases import simpler_sets, wider_sets, with_one_simpler
 from workbench.gap.search.fit import Fit, cost_of, finite_residual, fit
 from workbench.gap.search.search import Search, promise
-from workbench.gap.search.settings import FINISH, PURSUIT
+from workbench.gap.search.settings import FINISH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, Domain, Interval, Rectangle, Where
 
@@ -18,10 +18,10 @@ from workbench.structure.domain import Between, Domain, Interval, Rectangle, Whe
 def finished(search: Search, candidate: Fit) -> Fit:
     """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
     if candidate.falling == 0 and not search.explains(candidate):
-        finely = cost_of(search.rig, candidate.effects, search.data.stepped(PURSUIT.fine))
+        finely = cost_of(search.rig, candidate.effects, search.data.stepped(SELECTION.fine))
         if finely - 1.0 > FINISH.no_nearer * (candidate.cost - 1.0):
             return _by_finest_steps(search, candidate)
-    ended = fit(search.rig, candidate.effects, search.data.stepped(PURSUIT.fine), iterations=25, tolerance=1e-7)
+    ended = fit(search.rig, candidate.effects, search.data.stepped(SELECTION.fine), iterations=25, tolerance=1e-7)
     return _by_finest_steps(search, ended)
 
 
@@ -55,7 +55,7 @@ def widened(search: Search, found: Fit) -> Fit:
     sets = list(wider_sets(found.effects))
     if not sets:
         return found
-    data = search.data.stepped(PURSUIT.fine)
+    data = search.data.stepped(SELECTION.fine)
     cost = cost_of(search.rig, found.effects, data)
     for effects in sets:
         trial = fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=True)
@@ -167,7 +167,7 @@ def simplest(search: Search, candidate: Fit) -> Fit:
     def tried(effects: tuple[Effect, ...]) -> Fit | None:
         if promise(fit(search.rig, effects, search.quick, iterations=FINISH.at_first)) > FINISH.too_far * here:
             return None
-        trial = fit(search.rig, effects, search.data.stepped(PURSUIT.fine), iterations=12, tolerance=1e-7)
+        trial = fit(search.rig, effects, search.data.stepped(SELECTION.fine), iterations=12, tolerance=1e-7)
         return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
 
     simpler = next(filter(None, search.workers.map(tried, _simpler_sets(search, candidate))), None)

@@ -12,7 +12,7 @@ from workbench.gap.prediction.logged_inputs import logging_noise
 from workbench.gap.prediction.noise import noise_found
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import JOINT, PURSUIT
+from workbench.gap.search.settings import JOINT, SELECTION
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def fit_jointly(
         to_the_end: until no step lowers the cost, by fine steps of time where a law needs them.
     """
     rounds = JOINT.rounds if rounds is None else rounds
-    substeps = PURSUIT.fine if to_the_end else 4
+    substeps = SELECTION.fine if to_the_end else 4
     if to_the_end:
         errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
     if known is None:

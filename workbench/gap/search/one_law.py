@@ -6,9 +6,9 @@ from workbench.gap.effects.beyond import BEYOND, any_beyond, in_catalogue
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import finished, ranked
 from workbench.gap.search.fit import Fit, cost_of, fit
-from workbench.gap.search.pursuit import on_whole_records, one_more
 from workbench.gap.search.search import Decision, Search
-from workbench.gap.search.settings import LAW, PURSUIT, SEARCH
+from workbench.gap.search.selection import on_whole_records, one_more
+from workbench.gap.search.settings import LAW, SEARCH, SELECTION
 
 
 def one_law(search: Search, evidence: Evidence) -> Fit | None:
@@ -18,8 +18,8 @@ def one_law(search: Search, evidence: Evidence) -> Fit | None:
     """
     search.report("one force of another law", 0.35)
     beyond = replace(search, catalogue=BEYOND)
-    hopeful = [f for f in one_more(beyond, (), evidence) if f.cost < PURSUIT.hopeful]
-    fits = on_whole_records(beyond, hopeful, LAW.tried, to_cost=search.enough)
+    promising = [f for f in one_more(beyond, (), evidence) if f.cost < SELECTION.promising]
+    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.enough)
     return next((f for f in (_named(search, f) for f in fits) if search.explains(f)), None)
 
 
@@ -44,15 +44,15 @@ def unless_another(search: Search, decision: Decision, evidence: Evidence) -> De
     search.report("one force of another law", 0.9)
     beyond, there = replace(search, catalogue=BEYOND), evidence.of_force_at(effect.at)
     as_near = cost_of(search.rig, best.effects, search.ahead) + SEARCH.rival
-    hopeful = [f for f in one_more(beyond, (), there) if f.cost < as_near]
-    fits = on_whole_records(beyond, hopeful, LAW.tried, to_cost=search.enough)
+    promising = [f for f in one_more(beyond, (), there) if f.cost < as_near]
+    fits = on_whole_records(beyond, promising, LAW.tried, to_cost=search.enough)
     other = [f for f in fits if in_catalogue(f.effects[0]) is None]
     sure = (f for f in other if search.explains(f) and search.surely_better(f, best.cost, best.n_parameters))
     law = next(sure, None)
-    return decision if law is None else weighed_against(law, search, decision)
+    return decision if law is None else compared_with(law, search, decision)
 
 
-def weighed_against(law: Fit, search: Search, decision: Decision) -> Decision:
+def compared_with(law: Fit, search: Search, decision: Decision) -> Decision:
     """What is claimed where one force of another law explains the records: the likelier of it and of the decision's."""
     told = [decision.best, *(f for f, _ in decision.rivals)] if decision.outcome == "explained" else []
     best, rivals = ranked(search, [law, *told])

@@ -9,9 +9,9 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.search.finish import best_of_each, finished, plainest, ranked, relocated, simplest, simplified
 from workbench.gap.search.fit import Fit, cost_of
-from workbench.gap.search.pursuit import is_hopeful, on_whole_records, one_more, pairs_at_once
-from workbench.gap.search.screening import Weighed
+from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Decision, Search, in_one_valley, unexplained
+from workbench.gap.search.selection import is_promising, on_whole_records, one_more, pairs_at_once
 from workbench.gap.search.settings import PAIRS, RANDOM
 from workbench.structure.domain import Between
 
@@ -40,14 +40,14 @@ class Pairs:
     missed: list[Fit] = field(default_factory=list)
     moved: list[Fit] = field(default_factory=list)
 
-    def at_once(self, weighed: Weighed) -> bool:
+    def at_once(self, screened: Screening) -> bool:
         """Whether one of the pairs that are likeliest at first sight explains the records.
 
         Args:
-            weighed: what may be there, with nothing given.
+            screened: what may be there, with nothing given.
         """
         self.search.report("all pairs at once", 0.4)
-        return self._explained_by(pairs_at_once(self.search, weighed))
+        return self._explained_by(pairs_at_once(self.search, screened))
 
     def with_a_third(self) -> bool:
         """Whether the best pair and one more effect explain the records, where the pair leaves enough for one."""
@@ -96,7 +96,7 @@ class Pairs:
         Args:
             start: what is there with no effect.
         """
-        likeliest = best_of_each(self.found or [start])[: PAIRS.told]
+        likeliest = best_of_each(self.found or [start])[: PAIRS.named]
         explaining = [f for f in likeliest if self.search.explains(f)]
         if explaining:
             plain = plainest(self.search, explaining)
@@ -111,8 +111,8 @@ class Pairs:
     def _explained_by(self, ahead: Sequence[Fit]) -> bool:
         self.ahead = sorted((*self.ahead, *ahead), key=lambda f: f.cost)
         domain = self.search.rig.modes.domain
-        hopeful = [f for f in ahead if is_hopeful(self.search, f)]
-        fresh = [f for f in hopeful if not any(in_one_valley(f, other, domain) for other in self.followed)]
+        promising = [f for f in ahead if is_promising(self.search, f)]
+        fresh = [f for f in promising if not any(in_one_valley(f, other, domain) for other in self.followed)]
         most = PAIRS.more if self.found else PAIRS.finalists
         self.followed += fresh[:most]
         self._add(on_whole_records(self.search, fresh, most))

@@ -13,9 +13,9 @@ from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.search.finish import finished
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.jointly import on_their_sides, surely_late
-from workbench.gap.search.screening import Weighed
+from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import PLAIN, PURSUIT, SEARCH
+from workbench.gap.search.settings import PLAIN, SEARCH, SELECTION
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
@@ -117,7 +117,7 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | Non
         if best is not None and _labels(best) <= _labels(candidate):
             continue
         effects = _on_their_sides(search, candidate.effects)
-        found = fit(search.rig, effects, search.data.stepped(PURSUIT.fine), iterations=PLAIN.plainly)
+        found = fit(search.rig, effects, search.data.stepped(SELECTION.fine), iterations=PLAIN.plainly)
         more = 0 if best is None else found.n_parameters - best.n_parameters
         if search.explains(found) and (best is None or search.surely_better(found, best.cost, more)):
             best = found
@@ -146,7 +146,7 @@ def _with_one_late(search: Search, found: Fit) -> Fit:
     if len(off) != 1 or delays[off[0]] < 0:
         return found
     delay = Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * late.target.sample_time})
-    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(PURSUIT.fine))
+    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(SELECTION.fine))
     return alone if search.explains(alone) else found
 
 
@@ -157,14 +157,14 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
         return None
     given = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly).effects
     evidence = search.evidence_of(apply_all(search.rig, given))
-    weighed = Weighed.of(replace(search, catalogue=alike), given, evidence).likeliest()
-    likeliest = {effect.kind: effect for effect in reversed(weighed)}  # the best of each kind
-    more = [(*given, effect) for effect in weighed if effect is likeliest[effect.kind]][: PLAIN.likeliest]
+    screened = Screening.of(replace(search, catalogue=alike), given, evidence).likeliest()
+    likeliest = {effect.kind: effect for effect in reversed(screened)}  # the best of each kind
+    more = [(*given, effect) for effect in screened if effect is likeliest[effect.kind]][: PLAIN.likeliest]
     found = _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))])
     if found is None:
         return None
     rest = [e for e in found.effects if e.kind in COMMON or any(e.label == other.label for other in given)]
-    without = fit(search.rig, rest, search.data.stepped(PURSUIT.fine), iterations=PLAIN.plainly)
+    without = fit(search.rig, rest, search.data.stepped(SELECTION.fine), iterations=PLAIN.plainly)
     extra = found.n_parameters - without.n_parameters
-    worth = without.cost - found.cost > SEARCH.worthwhile and search.surely_better(found, without.cost, extra)
+    worth = without.cost - found.cost > SEARCH.significant and search.surely_better(found, without.cost, extra)
     return found if worth else None

@@ -95,8 +95,8 @@ def likeliest(search: Search, step: Step) -> Deviations | None:
         return None
     noise = float(step.noise_power.mean())
     found = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
-    hopeful = [d for d in found if d.is_sure and d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
-    return min(hopeful, key=lambda d: d.left * (RECORDS.clearly if d is found[0] else 1.0), default=None)
+    promising = [d for d in found if d.is_sure and d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
+    return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is found[0] else 1.0), default=None)
 
 
 def beside_records(before: Stepwise) -> Stepwise | None:

@@ -22,7 +22,7 @@ NOTHING = 1e-300  # square of a move that given effects make up for whole
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed:
+class Screening:
     """Starts of every kind and target, and what each moves the errors by on the most telling record.
 
     An effect acts on a motion that the records hold in place, so errors of predictions one sample ahead are nearly
@@ -45,7 +45,7 @@ class Weighed:
     domain: Domain
 
     @classmethod
-    def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Weighed":
+    def of(cls, search: Search, given: tuple[Effect, ...], evidence: Evidence) -> "Screening":
         """Weigh what may be there beside the given effects.
 
         Args:
@@ -167,12 +167,12 @@ def _starts(search: Search, given: tuple[Effect, ...], evidence: Evidence) -> li
         [Effect(kind, target, dict(values)) for values in kind.starts(evidence, target)]
         for kind in search.catalogue
         if kind.found_in == "search"
-        for target in _worthwhile(kind, rig, left)
+        for target in _targets_worth_trying(kind, rig, left)
     ]
     return [task for task in starts if task and not any(_repeats(task[0], effect) for effect in given)]
 
 
-def _worthwhile(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, ...]:
+def _targets_worth_trying(kind: Kind, rig: Rig, left: np.ndarray) -> tuple[Any, ...]:
     """Targets of a kind; a fault of one sensor is only looked for where that sensor disagrees."""
     targets = kind.targets(rig)
     if kind.path != "sensor":

@@ -60,7 +60,7 @@ class Search:
 
         Effects that crowd about one place stand for one law that the catalogue does not hold.
         """
-        if self.crowded(candidate.effects):
+        if self.clustered(candidate.effects):
             return False
         left = candidate.cost_by_channel.mean(axis=1)
         per_record = self.data.counted[0].outputs.size
@@ -73,7 +73,7 @@ class Search:
         """The cost of a set that explains the records, at most."""
         return float(1.0 + SEARCH.slack + SEARCH.integration_share * self.nominal.mean())
 
-    def crowded(self, effects: Sequence[Effect]) -> bool:
+    def clustered(self, effects: Sequence[Effect]) -> bool:
         """Whether nonlinear effects stand for one law: two of a kind, or three of any, side by side."""
         point = [effect for effect in effects if effect.kind.nonlinear and effect.at is not None]
 
@@ -88,9 +88,11 @@ class Search:
         n = self.data.n_values
         return bool(n * (than - candidate.cost) > SEARCH.sure + extra * np.log(n))
 
-    def worthwhile(self, candidate: Fit, than: float) -> bool:
+    def significant(self, candidate: Fit, than: float) -> bool:
         """Whether the gain is sure and large enough to be an effect rather than an imperfect model."""
-        return self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > SEARCH.worthwhile
+        return (
+            self.surely_better(candidate, than, candidate.n_parameters) and than - candidate.cost > SEARCH.significant
+        )
 
     def tells_apart(self, better: float, cost: float, extra: int) -> bool:
         """Whether records surely prefer the lower of two costs, for `extra` more numbers, and by more than a trifle."""
@@ -132,7 +134,7 @@ class Search:
         """What the records say of an unmodelled force beside what a rig has."""
         return Evidence.of(rig, self.data, FEWER_PLACES, self.workers)
 
-    def hearing(self) -> "Search":
+    def without_clipped(self) -> "Search":
         """The same search without sensors that clip or round coarsely: what they do not show would pass for a force."""
         kept = [j for j, s in enumerate(self.rig.sensors) if np.isinf(s.limit) and s.step < SEARCH.coarse * s.noise_std]
         if not kept or len(kept) == len(self.rig.sensors):
@@ -193,7 +195,7 @@ class Search:
         return self.workers.map(lambda candidate: function(self, candidate), candidates)
 
 
-def most_telling(data: FitData, by_channel: np.ndarray) -> tuple[FitData, FitData]:
+def most_informative(data: FitData, by_channel: np.ndarray) -> tuple[FitData, FitData]:
     """The two records that say most, and the first of them: largest against the noise, and against the signal.
 
     Args:

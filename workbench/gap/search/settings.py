@@ -14,7 +14,7 @@ class SearchSettings:
     sure: float = 30.0  # twice the logarithm of a likelihood ratio that settles a choice
     # of the noise power: no set is preferred to a simpler one for less, whatever the likelihood says
     trifle: float = 0.005
-    worthwhile: float = 0.01  # of the noise power: less is no effect but an imperfect model
+    significant: float = 0.01  # of the noise power: less is no effect but an imperfect model
     elsewhere: float = 0.1  # of the extent: nearer, two places are in one valley of the cost at first
     same_place: float = 0.02  # of the extent: nearer, fits go on to the same end
     rival: float = 0.02  # of the noise power: what is farther behind what explains the records is no rival of it
@@ -41,11 +41,11 @@ class ScreeningSettings:
 
     weaker: float = 0.03  # times its strength at the start: the least that an effect may turn out to have
     stronger: float = 30.0  # likewise, the most
-    most_values: int = 20_000  # of the errors that are weighed
+    most_values: int = 20_000  # of the errors that are screened
 
 
 @dataclass(frozen=True)
-class PursuitSettings:
+class SelectionSettings:
     """Constants of fits one sample ahead, and of those to whole records that follow."""
 
     fine: int = 8  # substeps of a sample
@@ -55,11 +55,12 @@ class PursuitSettings:
     likeliest: int = 5  # likewise, to their end
     exchanged: int = 2  # likeliest effects in whose places other kinds are tried
     far_behind: float = 10.0  # times the least promise: what is not fitted to its end
-    hopeful: float = 5.0  # times the noise one sample ahead: more is left by no set that explains the records, but for
-    # of what the nominal rig leaves there: steps of half a sample cost more than a small noise
-    hopeful_share: float = 0.05
+    # times the noise one sample ahead, or this share of what the nominal rig leaves there, where steps of half a sample
+    # cost more than a small noise: more is left by no set that explains the records
+    promising: float = 5.0
+    promising_share: float = 0.05
     # how loosely rigs are held beside the records, one after the other
-    letting_go: tuple[float, ...] = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)
+    continuation: tuple[float, ...] = (LOOSE, 0.1 * LOOSE, 0.01 * LOOSE)
     at_hand: float = 10.0  # times the noise: so near, whole records tell the way
     close: float = 2.0  # times the least cost ahead: what may still come first on whole records
     at_first: int = 5  # iterations on whole records, before it is seen which sets go on
@@ -113,7 +114,7 @@ class InputSettings:
     white: float = 2.0  # mean square, white, that a set may leave beside that noise for a search to go on beside it
     # of what a set leaves without that noise: errors of the model that bent to it may leave so much beside it
     bent: float = 0.1
-    hearings: int = 2  # rounds of learning the sensors' noise beside it
+    rounds: int = 2  # rounds of learning the sensors' noise beside it
 
 
 @dataclass(frozen=True)
@@ -255,7 +256,7 @@ class PairSettings:
     least: float = 0.002  # likewise: what is left of a measured gap bends to any law
     exchanges: int = 2  # rounds of keeping either half of the best pair ahead
     tried_further: int = 2  # pairs, best first, that are tried from other places too
-    told: int = 4  # sets, best first, that may be named or be rivals
+    named: int = 4  # sets, best first, that may be named or be rivals
 
 
 @dataclass(frozen=True)
@@ -293,7 +294,7 @@ class IntervalSettings:
 SEARCH = SearchSettings()
 FIT = FitSettings()
 SCREENING = ScreeningSettings()
-PURSUIT = PursuitSettings()
+SELECTION = SelectionSettings()
 FINISH = FinishSettings()
 RANDOM = RandomSettings()
 INPUTS = InputSettings()

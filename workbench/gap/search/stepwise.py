@@ -16,8 +16,8 @@ from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.plain import COMMON, in_place_of_errors
-from workbench.gap.search.pursuit import one_more
-from workbench.gap.search.search import Decision, Search, most_telling, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
+from workbench.gap.search.selection import one_more
 from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, STEPWISE
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
@@ -56,7 +56,7 @@ class Stepwise:
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
         self.steps.append(self._afresh(()))
-        self._hear_inputs(self.last)
+        self._with_input_noise(self.last)
 
     @property
     def last(self) -> Step:
@@ -79,7 +79,7 @@ class Stepwise:
             return False
         best = self._alone[0]
         if not self.explains(best):
-            best = self._hear_inputs(best) or best
+            best = self._with_input_noise(best) or best
         left = best.excess(best.noise_power)
         if not self.explains(best) and left > STEPWISE.further * float(self.search.nominal.mean()):
             return False
@@ -91,7 +91,7 @@ class Stepwise:
             self.steps.append(fit_jointly(self.search, (), fewer.errors))
             return self.is_enough
         self.steps.append(best)
-        self._hear_inputs(best)
+        self._with_input_noise(best)
         return True
 
     def run(self) -> None:
@@ -106,7 +106,7 @@ class Stepwise:
                 break
             self.steps.append(step)
             heard = self.search.logged
-            self._hear_inputs(step)
+            self._with_input_noise(step)
             if heard and not self.search.logged:  # what stood beside a noise that is none stands anew
                 self.steps[-1] = self._chosen_again(replace(self.last, others=step.others))
             self.steps.append(self._without_needless(self.last))
@@ -130,7 +130,7 @@ class Stepwise:
         """Whether what the last set leaves above the noise is less than any effect would."""
         return self.last.excess(self.last.noise_power) < STEPWISE.spotless * float(self.last.noise_power.mean())
 
-    def _hear_inputs(self, step: Step) -> Step | None:
+    def _with_input_noise(self, step: Step) -> Step | None:
         """The step beside noise of the logged inputs, where that makes what it leaves all but white; None elsewhere.
 
         The search goes on beside that noise, as loud as what this step leaves shows it, and so do the steps before;
@@ -217,7 +217,7 @@ class Stepwise:
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
         self.is_tried = True
-        quick, first = most_telling(self.search.data, step.fit.cost_by_channel)
+        quick, first = most_informative(self.search.data, step.fit.cost_by_channel)
         self.search = search = replace(self.search, quick=quick, first=first)
         search.report("another effect beside small errors of the model", 0.5 + 0.1 * len(step.effects))
         # errors fitted to whole records have taken what they can: what they leave tells of an effect that is missing
@@ -244,7 +244,7 @@ class Stepwise:
         best = self._best_of(tried, step)
         if not self._is_worth(best, step):
             return None
-        self.is_beyond = search.crowded(best.effects)
+        self.is_beyond = search.clustered(best.effects)
         return None if self.is_beyond else best
 
     def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
@@ -308,7 +308,7 @@ class Stepwise:
     def _is_likelier(self, best: Step, step: Step) -> bool:
         """Whether records surely prefer a set to a smaller one, by more than a model is imperfect."""
         more, gain = max(best.fit.n_parameters - step.fit.n_parameters, 1), self._gain(best, step)
-        return gain > SEARCH.worthwhile and self.search.pays(gain, more)
+        return gain > SEARCH.significant and self.search.pays(gain, more)
 
     def _gain(self, best: Step, step: Step) -> float:
         """Twice the log-likelihood that one step has more than another, a value."""

@@ -7,60 +7,60 @@ from workbench.gap.effects.limiting_cases import contained
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit, cost_of, fit
-from workbench.gap.search.screening import Weighed
+from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search, in_one_valley, promise, spread_over_kinds
-from workbench.gap.search.settings import PURSUIT, SEARCH
+from workbench.gap.search.settings import SEARCH, SELECTION
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import NamedPoints
 
 
 def one_more(
-    search: Search, given: tuple[Effect, ...], evidence: Evidence, weighed: Weighed | None = None
+    search: Search, given: tuple[Effect, ...], evidence: Evidence, screened: Screening | None = None
 ) -> list[Fit]:
     """The likeliest fits, one sample ahead, of the given effects with one more, best first.
 
     Args:
         evidence: of the rig with the given effects.
-        weighed: what may be there beside them, where it is at hand.
+        screened: what may be there beside them, where it is at hand.
     """
-    weighed = Weighed.of(search, given, evidence) if weighed is None else weighed
+    screened = Screening.of(search, given, evidence) if screened is None else screened
     chosen: list[Effect] = []
-    for effect in weighed.likeliest():
-        if sum(effect.kind is other.kind for other in chosen) < PURSUIT.targets_a_kind:
+    for effect in screened.likeliest():
+        if sum(effect.kind is other.kind for other in chosen) < SELECTION.targets_a_kind:
             chosen.append(effect)
     found = fitted_ahead(search, [(*given, effect) for effect in chosen])
     if not (search.held and found):
         return found
     # beside errors that give way, a start that stands a little off its place comes to nothing
-    there = fitted_ahead(search, [(*given, effect) for effect in _exchanged(found, weighed)])
+    there = fitted_ahead(search, [(*given, effect) for effect in _exchanged(found, screened)])
     return distinct_valleys(search, sorted((*found, *there), key=lambda f: f.cost))
 
 
-def _exchanged(found: Sequence[Fit], weighed: Weighed) -> list[Effect]:
+def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
     """Linear kinds of the structure, each where the likeliest of others stand."""
 
     def is_linear(effect: Effect) -> bool:
         return effect.kind.path == "structure" and not effect.kind.nonlinear and effect.at is not None
 
-    if isinstance(weighed.domain, NamedPoints):
+    if isinstance(screened.domain, NamedPoints):
         return []
-    likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][: PURSUIT.exchanged]
-    starts = {effect.kind: effect for effect in reversed(weighed.likeliest()) if is_linear(effect)}
+    likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][: SELECTION.exchanged]
+    starts = {effect.kind: effect for effect in reversed(screened.likeliest()) if is_linear(effect)}
     return [e.moved_to(one.at) for one in likeliest for e in starts.values() if e.kind is not one.kind]
 
 
-def pairs_at_once(search: Search, weighed: Weighed) -> list[Fit]:
+def pairs_at_once(search: Search, screened: Screening) -> list[Fit]:
     """The likeliest fits, one sample ahead, of any two effects, best first.
 
     Args:
-        weighed: with nothing given.
+        screened: with nothing given.
     """
-    return fitted_ahead(search, weighed.likeliest_pairs(PURSUIT.tried))
+    return fitted_ahead(search, screened.likeliest_pairs(SELECTION.tried))
 
 
-def is_hopeful(search: Search, candidate: Fit) -> bool:
+def is_promising(search: Search, candidate: Fit) -> bool:
     """Whether a fit one sample ahead may explain whole records."""
-    return candidate.cost < max(PURSUIT.hopeful, PURSUIT.hopeful_share * search.nominal_ahead)
+    return candidate.cost < max(SELECTION.promising, SELECTION.promising_share * search.nominal_ahead)
 
 
 def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit]:
@@ -73,12 +73,14 @@ def fitted_ahead(search: Search, sets: Sequence[tuple[Effect, ...]]) -> list[Fit
     def ahead(effects: tuple[Effect, ...], data: FitData, iterations: int) -> Fit:
         return fit(search.rig, effects, data, held=search.held, iterations=iterations, tolerance=1e-4)
 
-    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[: PURSUIT.tried])
-    likely = sorted(tried, key=promise)[: PURSUIT.likely]
+    tried = search.workers.map(lambda effects: ahead(effects, search.first_ahead, 2), sets[: SELECTION.tried])
+    likely = sorted(tried, key=promise)[: SELECTION.likely]
     fits = distinct_valleys(
         search, sorted(search.workers.map(lambda f: ahead(f.effects, search.ahead, 3), likely), key=promise)
     )
-    falling = [f for f in fits[: PURSUIT.likeliest] if f.falling and promise(f) < PURSUIT.far_behind * promise(fits[0])]
+    falling = [
+        f for f in fits[: SELECTION.likeliest] if f.falling and promise(f) < SELECTION.far_behind * promise(fits[0])
+    ]
     longer = search.workers.map(lambda f: ahead(f.effects, search.ahead, 8), falling)
     return distinct_valleys(search, sorted((*longer, *(f for f in fits if f not in falling)), key=lambda f: f.cost))
 
@@ -103,8 +105,8 @@ def on_whole_records(
         to_cost: what a fit must come to, to be of use; those on their way to more stay where they are.
         at_first: iterations before that is asked; as the settings have it unless given.
     """
-    at_first = PURSUIT.at_first if at_first is None else at_first
-    close = [f for f in ahead[:most] if f.cost < PURSUIT.close * ahead[0].cost]
+    at_first = SELECTION.at_first if at_first is None else at_first
+    close = [f for f in ahead[:most] if f.cost < SELECTION.close * ahead[0].cost]
     simpler = contained(close[0].effects, search.rig) if close else set()
     first = [f for f in close if f is close[0] or f.key in simpler]
     fits = search.workers.map(lambda f: followed(search, f.effects, at_first), first)
@@ -115,7 +117,7 @@ def on_whole_records(
     fits = sorted((*fits, *search.workers.map(lambda f: followed(search, f.effects, at_first), others)), key=promise)
     fits = _none_that_contains(search, fits, fits)
     to_cost = min([to_cost, *(f.cost + SEARCH.rival for f in fits if search.explains(f))])
-    running = [f for f in fits if f.falling and promise(f) < PURSUIT.running * promise(fits[0])]
+    running = [f for f in fits if f.falling and promise(f) < SELECTION.running * promise(fits[0])]
     running = [f for f in running if promise(f, SEARCH.further) < to_cost]
     longer = search.workers.map(lambda f: whole(search, f.effects, 25), running)
     return sorted((*longer, *(f for f in fits if f not in running)), key=lambda f: f.cost)
@@ -123,7 +125,7 @@ def on_whole_records(
 
 def _none_that_contains(search: Search, fits: Sequence[Fit], others: Sequence[Fit]) -> list[Fit]:
     """The others but those that come, at bounds of their numbers, to a fit that leaves nothing worth an effect."""
-    enough = {f.key for f in fits if f.cost < 1.0 + SEARCH.worthwhile and search.explains(f)}
+    enough = {f.key for f in fits if f.cost < 1.0 + SEARCH.significant and search.explains(f)}
     return [f for f in others if enough.isdisjoint(contained(f.effects, search.rig))]
 
 
@@ -138,13 +140,13 @@ def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
     """
     rig = apply_all(search.rig, effects)
     if is_stepped(rig) and not search.held and search.data.follower is None:
-        for loose in PURSUIT.letting_go:
-            data = search.data.following(rig, loose).stepped(PURSUIT.fine)
+        for loose in SELECTION.continuation:
+            data = search.data.following(rig, loose).stepped(SELECTION.fine)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
             effects = held.effects
             if (
-                held.cost > PURSUIT.hopeful
-                or cost_of(search.rig, effects, search.data.stepped(PURSUIT.fine)) < PURSUIT.at_hand
+                held.cost > SELECTION.promising
+                or cost_of(search.rig, effects, search.data.stepped(SELECTION.fine)) < SELECTION.at_hand
             ):
                 break
     return whole(search, effects, iterations)
@@ -152,5 +154,5 @@ def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
 
 def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to whole records."""
-    data = search.data.stepped(PURSUIT.fine)
+    data = search.data.stepped(SELECTION.fine)
     return fit(search.rig, effects, data, held=search.held, iterations=iterations)
