@@ -21,13 +21,17 @@ def rig(hinged_beam):
 
 
 @pytest.mark.parametrize("elements", [(), (CubicSpring(1.1, 50.0),)], ids=["linear", "cubic"])
+@pytest.mark.parametrize("arriving", [0.0, 0.35, 1.85])
 @pytest.mark.parametrize("share", [-0.4, 0.3, 0.5, 0.9, 1.4])
-def test_a_late_sensor_reads_the_motion_between_samples(rig, elements, share):
-    """Truth: the same motion on a grid ten times as fine. The fourth mode has eight samples a period."""
+def test_a_late_sensor_reads_the_motion_between_samples(rig, elements, arriving, share):
+    """Truth: the same motion on a grid ten times as fine. The fourth mode has eight samples a period.
+
+    Held inputs that arrive within a sample interval are steps of the acceleration there.
+    """
     dt = 2 * np.pi / rig.modes.omega[3] / 8.0
     rng = np.random.default_rng(1)
     inputs = rng.standard_normal((1, 200))
-    rig = replace(rig, elements=elements)
+    rig = replace(rig, elements=elements, actuators=(replace(rig.actuators[0], delay=arriving * dt),))
     fine = simulate(rig, np.repeat(inputs, FINE, axis=1), sample_time=dt / FINE, substeps=8).outputs
     late = replace(rig, sensors=tuple(replace(s, delay=share * dt) for s in rig.sensors))
     read = simulate(late, inputs, sample_time=dt, substeps=80).outputs

@@ -7,6 +7,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.rig.stepping import propagators
 
+Steps = tuple[tuple[float, Floats], ...]
 SETTLED = 1e-6  # of the largest eigenvalue: directions of force that hardly move a mode over a sample are left alone
 
 
@@ -14,13 +15,17 @@ SETTLED = 1e-6  # of the largest eigenvalue: directions of force that hardly mov
 class BetweenSamples:
     """Modal motion at any time: in each sample interval every mode moves exactly under a force linear in time.
 
-    q'' + c q' + ω² q = p_0 + (p_1 - p_0) t / Δt in [0, Δt], p_0 and p_1 such that q and q' come out at both ends as
-    they are. So it is exact for inputs held over each sample, and of second order for forces that follow laws. p_0 and
-    p_1 are linear in the motion at both ends, so a reading at any time is a weighted sum of that.
+    q'' + c q' + ω² q = p_0 + (p_1 - p_0) t / Δt in [0, Δt] and steps of force within it that are known, p_0 and p_1
+    such that q and q' come out at both ends as they are. So it is exact for inputs held over each sample, late or not,
+    and of second order for forces that follow laws. p_0 and p_1 are linear in the motion at both ends, so a reading at
+    any time is a weighted sum of that.
 
     Attributes:
         omega, damping: (n_modes,) of each mode alone.
         series: (3 n_modes, n_samples) displacements, velocities, and forces beside those of stiffness and damping.
+        arrivals: (2 n_modes, n_samples - 1) displacements and velocities where each interval ends, less what steps of
+            force within it bring about.
+        steps: (s after each sample, (n_modes, n_samples) of the forces).
         ends: (2, 5, n_modes) p_0 and p_1, of displacement, velocity and force where an interval begins, displacement
             and velocity where it ends.
         sample_time: s.
@@ -30,6 +35,8 @@ class BetweenSamples:
     omega: Floats
     damping: Floats
     series: Floats
+    arrivals: Floats
+    steps: Steps
     ends: Floats
     sample_time: float
     rests: bool
@@ -44,6 +51,7 @@ class BetweenSamples:
         damping: Floats,
         sample_time: float,
         *,
+        steps: Steps = (),
         held: bool = False,
     ) -> "BetweenSamples":
         """From displacements, velocities and forces (n_modes, n_samples) at the samples.
@@ -51,7 +59,8 @@ class BetweenSamples:
         Args:
             stiffness: (n_modes, 1) or (n_modes, n_samples).
             damping: (n_modes, n_modes).
-            held: whether the forces stay as they are from sample to sample; then they are exact as they are.
+            steps: by which they change within each interval, (s after the sample, (n_modes, n_samples)).
+            held: whether the forces stay as they are from sample to sample but for these; then they are exact so.
         """
         omega, own = np.sqrt(stiffness.mean(axis=1)), np.diag(damping).copy()
         # what a mode alone does not have counts as a force
@@ -62,7 +71,12 @@ class BetweenSamples:
             beside = beside - coupled @ velocity
         ends = _held(omega.size) if held else _ends(omega, own, sample_time)
         rests = not (displacement[:, 0].any() or velocity[:, 0].any())
-        return cls(omega, own, np.concatenate([displacement, velocity, beside]), ends, sample_time, rests)
+        series = np.concatenate([displacement, velocity, beside])
+        arrivals = series[: 2 * omega.size, 1:].copy()
+        for late, forces in steps:
+            added = _after_step(omega, own, sample_time - late)
+            arrivals -= np.concatenate([row[:, None] * forces[:, :-1] for row in added])
+        return cls(omega, own, series, arrivals, steps, ends, sample_time, rests)
 
     def earlier(self, order: int, shapes: Floats, delays: Floats) -> Floats:
         """What each sensor reads its delay before each sample, (n_sensors, n_samples), zero before a start at rest.
@@ -78,6 +92,11 @@ class BetweenSamples:
         within = [self.sample_time * round(n - samples, 9) for n, samples in zip(whole, back, strict=True)]
         rows = np.array([self._rows(order, time) for time in within])
         read = self._read(shapes, rows)
+        for late, forces in self.steps:
+            for j in (j for j, time in enumerate(within) if time > late):
+                moved = _after_step(self.omega, self.damping, within[j] - late)
+                row = moved[order] if order < 2 else 1.0 - self.omega**2 * moved[0] - self.damping * moved[1]
+                read[j] += (shapes[j] * row) @ forces
         n_samples = read.shape[1]
         found = np.zeros_like(read)
         for j, n in enumerate(whole):
@@ -89,7 +108,7 @@ class BetweenSamples:
 
     def _read(self, shapes: Floats, rows: Floats, samples: slice = slice(None)) -> Floats:
         """Readings (n_sensors, n_samples) in each interval, by rows (n_sensors, 4, n_modes) of q, q', p_0 and p_1."""
-        n_modes, series = self.omega.size, self.series[:, samples]
+        n_modes, series, arrivals = self.omega.size, self.series[:, samples], self.arrivals[:, samples]
 
         def weights(ends: Floats) -> Floats:
             by_motion = np.einsum("jfm,fsm->jsm", rows[:, 2:], ends)
@@ -99,7 +118,7 @@ class BetweenSamples:
 
         by_motion = weights(self.ends)
         read: Floats = by_motion[:, : 3 * n_modes] @ series
-        read[:, :-1] += by_motion[:, 3 * n_modes :] @ series[: 2 * n_modes, 1:]
+        read[:, :-1] += by_motion[:, 3 * n_modes :] @ arrivals[:, : series.shape[1] - 1]
         # after the last sample its force is held
         read[:, -1] = weights(_held(n_modes))[:, : 3 * n_modes] @ series[:, -1]
         return read
@@ -115,6 +134,12 @@ class BetweenSamples:
         rows[2] += 1.0 - share
         rows[3] += share
         return rows
+
+
+def _after_step(omega: Floats, damping: Floats, time: float) -> Floats:
+    """(2, n_modes): q and q' a while after a force of one begins to act on a mode at rest."""
+    after: Floats = _propagators(omega, damping, time)[:, 2:].sum(axis=1)
+    return after
 
 
 def _held(n_modes: int) -> Floats:

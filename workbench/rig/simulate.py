@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from workbench.arrays import Floats, Integers
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
-from workbench.rig.between_samples import BetweenSamples
+from workbench.rig.between_samples import BetweenSamples, Steps
 from workbench.rig.elements import (
     AirDrag,
     BoucWen,
@@ -78,7 +78,8 @@ class Motion:
         forces: (n_modes, n_samples) on them beside those of stiffness and damping.
         stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
         damping: (n_modes, n_modes).
-        held: whether the forces stay as they are from sample to sample.
+        steps: by which forces change within each interval, (s after the sample, (n_modes, n_samples)).
+        held: whether the forces stay as they are from sample to sample but for these.
     """
 
     displacement: Floats
@@ -86,13 +87,15 @@ class Motion:
     forces: Floats
     stiffness: Floats
     damping: Floats
+    steps: Steps = ()
     held: bool = False
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
         """The motion at any time, s; computed once, since sensors of many delays may read one motion."""
         if "_between_samples" not in self.__dict__:
             q, v, forces = self.displacement, self.velocity, self.forces
-            found = BetweenSamples.of(q, v, forces, self.stiffness, self.damping, sample_time, held=self.held)
+            figures = self.stiffness, self.damping, sample_time
+            found = BetweenSamples.of(q, v, forces, *figures, steps=self.steps, held=self.held)
             object.__setattr__(self, "_between_samples", found)
         known: BetweenSamples = self.__dict__["_between_samples"]
         return known
@@ -108,7 +111,8 @@ class Motion:
             return self
         stiffness = self.stiffness[:, lead:] if self.stiffness.shape[1] > 1 else self.stiffness
         q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
-        return Motion(q, v, forces, stiffness, self.damping, self.held)
+        steps = tuple((late, step[:, lead:]) for late, step in self.steps)
+        return Motion(q, v, forces, stiffness, self.damping, steps, self.held)
 
 
 def simulate(
@@ -286,8 +290,20 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
     held = input_hold == "zero" and modes.proportional and not any(isinstance(e, PeriodicForce) for e in rig.elements)
-    held = held and not any(a.delay or a.time_constant for a in rig.actuators)
-    return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping, held)
+    held = held and not any(a.time_constant for a in rig.actuators)
+    steps = _steps_within(rig, inputs, participation, sample_time) if input_hold == "zero" else ()
+    return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping, steps, held)
+
+
+def _steps_within(rig: Rig, inputs: Floats, participation: Floats, sample_time: float) -> Steps:
+    """What held inputs that arrive within each sample interval change the forces on the modes by there."""
+    steps: dict[float, Floats] = {}
+    for j, actuator in enumerate(rig.actuators):
+        shift, late = divmod(actuator.delay, sample_time)
+        if late and not actuator.time_constant and not np.isfinite(actuator.rate_limit):
+            older, newer = _shifted(actuator_force(actuator, inputs[j]), int(shift))
+            steps[late] = steps.get(late, 0.0) + np.outer(participation[:, j], newer - older)
+    return tuple(steps.items())
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int, input_hold: str) -> Motion:
@@ -298,7 +314,8 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     stiffness = modes.omega[:, None] ** 2 * (scale if rig.stiffness_rate else 1.0)
     # the forces on the modes hold what couples them; only each mode's own damping is left
-    return Motion(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)))
+    steps = _steps_within(rig, inputs, participation, sample_time) if input_hold == "zero" else ()
+    return Motion(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)), steps)
 
 
 def follow(

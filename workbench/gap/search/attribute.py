@@ -188,7 +188,7 @@ def attribute(
         alone = _without_a_second(search, start, singles)
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
-        decision = decision or _with_a_second(search, start, singles, screened, evidence, tolerance)
+        decision = decision or _with_a_second(search, start, singles, ahead, screened, evidence, tolerance)
     outcome, best, random, rivals, noise, beside_inputs = decision
     within = beside_inputs or search
     best = common_as_errors(search, best, alone=random is not None)
@@ -330,10 +330,16 @@ def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
 
 
 def _with_a_second(
-    search: Search, start: Fit, singles: Sequence[Fit], screened: Screening, evidence: Evidence, tolerance: float
+    search: Search,
+    start: Fit,
+    singles: Sequence[Fit],
+    ahead: Sequence[Fit],
+    screened: Screening,
+    evidence: Evidence,
+    tolerance: float,
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
-    beside = Stepwise(search, tolerance, singles)
+    beside = Stepwise(search, tolerance, singles, ahead)
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
@@ -347,14 +353,13 @@ def _with_a_second(
     if varied is not None:
         return varied.decision()
     law = one_law(search, evidence)
-    if law is None and beside.last.fit.cost < min(f.cost for f in (start, *singles)):
-        beside.run()
-        decision = beside.decision()
-        if decision.outcome == "explained":
-            return decision
-        if decision.outcome == "none" and beside.is_quiet:
-            return decision
     pairs = Pairs(search)
+    # beside errors that no model has, something is missing that may stand in for them: few effects without come first
+    nearer = beside.last.is_plausible and beside.last.fit.cost < min(f.cost for f in (start, *singles))
+    if law is None and nearer:
+        beside.run()
+        if beside.is_settled:
+            return beside.decision()
     explained = pairs.at_once(screened) or (law is None and pairs.with_a_third())
     decision = pairs.decision(start)
     if law is not None:
@@ -363,7 +368,7 @@ def _with_a_second(
         return decision
     if len(beside.steps) == 1:
         beside.run()
-    if beside.decision().outcome != "explained" and pairs.by_exchange():
+    if not beside.is_settled and beside.decision().outcome != "explained" and pairs.by_exchange():
         decision = pairs.decision(start)
         if not (are_common(decision.best.effects) and beside.is_nothing):
             return decision

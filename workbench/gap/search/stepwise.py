@@ -16,7 +16,7 @@ from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.plain import COMMON, in_place_of_errors
-from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
+from workbench.gap.search.search import Decision, Search, in_one_valley, most_informative, spread_over_kinds
 from workbench.gap.search.selection import one_more
 from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, STEPWISE
 
@@ -29,7 +29,8 @@ class Stepwise:
     Attributes:
         search: what it works on.
         tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
-        singles: the likeliest effects alone, without errors, which the first one is chosen among too.
+        singles: the likeliest effects alone, without errors, which the first one is chosen among too; with the values
+            that predictions one sample ahead give them.
         at_first: the search without noise of the logged inputs.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
@@ -38,9 +39,14 @@ class Stepwise:
         is_run: whether effects have been added as long as that pays.
     """
 
-    def __init__(self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = ()) -> None:
+    def __init__(
+        self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = (), ahead: Sequence[Fit] = ()
+    ) -> None:
         self.singles: list[Fit] = []
-        for single in spread_over_kinds(singles, 1):
+        domain = search.rig.modes.domain
+        # on whole records, with frequencies that are off, an effect may have gone astray: it starts as it was before
+        before = [next((f for f in ahead if in_one_valley(f, single, domain)), single) for single in singles]
+        for single in spread_over_kinds(before, 1):
             # a law that comes to a likelier one at its bounds is no other explanation
             comes_to = contained(single.effects, search.rig)
             if single.effects[0].kind not in COMMON and not any(f.key in comes_to for f in self.singles):
@@ -180,6 +186,13 @@ class Stepwise:
     def is_quiet(self) -> bool:
         """Whether next to nothing is left but noise of sensors and logged inputs."""
         return self.last.excess(self.last.noise_power) < STEPWISE.no_gap * float(self.last.noise_power.mean())
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether nothing is left to look for: effects explain the gap beside no errors that no model has, or errors do."""
+        outcome = self.decision().outcome
+        plausible = self.plain is not None or self.last.is_plausible
+        return (outcome == "explained" and plausible) or (outcome == "none" and self.is_quiet)
 
     def decision(self) -> Decision:
         """What the effects of the last set explain."""
