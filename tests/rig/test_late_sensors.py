@@ -21,17 +21,22 @@ def rig(hinged_beam):
 
 
 @pytest.mark.parametrize("elements", [(), (CubicSpring(1.1, 50.0),)], ids=["linear", "cubic"])
-@pytest.mark.parametrize("arriving", [0.0, 0.35, 1.85])
+@pytest.mark.parametrize(
+    "drive",
+    [{}, {"delay": 0.35}, {"delay": 1.85}, {"time_constant": 0.4}, {"delay": 0.35, "time_constant": 0.4}],
+    ids=lambda drive: " and ".join(drive) or "at once",
+)
 @pytest.mark.parametrize("share", [-0.4, 0.3, 0.5, 0.9, 1.4])
-def test_a_late_sensor_reads_the_motion_between_samples(rig, elements, arriving, share):
+def test_a_late_sensor_reads_the_motion_between_samples(rig, elements, drive, share):
     """Truth: the same motion on a grid ten times as fine. The fourth mode has eight samples a period.
 
-    Held inputs that arrive within a sample interval are steps of the acceleration there.
+    Held inputs that a drive delays, or lags behind, are steps of the acceleration within a sample interval.
     """
     dt = 2 * np.pi / rig.modes.omega[3] / 8.0
     rng = np.random.default_rng(1)
     inputs = rng.standard_normal((1, 200))
-    rig = replace(rig, elements=elements, actuators=(replace(rig.actuators[0], delay=arriving * dt),))
+    drive = {name: share * dt for name, share in drive.items()}
+    rig = replace(rig, elements=elements, actuators=(replace(rig.actuators[0], **drive),))
     fine = simulate(rig, np.repeat(inputs, FINE, axis=1), sample_time=dt / FINE, substeps=8).outputs
     late = replace(rig, sensors=tuple(replace(s, delay=share * dt) for s in rig.sensors))
     read = simulate(late, inputs, sample_time=dt, substeps=80).outputs
@@ -42,6 +47,23 @@ def test_a_late_sensor_reads_the_motion_between_samples(rig, elements, arriving,
         expected = np.array([np.r_[np.zeros(back), y][: y.size][::FINE] for y in fine])
     error = np.abs(read - expected)[:, 2:].max(axis=1) / np.abs(expected).max(axis=1)
     assert (error < (2e-3, 2e-3, 1e-2)).all(), error
+
+
+@pytest.mark.parametrize("hold", ["zero", "first"])
+@pytest.mark.parametrize("samples", [-3, 7])
+def test_a_rate_limited_force_is_read_between_samples(rig, samples, hold):
+    """Truth: the same motion on a grid ten times as fine; its ramps begin and end within the sample intervals."""
+    dt = 2 * np.pi / rig.modes.omega[3] / 8.0
+    inputs = np.random.default_rng(1).standard_normal((1, 200))
+    rig = replace(rig, actuators=(replace(rig.actuators[0], rate_limit=1.7 / dt),))
+    time = np.arange(inputs.size * FINE) / FINE
+    often = inputs.repeat(FINE, axis=1) if hold == "zero" else np.interp(time, np.arange(inputs.size), inputs[0])[None]
+    fine = simulate(rig, often, sample_time=dt / FINE, substeps=8, input_hold=hold).outputs
+    late = replace(rig, sensors=tuple(replace(s, delay=samples * dt / FINE) for s in rig.sensors))
+    read = simulate(late, inputs, sample_time=dt, substeps=80, input_hold=hold).outputs
+    expected = np.roll(fine, samples, axis=1)[:, ::FINE]
+    error = np.abs(read - expected)[:, 2:-1].max(axis=1) / np.abs(expected).max(axis=1)
+    assert (error < 1e-3).all(), error
 
 
 def test_a_sensor_late_by_whole_samples_is_shifted(rig):

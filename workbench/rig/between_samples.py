@@ -7,8 +7,36 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.rig.stepping import propagators
 
-Steps = tuple[tuple[float, Floats], ...]
 SETTLED = 1e-6  # of the largest eigenvalue: directions of force that hardly move a mode over a sample are left alone
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A change of the forces on the modes within every sample interval.
+
+    Attributes:
+        late: s after the sample at which it begins.
+        time_constant: s, of the first-order lag by which it comes about; 0 at once.
+        forces: (n_modes, n_samples) by which they change.
+    """
+
+    late: float
+    time_constant: float
+    forces: Floats
+
+    def answer(self, omega: Floats, damping: Floats, time: float) -> Floats:
+        """(3, n_modes): q, q' and q'' that a step of one has brought about a time after the sample."""
+        span = time - self.late
+        motion = _propagators(omega, damping, span)
+        answer, force = motion[:, 2:].sum(axis=1), 1.0
+        if self.time_constant:
+            # what has not come about yet, exp(-t / T), is answered by a motion like it, which goes free at the start
+            fade, rate = np.exp(-span / self.time_constant), 1.0 / self.time_constant
+            like = 1.0 / (rate**2 - damping * rate + omega**2)
+            free = motion[:, 0] * like - motion[:, 1] * rate * like
+            answer = answer - (np.array([[1.0], [-rate]]) * like * fade - free)
+            force -= fade
+        return np.vstack([answer, force - omega**2 * answer[0] - damping * answer[1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,16 +44,16 @@ class BetweenSamples:
     """Modal motion at any time: in each sample interval every mode moves exactly under a force linear in time.
 
     q'' + c q' + ω² q = p_0 + (p_1 - p_0) t / Δt in [0, Δt] and steps of force within it that are known, p_0 and p_1
-    such that q and q' come out at both ends as they are. So it is exact for inputs held over each sample, late or not,
-    and of second order for forces that follow laws. p_0 and p_1 are linear in the motion at both ends, so a reading at
-    any time is a weighted sum of that.
+    such that q and q' come out at both ends as they are. So it is exact for inputs held over each sample, delayed or
+    lagged too, and of second order for forces that follow laws. p_0 and p_1 are linear in the motion at both ends, so a
+    reading at any time is a weighted sum of that.
 
     Attributes:
         omega, damping: (n_modes,) of each mode alone.
         series: (3 n_modes, n_samples) displacements, velocities, and forces beside those of stiffness and damping.
         arrivals: (2 n_modes, n_samples - 1) displacements and velocities where each interval ends, less what steps of
             force within it bring about.
-        steps: (s after each sample, (n_modes, n_samples) of the forces).
+        steps: of the forces within each interval.
         ends: (2, 5, n_modes) p_0 and p_1, of displacement, velocity and force where an interval begins, displacement
             and velocity where it ends.
         sample_time: s.
@@ -36,7 +64,7 @@ class BetweenSamples:
     damping: Floats
     series: Floats
     arrivals: Floats
-    steps: Steps
+    steps: tuple[Step, ...]
     ends: Floats
     sample_time: float
     rests: bool
@@ -51,7 +79,7 @@ class BetweenSamples:
         damping: Floats,
         sample_time: float,
         *,
-        steps: Steps = (),
+        steps: tuple[Step, ...] = (),
         held: bool = False,
     ) -> "BetweenSamples":
         """From displacements, velocities and forces (n_modes, n_samples) at the samples.
@@ -59,7 +87,7 @@ class BetweenSamples:
         Args:
             stiffness: (n_modes, 1) or (n_modes, n_samples).
             damping: (n_modes, n_modes).
-            steps: by which they change within each interval, (s after the sample, (n_modes, n_samples)).
+            steps: by which they change within each interval.
             held: whether the forces stay as they are from sample to sample but for these; then they are exact so.
         """
         omega, own = np.sqrt(stiffness.mean(axis=1)), np.diag(damping).copy()
@@ -73,9 +101,9 @@ class BetweenSamples:
         rests = not (displacement[:, 0].any() or velocity[:, 0].any())
         series = np.concatenate([displacement, velocity, beside])
         arrivals = series[: 2 * omega.size, 1:].copy()
-        for late, forces in steps:
-            added = _after_step(omega, own, sample_time - late)
-            arrivals -= np.concatenate([row[:, None] * forces[:, :-1] for row in added])
+        for step in steps:
+            added = step.answer(omega, own, sample_time)
+            arrivals -= np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
         return cls(omega, own, series, arrivals, steps, ends, sample_time, rests)
 
     def earlier(self, order: int, shapes: Floats, delays: Floats) -> Floats:
@@ -84,7 +112,7 @@ class BetweenSamples:
         Args:
             order: 0 for displacement, 1 for velocity, 2 for acceleration.
             shapes: (n_sensors, n_modes) at the sensors.
-            delays: (n_sensors,) s; negative, by less than a sample, for what is read ahead.
+            delays: (n_sensors,) s; negative for what is read ahead.
         """
         back = [delay / self.sample_time for delay in delays]
         whole = [int(np.ceil(round(samples, 9))) for samples in back]
@@ -92,15 +120,18 @@ class BetweenSamples:
         within = [self.sample_time * round(n - samples, 9) for n, samples in zip(whole, back, strict=True)]
         rows = np.array([self._rows(order, time) for time in within])
         read = self._read(shapes, rows)
-        for late, forces in self.steps:
-            for j in (j for j, time in enumerate(within) if time > late):
-                moved = _after_step(self.omega, self.damping, within[j] - late)
-                row = moved[order] if order < 2 else 1.0 - self.omega**2 * moved[0] - self.damping * moved[1]
-                read[j] += (shapes[j] * row) @ forces
+        for step in self.steps:
+            for j in (j for j, time in enumerate(within) if time > step.late):
+                answer = step.answer(self.omega, self.damping, within[j])
+                read[j] += (shapes[j] * answer[order]) @ step.forces
         n_samples = read.shape[1]
         found = np.zeros_like(read)
         for j, n in enumerate(whole):
-            found[j, n:] = read[j, : max(n_samples - n, 0)]
+            ahead = max(-n, 0)
+            found[j, max(n, 0) : n_samples - ahead] = read[j, ahead : max(n_samples - n, 0)]
+            for k in range(ahead):  # beyond the last sample its force is held
+                there = self._rows(order, within[j] + self.sample_time * (k + 1))
+                found[j, k - ahead] = self._read(shapes[j : j + 1], there[None], slice(-1, None))[0, 0]
             for k in range(0 if self.rests else min(n, n_samples)):  # the first interval drawn on backwards
                 there = self._rows(order, within[j] + self.sample_time * (k - n))
                 found[j, k] = self._read(shapes[j : j + 1], there[None], slice(0, 2))[0, 0]
@@ -134,12 +165,6 @@ class BetweenSamples:
         rows[2] += 1.0 - share
         rows[3] += share
         return rows
-
-
-def _after_step(omega: Floats, damping: Floats, time: float) -> Floats:
-    """(2, n_modes): q and q' a while after a force of one begins to act on a mode at rest."""
-    after: Floats = _propagators(omega, damping, time)[:, 2:].sum(axis=1)
-    return after
 
 
 def _held(n_modes: int) -> Floats:

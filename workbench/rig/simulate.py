@@ -1,7 +1,7 @@
 """Simulation of a rig from rest: exact where it is linear, stepped with exact modes where it is not."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from workbench.arrays import Floats, Integers
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
-from workbench.rig.between_samples import BetweenSamples, Steps
+from workbench.rig.between_samples import BetweenSamples, Step
 from workbench.rig.elements import (
     AirDrag,
     BoucWen,
@@ -78,8 +78,9 @@ class Motion:
         forces: (n_modes, n_samples) on them beside those of stiffness and damping.
         stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
         damping: (n_modes, n_modes).
-        steps: by which forces change within each interval, (s after the sample, (n_modes, n_samples)).
+        steps: by which forces change within each interval.
         held: whether the forces stay as they are from sample to sample but for these.
+        finer: what moves again, with so many times as many samples, where forces change within an interval otherwise.
     """
 
     displacement: Floats
@@ -87,8 +88,9 @@ class Motion:
     forces: Floats
     stiffness: Floats
     damping: Floats
-    steps: Steps = ()
+    steps: tuple[Step, ...] = ()
     held: bool = False
+    finer: "tuple[int, Callable[[], Motion]] | None" = None
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
         """The motion at any time, s; computed once, since sensors of many delays may read one motion."""
@@ -111,8 +113,12 @@ class Motion:
             return self
         stiffness = self.stiffness[:, lead:] if self.stiffness.shape[1] > 1 else self.stiffness
         q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
-        steps = tuple((late, step[:, lead:]) for late, step in self.steps)
-        return Motion(q, v, forces, stiffness, self.damping, steps, self.held)
+        steps = tuple(replace(step, forces=step.forces[:, lead:]) for step in self.steps)
+        later = replace(self, displacement=q, velocity=v, forces=forces, stiffness=stiffness, steps=steps)
+        if self.finer is None:
+            return later
+        times, move_again = self.finer
+        return replace(later, finer=(times, lambda: move_again().after(times * lead)))
 
 
 def simulate(
@@ -185,14 +191,17 @@ def steps_exactly(rig: Rig) -> bool:
 def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
-    late = motion.between_samples(sample_time) if any(sensor.delay for sensor in rig.sensors) else None
+    late, every = None, 1
+    if any(sensor.delay for sensor in rig.sensors):
+        every, finer = (1, motion) if motion.finer is None else (motion.finer[0], motion.finer[1]())
+        late = finer.between_samples(sample_time / every)
     for order, here, shapes in _shapes_at_sensors(rig):
         delays = np.array([rig.sensors[j].delay for j in here])
         if late is None or not delays.all():
             outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
         if late is not None and delays.any():
             behind = np.flatnonzero(delays)
-            outputs[np.array(here)[behind]] = late.earlier(order, shapes[behind], delays[behind])
+            outputs[np.array(here)[behind]] = late.earlier(order, shapes[behind], delays[behind])[:, ::every]
     for row, leak in _leaks(rig, outputs):
         outputs[row] += leak
     for j, sensor in enumerate(rig.sensors):
@@ -265,7 +274,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
     system = modal_poles(modes.omega, modes.damping)
     n_samples = inputs.shape[1]
     response = np.zeros((system.poles.size, n_samples), complex)
-    acting = np.zeros((modes.n_modes, n_samples))
+    acting = np.zeros_like(inputs)
     response_to = held_response if input_hold == "zero" else straight_response
     for delay, lag in {(a.delay, a.time_constant) for a in rig.actuators}:
         group = [j for j, a in enumerate(rig.actuators) if (a.delay, a.time_constant) == (delay, lag)]
@@ -274,12 +283,14 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
             system, forces, participation[:, group], sample_time, delay=delay, time_constant=lag
         )
         response += share
-        acting += participation[:, group] @ at_samples
+        acting[group] = at_samples
+    steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
     bias = np.array([actuator.bias for actuator in rig.actuators])
     if bias.any():
         constant = np.outer(bias, np.ones(n_samples))
         response += held_response(system, constant, participation, sample_time)[0]
-        acting += participation @ constant
+        acting += constant
+    on_modes = participation @ acting
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
         if not isinstance(element, PeriodicForce):
@@ -287,23 +298,30 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         shape = modes.phi_at(element.at)
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
         response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
-        acting += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
+        on_modes += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
     held = input_hold == "zero" and modes.proportional and not any(isinstance(e, PeriodicForce) for e in rig.elements)
-    held = held and not any(a.time_constant for a in rig.actuators)
-    steps = _steps_within(rig, inputs, participation, sample_time) if input_hold == "zero" else ()
-    return Motion(q, v, acting, modes.omega[:, None] ** 2, modes.damping, steps, held)
+    return Motion(q, v, on_modes, modes.omega[:, None] ** 2, modes.damping, steps, held)
 
 
-def _steps_within(rig: Rig, inputs: Floats, participation: Floats, sample_time: float) -> Steps:
-    """What held inputs that arrive within each sample interval change the forces on the modes by there."""
-    steps: dict[float, Floats] = {}
+def _steps_within(
+    rig: Rig, inputs: Floats, acting: Floats, participation: Floats, sample_time: float
+) -> tuple[Step, ...]:
+    """How held inputs that are delayed or lagged change the forces on the modes within each sample interval.
+
+    Args:
+        acting: (n_actuators, n_samples) forces at the samples, without bias.
+    """
+    steps: dict[tuple[float, float], Floats] = {}
     for j, actuator in enumerate(rig.actuators):
         shift, late = divmod(actuator.delay, sample_time)
-        if late and not actuator.time_constant and not np.isfinite(actuator.rate_limit):
-            older, newer = _shifted(actuator_force(actuator, inputs[j]), int(shift))
-            steps[late] = steps.get(late, 0.0) + np.outer(participation[:, j], newer - older)
-    return tuple(steps.items())
+        lag = actuator.time_constant
+        if not (late or lag) or np.isfinite(actuator.rate_limit):
+            continue
+        older, newer = _shifted(actuator_force(actuator, inputs[j]), int(shift))
+        for begins, change in ((0.0, older - acting[j]), (late, newer - older)) if lag else ((late, newer - older),):
+            steps[begins, lag] = steps.get((begins, lag), 0.0) + np.outer(participation[:, j], change)
+    return tuple(Step(late, lag, forces) for (late, lag), forces in steps.items())
 
 
 def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: int, input_hold: str) -> Motion:
@@ -314,8 +332,24 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     scale = 1.0 + rig.stiffness_rate * sample_time * np.arange(inputs.shape[1])
     stiffness = modes.omega[:, None] ** 2 * (scale if rig.stiffness_rate else 1.0)
     # the forces on the modes hold what couples them; only each mode's own damping is left
-    steps = _steps_within(rig, inputs, participation, sample_time) if input_hold == "zero" else ()
-    return Motion(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)), steps)
+    bias = np.array([[actuator.bias] for actuator in rig.actuators])
+    acting = at_samples[: len(rig.actuators)] - bias
+    steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
+    limited = substeps > 1 and any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators)
+    return Motion(
+        *(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)), steps),
+        finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)) if limited else None,
+    )
+
+
+def _move_finely(rig: Rig, inputs: Floats, sample_time: float, substeps: int, input_hold: str) -> Motion:
+    """The same motion with every substep a sample."""
+    if input_hold == "zero":
+        finely = np.repeat(inputs, substeps, axis=1)
+    else:
+        time = np.arange(inputs.shape[1] * substeps) / substeps
+        finely = np.array([np.interp(time, np.arange(inputs.shape[1]), row) for row in inputs])
+    return _move_in_steps(rig, finely, sample_time / substeps, 1, input_hold)
 
 
 def follow(
