@@ -219,7 +219,7 @@ class StepwiseSettings:
     least: float = 0.002
     # share of what the best candidate takes away one sample ahead that another must take away to be tried
     promising: float = 0.2
-    as_good: float = 0.9  # likewise, for a kind to be tried at a second place too
+    as_good: float = 0.9  # likewise, for a kind to be tried at a second place too, or one of fewer numbers in its stead
     ahead: float = 0.005  # share of the cost one sample ahead that the best candidate must take away to be tried at all
     simpler: float = 0.05  # share by which a set may leave more above the noise and still be taken for being simpler
     needless: float = 0.3  # likewise, for a set with one effect less

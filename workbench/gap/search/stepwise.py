@@ -31,6 +31,7 @@ class Stepwise:
         tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
         singles: the likeliest effects alone, without errors, which the first one is chosen among too; with the values
             that predictions one sample ahead give them.
+        ahead: effects alone, fitted to predictions one sample ahead, best first.
         at_first: the search without noise of the logged inputs.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
@@ -43,6 +44,7 @@ class Stepwise:
         self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = (), ahead: Sequence[Fit] = ()
     ) -> None:
         self.singles: list[Fit] = []
+        self.ahead = ahead
         domain = search.rig.modes.domain
         # on whole records, with frequencies that are off, an effect may have gone astray: it starts as it was before
         before = [next((f for f in ahead if in_one_valley(f, single, domain)), single) for single in singles]
@@ -189,7 +191,7 @@ class Stepwise:
 
     @property
     def is_settled(self) -> bool:
-        """Whether nothing is left to look for: effects explain the gap beside no errors that no model has, or errors do."""
+        """Whether nothing is left to look for; errors that no model has may stand for effects."""
         outcome = self.decision().outcome
         plausible = self.plain is not None or self.last.is_plausible
         return (outcome == "explained" and plausible) or (outcome == "none" and self.is_quiet)
@@ -410,6 +412,7 @@ class Stepwise:
         equals = [s for s in tried if len(s.effects) > 1 and not self._tells_apart(best, s)]
         fresh = [
             *simpler_sets(best.effects, self.search.rig),
+            *self._simpler_singles(best),
             *(fewer for s in equals for fewer in each_left_out(s.effects)),
         ]
         sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
@@ -424,6 +427,15 @@ class Stepwise:
             and not self._tells_apart(best, step)
         ]
         return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
+
+    def _simpler_singles(self, best: Step) -> list[tuple[Effect, ...]]:
+        """Effects of fewer numbers that one sample ahead are all but as good as a set of one is."""
+        if len(best.effects) != 1:
+            return []
+        size = len(parameters_of(self.search.rig, best.effects))
+        nominal = self.search.nominal_ahead
+        good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost) if self.ahead else 0.0
+        return [f.effects for f in spread_over_kinds(self.ahead, 1) if f.cost <= good and f.n_parameters < size]
 
     def _size(self, step: Step) -> tuple[int, int]:
         """How many numbers and effects a set has: of as many numbers, one effect is simpler than two."""
