@@ -1,6 +1,7 @@
 """What a verdict says where nothing is named."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,3 +25,23 @@ def test_a_gap_below_the_tolerance_is_said(hinged_rig, record_of, gain):
         r"The gap beyond the noise is ([\d.]+) % of the signal, below the tolerance of 1 %\.", verdict.sentence
     )
     assert float(told[1]) == pytest.approx(100 * 0.006 / 1.006, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("errors", "small"),
+    [
+        ({"stiffness_percent": 4.0, "mass_percent": 4.0, "damping_percent": 60.0, "delays_ms": 3.0}, True),
+        ({"stiffness_percent": 5.5, "mass_percent": 1.0}, False),
+        ({"damping_percent": 97.0}, False),
+        ({}, True),
+    ],
+)
+def test_errors_that_no_careful_model_has_are_not_called_small(hinged_rig, record_of, errors, small):
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    real = kind_named("actuator_gain").apply(rig, rig.actuators[0].name, {"gain": 1.3})
+    record = record_of(real, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
+    sentence = replace(found, budget=replace(found.budget, nominal=0.3, errors=errors)).sentence
+    assert ("small errors of the model" in sentence) is small and (
+        "errors of the model, not small" in sentence
+    ) != small

@@ -16,25 +16,29 @@ from workbench.rig.simulate import predict
 MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LEAST_LOGGED = 1e-3  # likewise: no record distinguishes less from none
 SHARES = tuple(MOST_LOGGED * 0.5**k for k in range(5))  # that are tried; between them the likeliest is interpolated
+DRAWS = 12  # that its power is told from
 QUIETEST = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
-    """Mean square (n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors' noise.
+    """Mean squares (n_draws, n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors'.
 
-    For white noise of each input, as strong as the input itself; inputs at rest have none. The structure smooths it,
-    so one draw of a record's length gives its power to a few per cent.
+    For draws of white noise of each input, as strong as the input itself; inputs at rest have none. A structure of
+    little damping answers one draw three times as loudly as another.
 
     Args:
         rig: nominal.
         data: fit records.
     """
     rng = np.random.default_rng(0)
-    rows = []
-    for record in data.counted:
-        response = predict(replace(rig, elements=()), replace(record, inputs=noise_of_inputs(record, rng)))
-        rows.append((response**2).mean(axis=1) / data.noise**2)
-    return np.array(rows)
+    linear = replace(rig, elements=())
+
+    def power(record: Record) -> Floats:
+        response = predict(linear, replace(record, inputs=noise_of_inputs(record, rng)))
+        mean_square: Floats = (response**2).mean(axis=1) / data.noise**2
+        return mean_square
+
+    return np.array([[power(record) for record in data.counted] for _ in range(DRAWS)])
 
 
 def noise_of_inputs(record: Record, rng: np.random.Generator) -> Floats:
@@ -52,7 +56,7 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     Args:
         by_channel: (n_records, n_outputs) mean squares of what is left, in units of the stated noise.
         sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
-        per_unit: of `logging_noise_power`.
+        per_unit: (n_records, n_outputs) mean of `logging_noise_power`.
     """
     rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
     beyond, per = by_channel - sensor_noise, per_unit

@@ -111,7 +111,12 @@ class Verdict:
                 return f"The gap beyond the noise is {_percent(self.where.beyond_noise)} of the signal{below}."
             if self.record_to_record is not None:
                 return self._differing(self.record_to_record)
-            return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
+            if self.budget.errors_are_small:
+                return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
+            return (
+                f"Errors of the nominal model explain the gap, but larger ones than a careful model has"
+                f"{self._errors_in_words}: something may be missing that no effect of the catalogue is."
+            )
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
         if any(effect.kind.remainder for effect in self.effects):
             verb = "accounts" if len(named) == 1 else "account"
@@ -148,8 +153,9 @@ class Verdict:
         if differs is not None and self.outcome != "none":
             share = _percent(self.budget.effects.get(differs.label, 0.0))
             parts.append(f"{share} are differences of {differs.figure} from record to record ({differs.words})")
-        if self.nominal_errors is not None and self.budget.nominal >= SHOWN:
-            parts.append(f"{_percent(self.budget.nominal)} are small errors of the model{self._errors_in_words}")
+        if self.budget.nominal >= SHOWN:
+            small = "small errors of the model" if self.budget.errors_are_small else "errors of the model, not small"
+            parts.append(f"{_percent(self.budget.nominal)} are {small}{self._errors_in_words}")
         if self.budget.unexplained >= SHOWN:
             parts.append(f"{_percent(self.budget.unexplained)} remain unexplained")
         if self.budget.noise >= SHOWN:

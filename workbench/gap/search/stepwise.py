@@ -153,6 +153,11 @@ class Stepwise:
         if beside is None:
             return None
         fitted = fit_jointly(beside, step.effects, step.errors)
+        if fitted.fit.cost < STEPWISE.too_white:  # errors had bent to that noise, so it was heard too loud
+            beside = beside_inputs(search, fitted.fit, plain.sensor_noise)
+            if beside is None:
+                return None
+            fitted = fit_jointly(beside, step.effects, fitted.errors)
         return None if fitted.fit.cost < STEPWISE.too_white else self._go_on(beside, step, fitted)
 
     def _go_on(self, search: Search, step: Step, fitted: Step) -> Step:
