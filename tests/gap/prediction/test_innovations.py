@@ -1,5 +1,8 @@
 """A rig held beside the records by every sample of them."""
 
+import gc
+import weakref
+
 import numpy as np
 
 from workbench.gap.effects.catalogue import kind_named
@@ -23,3 +26,20 @@ def test_exchanged_sensors_do_not_make_the_correction_run_away(hinged_rig, recor
         data = FitData((record,), noise).following(rig)
         assert cost_of(rig, (), data) > 100.0
         assert cost_of(rig, (there,), data) < 1.5
+
+
+def test_records_and_motions_are_let_go(hinged_rig, record_of):
+    """Without waiting for the collector of cycles, which counts objects and not what they weigh."""
+    rig, rng = hinged_rig(3), np.random.default_rng(1)
+    noise = np.array([sensor.noise_std for sensor in rig.sensors])
+    delayed = Effect(kind_named("actuator_delay"), "all", {"delay": 1e-3}).apply(rig)
+    data = FitData((record_of(rig, rng.normal(size=(1, 300)), rng),), noise).following(rig)
+    data.residual(delayed)
+    data.differences(rig)
+    gone = weakref.ref(data)
+    gc.disable()
+    try:
+        del data
+        assert gone() is None
+    finally:
+        gc.enable()

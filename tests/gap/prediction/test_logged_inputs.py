@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 from scipy.linalg import toeplitz
 
-from workbench.gap.prediction.logged_inputs import MOST_LOGGED, input_filters, likeliest_share
+from workbench.gap.prediction.logged_inputs import (
+    MOST_LOGGED,
+    input_filters,
+    likeliest_share,
+    logging_noise_power,
+)
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
 from workbench.rig.actuators import Actuator
-from workbench.rig.simulate import simulate
+from workbench.rig.simulate import predict, simulate
 
 NOISE = 1e-5
 SHARE = 0.005
@@ -42,6 +47,21 @@ def test_none_is_told_from_some(rig, record_of):
     rng = np.random.default_rng(4)
     quiet = FitData((record_of(rig, rng.normal(size=(2, 1000)), rng, name="quiet"),), np.full(4, NOISE))
     assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * MOST_LOGGED
+
+
+def test_its_power_is_that_of_the_answer_to_a_pulse(rig, logged):
+    """E[y_n²] = Σ_j σ_j² Σ_{k ≤ n} h_j[k]², h_j the answer to one sample of input j; draws scatter about it."""
+    powers = logging_noise_power(rig, logged)
+    for i, record in enumerate(logged.counted):
+        expected = 0.0
+        for j, rms in enumerate(np.sqrt((record.inputs**2).mean(axis=1))):
+            pulse = np.zeros_like(record.inputs)
+            pulse[j, 0] = 1.0
+            answer = predict(rig, replace(record, inputs=pulse))
+            expected = expected + (rms / NOISE) ** 2 * (answer**2).cumsum(axis=1).mean(axis=1)
+        error = powers[:, i].std(axis=0) / np.sqrt(len(powers) - 1)
+        assert (np.abs(powers[:, i].mean(axis=0) - expected) < 4.0 * error).all()
+        assert (error < 0.2 * expected).all()
 
 
 def test_what_it_leaves_is_white_through_the_filter(rig, logged):

@@ -175,9 +175,13 @@ class FitData:
             ]
         return np.concatenate([errors[:, self.lead :].ravel() for errors in ahead])
 
-    @cached_property
+    @property
     def _from_the_first_sample(self) -> "FitData":
-        return replace(self, lead=0) if self.lead else self
+        return self._with_its_lead if self.lead else self
+
+    @cached_property
+    def _with_its_lead(self) -> "FitData":
+        return replace(self, lead=0)
 
     def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
         """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
