@@ -11,6 +11,8 @@ from workbench.gap.prediction.logged_inputs import (
     input_filters,
     likeliest_share,
     logging_noise_power,
+    loudest_logging_noise,
+    noise_of_inputs,
 )
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import log_likelihood, whiten
@@ -49,19 +51,16 @@ def test_none_is_told_from_some(rig, record_of):
     assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * MOST_LOGGED
 
 
-def test_its_power_is_that_of_the_answer_to_a_pulse(rig, logged):
-    """E[y_n²] = Σ_j σ_j² Σ_{k ≤ n} h_j[k]², h_j the answer to one sample of input j; draws scatter about it."""
-    powers = logging_noise_power(rig, logged)
+def test_its_power_is_that_of_draws(rig, logged):
+    """Of 200 draws of a record; the loudest of twelve is louder than their mean."""
+    rng = np.random.default_rng(5)
+    expected, loudest = logging_noise_power(rig, logged), loudest_logging_noise(rig, logged)
     for i, record in enumerate(logged.counted):
-        expected = 0.0
-        for j, rms in enumerate(np.sqrt((record.inputs**2).mean(axis=1))):
-            pulse = np.zeros_like(record.inputs)
-            pulse[j, 0] = 1.0
-            answer = predict(rig, replace(record, inputs=pulse))
-            expected = expected + (rms / NOISE) ** 2 * (answer**2).cumsum(axis=1).mean(axis=1)
-        error = powers[:, i].std(axis=0) / np.sqrt(len(powers) - 1)
-        assert (np.abs(powers[:, i].mean(axis=0) - expected) < 4.0 * error).all()
-        assert (error < 0.2 * expected).all()
+        answers = (predict(rig, replace(record, inputs=noise_of_inputs(record, rng))) for _ in range(200))
+        powers = np.array([((answer / NOISE) ** 2).mean(axis=1) for answer in answers])
+        error = powers.std(axis=0) / np.sqrt(len(powers))
+        assert (np.abs(powers.mean(axis=0) - expected[i]) < 4.0 * error).all() and (error < 0.1 * expected[i]).all()
+        assert loudest[i].mean() > expected[i].mean()
 
 
 def test_what_it_leaves_is_white_through_the_filter(rig, logged):

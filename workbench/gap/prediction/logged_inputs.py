@@ -16,20 +16,33 @@ from workbench.rig.simulate import predict
 MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LEAST_LOGGED = 1e-3  # likewise: no record distinguishes less from none
 SHARES = tuple(MOST_LOGGED * 0.5**k for k in range(5))  # that are tried; between them the likeliest is interpolated
-DRAWS = 12  # that its power is told from
+DRAWS = 12  # of it
 QUIETEST = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
-    """Mean squares (n_draws, n_records, n_outputs) that noise of the logged inputs leaves, in units of the sensors'.
+    """Mean squares (n_records, n_outputs) to expect of noise of the logged inputs, in units of the sensors' noise.
 
-    For draws of white noise of each input, as strong as the input itself; inputs at rest have none. A structure of
-    little damping answers one draw three times as loudly as another.
+    For white noise of each input, as strong as the input itself; inputs at rest have none. That of variance σ² at one
+    input leaves σ² Σ h_k² of sample n, over k ≤ n of the answer h to a pulse of one sample.
 
     Args:
         rig: nominal.
         data: fit records.
     """
+    longest = max(data.counted, key=lambda record: record.n_samples)
+    pulses = np.eye(len(rig.actuators))[:, :, None] * (np.arange(longest.n_samples) == 0)
+    linear = replace(rig, elements=())
+    answers = np.array([predict(linear, replace(longest, inputs=pulse)) for pulse in pulses])
+    so_far = (answers**2).cumsum(axis=2)  # (n_inputs, n_outputs, n_samples)
+    by_input = [so_far[:, :, : record.n_samples].mean(axis=2) for record in data.counted]
+    each = zip(data.counted, by_input, strict=True)
+    expected: Floats = np.array([(record.inputs**2).mean(axis=1) @ power for record, power in each]) / data.noise**2
+    return expected
+
+
+def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:
+    """The same mean squares of the loudest of a dozen draws: a structure of little damping answers each otherwise."""
     rng = np.random.default_rng(0)
     linear = replace(rig, elements=())
 
@@ -38,7 +51,9 @@ def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
         mean_square: Floats = (response**2).mean(axis=1) / data.noise**2
         return mean_square
 
-    return np.array([[power(record) for record in data.counted] for _ in range(DRAWS)])
+    draws = np.array([[power(record) for record in data.counted] for _ in range(DRAWS)])
+    loudest = draws.mean(axis=2).argmax(axis=0)
+    return np.array([draws[draw, i] for i, draw in enumerate(loudest)])
 
 
 def noise_of_inputs(record: Record, rng: np.random.Generator) -> Floats:
@@ -56,7 +71,7 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     Args:
         by_channel: (n_records, n_outputs) mean squares of what is left, in units of the stated noise.
         sensor_noise: (n_outputs,) power of the sensors' noise, likewise.
-        per_unit: (n_records, n_outputs) mean of `logging_noise_power`.
+        per_unit: of `logging_noise_power`.
     """
     rows = np.arange(len(by_channel)) != np.argmin(per_unit.sum(axis=1))
     beyond, per = by_channel - sensor_noise, per_unit

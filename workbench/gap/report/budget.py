@@ -9,7 +9,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import group_of, parted
 from workbench.gap.effects.record_to_record import label_of
-from workbench.gap.prediction.logged_inputs import logging_noise_power
+from workbench.gap.prediction.logged_inputs import loudest_logging_noise
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.report.shrinkage import scale_of
 from workbench.records.record import Record
@@ -169,11 +169,11 @@ def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:
 
 
 def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.ndarray:
-    """Mean square (n_records,) that noise of the logged inputs leaves at most, were it as strong as they are."""
+    """Mean square (n_records,) that noise of the logged inputs leaves by chance, were it as strong as they are."""
     lead = round(settle / records[0].sample_time)
-    powers = logging_noise_power(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))
+    powers = loudest_logging_noise(rig, FitData(tuple(records), np.ones(len(rig.sensors)), lead=lead))
     scales = np.array([scale_of(record.outputs[:, lead:])[:, 0] for record in records])
-    return np.asarray((powers / scales**2).mean(axis=2).max(axis=0))
+    return np.asarray((powers / scales**2).mean(axis=1))
 
 
 def sizes_of(errors: Effect | None) -> dict[str, float]:

@@ -169,7 +169,7 @@ class Search:
     @cached_property
     def logging_noise(self) -> np.ndarray:
         """Power that noise of the logged inputs leaves (n_records, n_outputs); see `logging_noise_power`."""
-        return np.asarray(logging_noise_power(self.rig, self.data).mean(axis=0))
+        return logging_noise_power(self.rig, self.data)
 
     @cached_property
     def ahead(self) -> FitData:
