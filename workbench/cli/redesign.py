@@ -30,6 +30,9 @@ def redesign(
         float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
     ] = None,
     impulse_at: ImpulseAt = None,
+    more_work: Annotated[
+        float, typer.Option(help="Share by which the new controller may work or cost more than the present one.")
+    ] = 0.01,
     draws: Annotated[int, typer.Option(min=1, help="Possible rigs on which both controllers are proved.")] = 200,
     seed: Annotated[int, typer.Option(help="Of the draws and of the noise.")] = 0,
     workers: Workers = None,
@@ -81,6 +84,7 @@ def redesign(
             test=test,
             draws=draws,
             seed=seed,
+            more_work=more_work,
             report=lambda what, share: report(what, 0.7 + 0.3 * share),
         )
     say(result.sentence, bold=True)

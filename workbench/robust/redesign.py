@@ -30,8 +30,9 @@ from workbench.threads import one_blas_thread
 Report = Callable[[str, float], None]
 
 PAYS = 0.005  # of the loss: what a step must take away
-WEIGHTS = (0.7, 0.55, 0.45, 0.35, 0.25)  # of the forces of a law whose actuators saturate, over its own
+WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
+MORE_WORK = 0.01  # of the present one's work and cost: what counts as no more
 
 
 @dataclass(frozen=True)
@@ -41,9 +42,12 @@ class Step:
     Attributes:
         name: such as "delay".
         what: in words, with the numbers that it takes out.
-        vibration, effort: ∫ of the energy of all modes and ∫ FᵀF dt, on the corrected rig under test.
-        loss: how much more of both it takes than the redesigned law with perfect actuators and sensors: the sum of the
-            shares in excess, with this step and those kept before.
+        vibration, effort, work: ∫ of the energy of all modes, ∫ FᵀF dt and W = Σ_r |W_r|, on the corrected rig under
+            test.
+        excess: what it takes more than the redesigned law with perfect actuators and sensors, with this step and those
+            kept before: of the vibration of controlled modes, of that of residual modes (over that of all modes), and
+            of the effort, as shares; none is below zero, so that a gain in one makes up for no loss in another.
+        loss: their sum.
         cost: J / J₀ - 1, J = 2 ∫ energy dt + ρ ∫ FᵀF dt, J₀ that of the same perfect loop; ρ makes its two terms
             equal over the controlled modes, as they are in an optimal regulator. Below zero the loop does better.
         kept: whether it paid.
@@ -53,6 +57,8 @@ class Step:
     what: str
     vibration: float
     effort: float
+    work: float
+    excess: tuple[float, float, float]
     loss: float
     cost: float
     kept: bool
@@ -73,6 +79,7 @@ class Redesign:
         present_proof, proof: both on the same draws.
         weight: ρ of the cost J = 2 ∫ energy dt + ρ ∫ FᵀF dt, whose terms are equal over the controlled modes where
             actuators and sensors are perfect.
+        more_work: share by which the redesigned controller may do more work, and cost more, than the present one.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
         notes: what else a reader should know.
     """
@@ -89,6 +96,7 @@ class Redesign:
     present_proof: Proof
     proof: Proof
     weight: float
+    more_work: float = MORE_WORK
     relocation: Relocation | None = None
     notes: tuple[str, ...] = ()
 
@@ -96,19 +104,30 @@ class Redesign:
     def pays(self) -> bool:
         """Whether the redesigned controller does better than the present one, draw by draw.
 
-        It is stable on more of the draws; or on as many, and on those that both keep stable it costs less, by a larger
-        factor than it does more work: by the means of log J and log W, W = Σ_r |W_r|.
+        It is stable on more of the draws; or on as many, and on those that both keep stable it costs and works no more
+        than is allowed, by the means of log J and log W, W = Σ_r |W_r|, and costs less or settles sooner.
         """
         old, new = self.present_proof, self.proof
         if new.stable.sum() != old.stable.sum():
             return bool(new.stable.sum() > old.stable.sum())
+        return self._better and max(self._over) <= 1.0 + self.more_work
+
+    @property
+    def _better(self) -> bool:
+        """Whether it costs less than the present controller, or settles sooner."""
+        return self._over[0] < 1.0 or interval(self.proof.settling)[0] < interval(self.present_proof.settling)[0]
+
+    @cached_property
+    def _over(self) -> tuple[float, float]:
+        """J and W over those of the present controller: means of the draws that both keep stable; inf for none."""
+        old, new = self.present_proof, self.proof
         both = old.stable & new.stable
         if not both.any():
-            return False
-        cost_old, cost_new = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (old, new))
-        work_old, work_new = (np.abs(p.work[both]).sum(axis=1) for p in (old, new))
-        gain, dearer = float(np.log(cost_old / cost_new).mean()), float(np.log(work_new / work_old).mean())
-        return gain > max(dearer, 0.0)
+            return np.inf, np.inf
+        costs = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (new, old))
+        works = (np.abs(p.work[both]).sum(axis=1) for p in (new, old))
+        cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
+        return cost, work
 
     @property
     def controller(self) -> DigitalController:
@@ -145,10 +164,15 @@ class Redesign:
     @property
     def _kept(self) -> str:
         """Why the present controller stays."""
-        fewer = self.proof.stable.sum() < self.present_proof.stable.sum()
-        return (
-            f"Keep the present controller: {'it is stable on more draws' if fewer else 'the new one does no better'}."
-        )
+        old, new = self.present_proof, self.proof
+        if new.stable.sum() < old.stable.sum():
+            why = "it is stable on more draws"
+        elif self._better and np.isfinite(dearer := max(self._over) - 1.0):
+            why = f"the new one {_settles(new)} where it {_settles(old)}, but works or costs {_percent(dearer)} more;"
+            why += f" more_work = {np.ceil(100.0 * dearer) / 100.0:g} allows it"
+        else:
+            why = "the new one does no better"
+        return f"Keep the present controller: {why}."
 
     def _does(self, proof: Proof, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
@@ -238,6 +262,7 @@ def redesign(
     draws: int = 200,
     seed: int = 0,
     placement: bool = True,
+    more_work: float = MORE_WORK,
     report: Report = lambda text, share: None,
 ) -> Redesign:
     """A controller of the same kind, designed anew for the corrected rig, and both proved on the same possible rigs.
@@ -256,13 +281,17 @@ def redesign(
         draws: possible rigs on which both are proved.
         seed: of the draws and of the sensors' noise.
         placement: whether to look where the actuators should stand instead.
+        more_work: share by which the redesigned controller may do more work W = Σ_r |W_r|, and cost more, than the
+            present one; inf for as much as winning back takes.
         report: called with (what, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
-        ValueError: an impulse outside the structure, or no draws.
+        ValueError: an impulse outside the structure, no draws, or less work than none more.
     """
+    if not more_work >= 0:
+        raise ValueError(f"more_work is the share of work that may be added, 0 or more; got {more_work:g}")
     possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
     nominal, corrected = possible.nominal, possible.rig
     if test is not None:
@@ -298,8 +327,8 @@ def redesign(
     moved = relocated(anew, test) if placement else None
     report("done", 1.0)
     return Redesign(
-        possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight, moved,
-        _notes(possible, corrected),
+        possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
+        more_work, moved, _notes(possible, corrected),
     )  # fmt: skip
 
 
@@ -348,9 +377,10 @@ def _compensated(
     def tried(name: str, what: str, controller: DigitalController) -> Step:
         run = run_loop(rig, controller, test)
         vibration, effort = _vibration(run), run.effort if run.bounded else np.inf
-        excess = vibration / max(_vibration(ideal), 1e-300) - 1.0, effort / max(ideal.effort, 1e-300) - 1.0
         cost = (2.0 * vibration + weight * effort) / optimum - 1.0
-        return Step(name, what, vibration, effort, float(max(excess[0], 0.0) + max(excess[1], 0.0)), float(cost), True)
+        excess = _excess(run, ideal, loop.law.controlled)
+        work = float(np.abs(run.work).sum()) if run.bounded else np.inf
+        return Step(name, what, vibration, effort, work, excess, sum(excess), float(cost), True)
 
     kept: list[str] = []
     best = compensated(rig, loop, test.sample_time, ())
@@ -358,18 +388,18 @@ def _compensated(
         tried("present", f"{present.name}, as it is", present),
         tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig", best),
     ]
-    least, cost, chosen = steps[-1].loss, steps[-1].cost, loop
+    now, chosen = steps[-1], loop
     for name in STEPS:
         what = _losses(rig, loop, name)
         if not what:
             continue
         trial = compensated(rig, loop, test.sample_time, (*kept, name))
         step = tried(name, what, trial)
-        pays = step.loss < least - PAYS or not np.isfinite(least)
+        pays = step.loss < now.loss - PAYS or not np.isfinite(now.loss)
         steps.append(replace(step, kept=pays))
         if pays:
             kept.append(name)
-            best, least, cost = trial, step.loss, step.cost
+            best, now = trial, step
     # a limit holds the effort down: more gain wins vibration back for it
     bounded = any(np.isfinite(named(rig.actuators, a.name).limit) for a in loop.law.actuators)
     tunings = [("gain", "weight", WEIGHTS), ("estimator", "noise", SPEEDS)]
@@ -383,10 +413,14 @@ def _compensated(
                 break
             trial = compensated(rig, other, test.sample_time, kept)
             step = tried(name, f"{setting} taken as {factor:g} times what was designed for", trial)
-            pays = step.loss < least - PAYS if name == "gain" else step.cost < cost - PAYS and step.loss <= least
+            if name == "gain":
+                pays = step.loss < now.loss - PAYS
+            else:  # no trade: no part may be worse than under the present controller and before
+                bearable = np.maximum(now.excess, steps[0].excess)
+                pays = step.cost < now.cost - PAYS and step.loss <= now.loss and bool((step.excess <= bearable).all())
             if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
                 steps = [*(s for s in steps if s.name != name), step]
-                best, least, cost, chosen = trial, step.loss, step.cost, other
+                best, now, chosen = trial, step, other
         loop = chosen
     removed: list[str] = []
     for name in _faulty(rig, loop):
@@ -396,11 +430,11 @@ def _compensated(
         except DesignError:
             continue  # the others cannot do without it
         step = tried(f"without {name}", f"{name} is not read", trial)
-        pays = step.loss < least - PAYS
+        pays = step.loss < now.loss - PAYS
         steps.append(replace(step, kept=pays))
         if pays:
             removed.append(name)
-            best, least = trial, step.loss
+            best, now = trial, step
     return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight
 
 
@@ -426,6 +460,16 @@ def force_weight(run: LoopRun, controlled: Sequence[int]) -> float:
         controlled: zero-based modes.
     """
     return 2.0 * _vibration(run, controlled) / max(run.effort, 1e-300)
+
+
+def _excess(run: LoopRun, ideal: LoopRun, controlled: Sequence[int]) -> tuple[float, float, float]:
+    """What a loop takes more than an ideal one, see `Step`."""
+    if not run.bounded:
+        return np.inf, np.inf, np.inf
+    (found, part), (wanted, ideal_part) = ((_vibration(r), _vibration(r, controlled)) for r in (run, ideal))
+    controls = part / max(ideal_part, 1e-300) - 1.0
+    spills = ((found - part) - (wanted - ideal_part)) / max(wanted, 1e-300)
+    return max(controls, 0.0), max(spills, 0.0), max(run.effort / max(ideal.effort, 1e-300) - 1.0, 0.0)
 
 
 def _vibration(run: LoopRun, modes: Sequence[int] | None = None) -> float:
