@@ -57,7 +57,7 @@ def plant(index, seed):
 
     def designed(*effects):
         possible = UncertainRig(rig, effects, np.zeros((len(effects),) * 2))
-        return redesign(possible, law, test=test, draws=1, placement=False, more_work=np.inf)
+        return redesign(possible, law, test=test, draws=1, placement=False, more_cost=np.inf)
 
     nominal = designed()
     free = controlled(real, nominal.present)
@@ -177,7 +177,7 @@ def report(outcome, rows):
             "won back, median": float(np.median(won)),
             "half or more won back on": int((won >= HALF).sum()),
             "effort over that without": float(np.median(effort)),
-            "redesign pays, however much work": sum(row[name]["pays"] for row in there),
+            "redesign pays, whatever it costs": sum(row[name]["pays"] for row in there),
         }
     soonest = [row["saturation"]["soonest"] / row["without"]["settling"] for row in lost["saturation"]]
     table["saturation"] |= {"soonest of any forces": float(np.median(soonest)), "latest": float(np.max(soonest))}

@@ -79,9 +79,8 @@ def told(stable, vibration, work):
     ("stable", "vibration", "work", "pays"),
     [
         ([True, True], [0.8, 0.9], [1.0, 1.0], True),
-        ([True, True], [0.8, 0.9], [1.01, 1.005], True),
-        ([True, True], [0.8, 0.9], [1.02, 1.01], False),  # J by a tenth less, for work that nobody asked for
-        ([True, True], [0.98, 0.97], [1.4, 1.4], False),
+        ([True, True], [0.8, 0.9], [1.02, 1.01], True),  # J by a tenth less for 1.5 % more work
+        ([True, True], [0.98, 0.97], [1.4, 1.4], False),  # work beyond the bound
         ([True, True], [1.1, 1.1], [0.7, 0.7], False),  # less work, but it costs more
         ([True, True], [1.0, 1.0], [1.0, 1.0], False),
         ([True, False], [0.1, np.inf], [0.5, np.inf], False),  # it may be unstable
@@ -93,6 +92,8 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
     present = told([True, True], [1.0, 1.0], [-1.0, -1.0])  # damping takes energy out
     found = replace(sure, present_proof=present, proof=told(stable, vibration, np.negative(work)), weight=0.5)
+    assert replace(found, more_work=np.inf).pays or max(vibration) > 0.99
+    found = replace(found, more_work=0.05)
     assert found.pays is pays
     assert found.controller is (found.redesigned if pays else found.present)
     assert ("Keep the present controller" in found.sentence) is not pays

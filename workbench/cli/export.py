@@ -5,10 +5,9 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.rig_file import RigPath, Weight
+from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_told, observed
+from workbench.cli.rig_file import RigPath
 from workbench.cli.terminal import guarded, say, short
-
-LAWS, ESTIMATORS = ("imsc", "coupled"), ("luenberger", "kalman")
 
 
 @guarded
@@ -16,18 +15,14 @@ def export(
     rig: RigPath,
     rate_hz: Annotated[float, typer.Option(help="Sampling rate at which the controller is to run.")],
     to: Annotated[Path, typer.Option(metavar="FILE", help="File to write: NAME.c (with NAME.h), NAME.py or NAME.mat.")],
-    control: Annotated[
-        int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
-    ] = None,
-    weight: Weight = 1.0,
-    law: Annotated[str, typer.Option(metavar="|".join(LAWS), help="Control law.")] = LAWS[0],
+    law: LawName = "imsc",
+    control: Control = None,
+    weight: LawWeight = None,
+    damping: Damping = None,
     estimator: Annotated[
         str, typer.Option(metavar="|".join(ESTIMATORS), help="Observer that the law acts on.")
     ] = ESTIMATORS[0],
-    disturbance: Annotated[
-        float,
-        typer.Option(help="For the Kalman filter: intensity of white modal forces; noise is as the outputs state it."),
-    ] = 1.0,
+    disturbance: Disturbance = 1.0,
     computing_delay_ms: Annotated[
         float, typer.Option(help="From a reading to the first effect of its command, beside the actuators' delays.")
     ] = 0.0,
@@ -36,36 +31,22 @@ def export(
 
     The loop of all modes is checked with sampling and delay in it; a rate that is too slow is refused.
 
-    Example: workbench export case.toml --control 2 --rate-hz 500 --computing-delay-ms 0.5 --to controller.c
+    Example: workbench export case.toml --control 2 --damping 0.05 --rate-hz 500 --to controller.c
     """
     from workbench.cases.case import read_rig
-    from workbench.design.estimation.observers import kalman, luenberger
     from workbench.design.export.export import export as hand_over
-    from workbench.design.laws.coupled import coupled_lqr
-    from workbench.design.laws.imsc import imsc
-    from workbench.design.spillover.comparison import OBSERVER_POLES
     from workbench.rig.sensors import MEASURED
     from workbench.study.whole_file import check_target
 
-    for option, value, known in (("--law", law, LAWS), ("--estimator", estimator, ESTIMATORS)):
-        if value not in known:
-            raise ValueError(f"{option} is one of {', '.join(known)}; got {value!r}")
     check_target(to)
+    if not 0 < rate_hz < float("inf"):
+        raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
     found = read_rig(rig / "case.toml" if rig.is_dir() else rig)
-    modes, actuators = found.modes, [a for a in found.actuators if not a.direct]
-    count = len(actuators) if control is None else control
-    sensors = [s for s in found.sensors if MEASURED[s.quantity][1] < 2]
-    unread = [s.name for s in found.sensors if s not in sensors]
-    if not sensors:
-        raise ValueError(f"{rig}: every output is an acceleration; an observer needs motion or rates, so add a sensor")
-    made = (imsc if law == "imsc" else coupled_lqr)(modes, count, actuators, weight=weight)
-    if estimator == "luenberger":
-        observer = luenberger(modes, made, sensors, poles=OBSERVER_POLES * modes.omega[:count])
-    else:
-        # a noise of variance σ² held over each sample has the intensity σ² T
-        noise = [s.noise_std**2 / rate_hz if rate_hz > 0 else 0.0 for s in sensors]
-        observer = kalman(modes, made, sensors, disturbance=disturbance, noise=noise)
-    design = hand_over(modes, observer, to, sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms)
+    count = max(len([a for a in found.actuators if not a.direct]), 1) if control is None else control
+    chosen = law_told(found, law, count, weight, damping)
+    unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
+    observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
+    design = hand_over(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms)
     head, *rest = str(design).splitlines()
     say(head, bold=True)
     for line in rest:

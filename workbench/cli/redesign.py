@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_told, observed
 from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig
 from workbench.cli.rig_file import ImpulseAt, impulse_place
 from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
@@ -21,18 +22,25 @@ if TYPE_CHECKING:
 def redesign(
     case: CasePath,
     verdict: VerdictPath = None,
-    law: Annotated[str, typer.Option(help="Law in use: imsc, coupled, poles or on-off.")] = "imsc",
-    control: Annotated[
-        int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
+    law: LawName = "imsc",
+    control: Control = None,
+    weight: LawWeight = None,
+    damping: Damping = None,
+    estimator: Annotated[
+        str | None,
+        typer.Option(metavar="|".join(ESTIMATORS), help="Observer in use; a Kalman filter tuned to it unless given."),
     ] = None,
-    damping: Annotated[float, typer.Option(help="Damping ratio that the controlled modes should have.")] = 0.1,
+    disturbance: Disturbance = 1.0,
     rate_hz: Annotated[
         float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
     ] = None,
     impulse_at: ImpulseAt = None,
-    more_work: Annotated[
-        float, typer.Option(help="Share by which the new controller may work or cost more than the present one.")
+    more_cost: Annotated[
+        float, typer.Option(help="Share by which a new controller that settles sooner may cost more than the present.")
     ] = 0.01,
+    more_work: Annotated[
+        float, typer.Option(help="Share by which it may do more work; as much as it takes unless given.")
+    ] = float("inf"),
     draws: Annotated[int, typer.Option(min=1, help="Possible rigs on which both controllers are proved.")] = 200,
     seed: Annotated[int, typer.Option(help="Of the draws and of the noise.")] = 0,
     workers: Workers = None,
@@ -45,15 +53,14 @@ def redesign(
 ) -> None:
     """Design the controller anew for what a diagnosis found, and prove both on what remains unknown.
 
-    The law in use is designed for the nominal model and reads a Kalman filter on the case's sensors.
+    The controller in use is that of `workbench export` with the same options, designed for the nominal model.
 
     Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05 --to controller.c
     """
     from workbench.cases.case import read_case
     from workbench.design.export.export import check_name
     from workbench.design.laws.law import controlled_indices
-    from workbench.robust.on_rig import impulse_test
-    from workbench.robust.plain_law import plain_law
+    from workbench.robust.on_rig import Design, impulse_test
     from workbench.robust.redesign import redesign as run
     from workbench.study.redesign_page import redesign_page
     from workbench.study.whole_file import check_target
@@ -72,7 +79,10 @@ def redesign(
     struck = None if impulse_at is None else impulse_place(rig, impulse_at)
     sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
     test = impulse_test(rig, controlled, sample_time, struck, level=_largest(records), seed=seed)
-    chosen = plain_law(law, rig, count, damping=damping, impulse_at=test.impulse_at, impulse=test.impulse)
+    own = law_told(rig, law, count, weight, damping, impulse_at=test.impulse_at, impulse=test.impulse)
+    in_use: Design = own
+    if estimator is not None:
+        in_use = observed(rig, own, estimator, disturbance=disturbance, sample_time=sample_time)
     with progress_bar() as progress:
         report = reporter(progress, "reading")
         possible, _ = possible_rig(
@@ -80,10 +90,11 @@ def redesign(
         )
         result = run(
             possible,
-            chosen,
+            in_use,
             test=test,
             draws=draws,
             seed=seed,
+            more_cost=more_cost,
             more_work=more_work,
             report=lambda what, share: report(what, 0.7 + 0.3 * share),
         )

@@ -32,7 +32,7 @@ Report = Callable[[str, float], None]
 PAYS = 0.005  # of the loss: what a step must take away
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
-MORE_WORK = 0.01  # of the present one's work and cost: what counts as no more
+MORE_COST = 0.01  # of the present one's: what counts as no more
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ class Redesign:
         present_proof, proof: both on the same draws.
         weight: ρ of the cost J = 2 ∫ energy dt + ρ ∫ FᵀF dt, whose terms are equal over the controlled modes where
             actuators and sensors are perfect.
-        more_work: share by which the redesigned controller may do more work, and cost more, than the present one.
+        more_cost, more_work: shares by which the redesigned controller may cost more, J, and do more work, W, than the
+            present one.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
         notes: what else a reader should know.
     """
@@ -96,7 +97,8 @@ class Redesign:
     present_proof: Proof
     proof: Proof
     weight: float
-    more_work: float = MORE_WORK
+    more_cost: float = MORE_COST
+    more_work: float = np.inf
     relocation: Relocation | None = None
     notes: tuple[str, ...] = ()
 
@@ -104,18 +106,28 @@ class Redesign:
     def pays(self) -> bool:
         """Whether the redesigned controller does better than the present one, draw by draw.
 
-        It is stable on more of the draws; or on as many, and on those that both keep stable it costs and works no more
-        than is allowed, by the means of log J and log W, W = Σ_r |W_r|, and costs less or settles sooner.
+        It is stable on more of the draws; or on as many, and on those that both keep stable it costs less or settles
+        sooner, and neither costs nor works more than is allowed: by the means of log J and log W, W = Σ_r |W_r|.
         """
         old, new = self.present_proof, self.proof
         if new.stable.sum() != old.stable.sum():
             return bool(new.stable.sum() > old.stable.sum())
-        return self._better and max(self._over) <= 1.0 + self.more_work
+        return self._better and not self._more
 
     @property
     def _better(self) -> bool:
         """Whether it costs less than the present controller, or settles sooner."""
         return self._over[0] < 1.0 or interval(self.proof.settling)[0] < interval(self.present_proof.settling)[0]
+
+    @property
+    def _more(self) -> str:
+        """What it takes more than is allowed, in words; empty for nothing."""
+        over = zip(("costs", "works"), self._over, ("cost", "work"), (self.more_cost, self.more_work))
+        return ", and ".join(
+            f"{does} {_percent(share - 1.0)} more: more_{name} = {np.ceil(100.0 * (share - 1.0)) / 100.0:g} allows it"
+            for does, share, name, allowed in over
+            if share > 1.0 + allowed
+        )
 
     @cached_property
     def _over(self) -> tuple[float, float]:
@@ -167,9 +179,8 @@ class Redesign:
         old, new = self.present_proof, self.proof
         if new.stable.sum() < old.stable.sum():
             why = "it is stable on more draws"
-        elif self._better and np.isfinite(dearer := max(self._over) - 1.0):
-            why = f"the new one {_settles(new)} where it {_settles(old)}, but works or costs {_percent(dearer)} more;"
-            why += f" more_work = {np.ceil(100.0 * dearer) / 100.0:g} allows it"
+        elif self._better and np.isfinite(self._over).all():
+            why = f"the new one {_settles(new)} where it {_settles(old)}, but {self._more}"
         else:
             why = "the new one does no better"
         return f"Keep the present controller: {why}."
@@ -262,7 +273,8 @@ def redesign(
     draws: int = 200,
     seed: int = 0,
     placement: bool = True,
-    more_work: float = MORE_WORK,
+    more_cost: float = MORE_COST,
+    more_work: float = np.inf,
     report: Report = lambda text, share: None,
 ) -> Redesign:
     """A controller of the same kind, designed anew for the corrected rig, and both proved on the same possible rigs.
@@ -281,17 +293,19 @@ def redesign(
         draws: possible rigs on which both are proved.
         seed: of the draws and of the sensors' noise.
         placement: whether to look where the actuators should stand instead.
-        more_work: share by which the redesigned controller may do more work W = Σ_r |W_r|, and cost more, than the
-            present one; inf for as much as winning back takes.
+        more_cost: share by which the redesigned controller may cost more than the present one, J = 2 ∫ energy dt +
+            ρ ∫ FᵀF dt, where it settles sooner.
+        more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
         report: called with (what, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
-        ValueError: an impulse outside the structure, no draws, or less work than none more.
+        ValueError: an impulse outside the structure, no draws, or a share below zero.
     """
-    if not more_work >= 0:
-        raise ValueError(f"more_work is the share of work that may be added, 0 or more; got {more_work:g}")
+    for name, share in (("more_cost", more_cost), ("more_work", more_work)):
+        if not share >= 0:
+            raise ValueError(f"{name} is a share of that of the present controller, 0 or more; got {share:g}")
     possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
     nominal, corrected = possible.nominal, possible.rig
     if test is not None:
@@ -328,7 +342,7 @@ def redesign(
     report("done", 1.0)
     return Redesign(
         possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
-        more_work, moved, _notes(possible, corrected),
+        more_cost, more_work, moved, _notes(possible, corrected),
     )  # fmt: skip
 
 

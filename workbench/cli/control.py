@@ -1,0 +1,88 @@
+"""The controller that `export` and `redesign` are told of: law, modes and estimator, by one set of options."""
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from workbench.design.estimation.controller import Controller
+    from workbench.design.laws.law import Law
+    from workbench.design.laws.on_off import OnOffLaw
+    from workbench.rig.rig import Rig
+    from workbench.structure.domain import Where
+
+ESTIMATORS = ("luenberger", "kalman")
+DAMPING = 0.1  # unless told
+
+LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
+Control = Annotated[
+    int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
+]
+LawWeight = Annotated[
+    float | None, typer.Option("--weight", help="Control weight R: force against motion; in place of --damping.")
+]
+Damping = Annotated[
+    float | None, typer.Option(help=f"Damping ratio that controlled modes should have; {DAMPING:g} unless told.")
+]
+Disturbance = Annotated[
+    float,
+    typer.Option(help="For the Kalman filter: intensity of white modal forces; noise is as the outputs state it."),
+]
+
+
+def law_told(
+    rig: "Rig",
+    law: str,
+    count: int,
+    weight: float | None,
+    damping: float | None,
+    *,
+    impulse_at: "Where | None" = None,
+    impulse: float = 1.0,
+) -> "Law | OnOffLaw":
+    """The law by its name, and by a weight or a damping ratio.
+
+    Raises:
+        ValueError: both, or a law that has no weight.
+    """
+    from workbench.design.laws.coupled import coupled_lqr
+    from workbench.design.laws.imsc import imsc
+    from workbench.robust.plain_law import plain_law
+
+    if weight is None:
+        ratio = DAMPING if damping is None else damping
+        return plain_law(law, rig, count, damping=ratio, impulse_at=impulse_at, impulse=impulse)
+    if damping is not None:
+        raise ValueError("--weight and --damping both set the gain; give one of them")
+    if law not in (weighted := {"imsc": imsc, "coupled": coupled_lqr}):
+        raise ValueError(f"--weight is of the laws {', '.join(weighted)}; give --damping for {law}")
+    return weighted[law](rig.modes, count, [a for a in rig.actuators if not a.direct], weight=weight)
+
+
+def observed(
+    rig: "Rig", law: "Law | OnOffLaw", estimator: str, *, disturbance: float, sample_time: float
+) -> "Controller":
+    """The law on an observer of all outputs that read motion or rate.
+
+    Raises:
+        ValueError: an estimator that is none, a law that switches, or no such output.
+    """
+    from workbench.design.estimation.observers import kalman, luenberger
+    from workbench.design.laws.law import Law
+    from workbench.design.spillover.comparison import OBSERVER_POLES
+    from workbench.rig.sensors import MEASURED
+
+    if estimator not in ESTIMATORS:
+        raise ValueError(f"--estimator is one of {', '.join(ESTIMATORS)}; got {estimator!r}")
+    if not isinstance(law, Law):
+        raise ValueError(
+            f"{law.name} switches and is designed without --estimator; `workbench redesign --to` writes it"
+        )
+    sensors = [s for s in rig.sensors if MEASURED[s.quantity][1] < 2]
+    if not sensors:
+        raise ValueError("every output is an acceleration; an observer needs motion or rates, so add a sensor")
+    if estimator == "luenberger":
+        return luenberger(rig.modes, law, sensors, poles=OBSERVER_POLES * rig.modes.omega[list(law.controlled)])
+    # a noise of variance σ² held over each sample has the intensity σ² T
+    noise = [s.noise_std**2 * sample_time for s in sensors]
+    return kalman(rig.modes, law, sensors, disturbance=disturbance, noise=noise)
