@@ -28,7 +28,7 @@ def response_motion(
     sensors: Sequence[Sensor] = (),
     colours: Mapping[str, str] | None = None,
 ) -> dict[str, Any]:
-    """Responses of one structure, moving on one picture.
+    """Responses of one structure, moving on one picture: over each other along a beam, side by side as nets.
 
     Args:
         responses: by the name under which each is shown; all over the same times and of the same modes' number.
@@ -36,30 +36,36 @@ def response_motion(
         colours: of responses by name; None for the first of several in grey.
 
     Raises:
-        ValueError: responses over different times.
+        ValueError: responses over different times, or at named points without positions.
     """
     first = next(iter(responses.values()))
     if any(r.time.shape != first.time.shape or (r.time != first.time).any() for r in responses.values()):
         raise ValueError("responses that move together must be over the same times; simulate them on one time axis")
     step = -(-first.time.size // MOST_FRAMES)
-    x = np.linspace(0.0, first.modes.length, N_PLACES)
-    tracks = [
+    tracks: list[dict[str, Any]] = [
         {
             "label": name,
-            "shapes": _numbers(response.modes.phi(x)),
             "modal": _numbers(response.modal[: response.modes.n_modes, ::step]),
             "colour": (colours or {}).get(name),
         }
         for name, response in responses.items()
     ]
-    return {
-        "kind": "response",
-        "x": _numbers(x),
-        "time": _numbers(first.time[::step]),
-        "seconds": SHOWN_SECONDS,
-        "tracks": tracks,
-        **_places(actuators, sensors),
-    }
+    shown = {"kind": "response", "time": _numbers(first.time[::step]), "seconds": SHOWN_SECONDS, "tracks": tracks}
+    if not isinstance(first.modes.domain, Interval):
+        spots = _net(first.modes.domain)
+        moves = [spots.moves(response.modes) for response in responses.values()]
+        largest = max(
+            float(np.abs(moved @ response.modal[: response.modes.n_modes, ::step]).max())
+            for moved, response in zip(moves, responses.values(), strict=True)
+        )
+        for track, moved in zip(tracks, moves, strict=True):
+            scaled = moved * SWAY * np.ptp(spots.rest, axis=0).max() / max(largest, 1e-300)
+            track["moves"] = _numbers(np.moveaxis(scaled, 2, 0))
+        return shown | _on_net(spots, actuators, sensors)
+    x = np.linspace(0.0, first.modes.length, N_PLACES)
+    for track, response in zip(tracks, responses.values(), strict=True):
+        track["shapes"] = _numbers(response.modes.phi(x))
+    return shown | {"x": _numbers(x), **_places(actuators, sensors)}
 
 
 def mode_motion(
@@ -113,7 +119,7 @@ def mode_motion(
 
 def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
     first = next(iter(modes.values()))
-    spots = _plate_net(first.domain) if isinstance(first.domain, Rectangle) else frame_net(first.domain)
+    spots = _net(first.domain)
     size = np.ptp(spots.rest, axis=0).max()
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
@@ -131,14 +137,18 @@ def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], senso
                 "damping": _numbers(found.zeta),
             }
         )
-    net = {"rest": _numbers(spots.rest), "lines": spots.lines}
+    return {"kind": "modes", "tracks": tracks, **_on_net(spots, actuators, sensors)}
+
+
+def _on_net(spots: "Net", actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
+    """A net at rest, and the places marked on it."""
     marked = {
         key: [
             {"name": part.name, "at": _numbers(spots.at(part.at))} for part in parts if not isinstance(part.at, Between)
         ]
         for key, parts in (("actuators", actuators), ("sensors", sensors))
     }
-    return {"kind": "modes", "net": net, "tracks": tracks, **marked}
+    return {"net": {"rest": _numbers(spots.rest), "lines": spots.lines}, **marked}
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +176,10 @@ def _seen(at: np.ndarray) -> np.ndarray:
 def _front(at: np.ndarray) -> np.ndarray:
     """(..., 3) as (..., 2): x to the right, y up."""
     return at[..., :2]
+
+
+def _net(domain: Domain) -> Net:
+    return _plate_net(domain) if isinstance(domain, Rectangle) else frame_net(domain)
 
 
 def _plate_net(domain: Rectangle) -> Net:

@@ -24,7 +24,7 @@ def plot_redesign(result: Redesign) -> Figure:
         middle, low, high = np.clip(proof.energy, 1e-9 * top, 1e3 * top)
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
         left.semilogy(time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {proof.share_stable:.0%}")
-    left.set(xlabel="time [s]", ylabel="energy of all modes", ylim=(1e-6 * top, 3.0 * top))
+    left.set(xlabel="time [s]", ylabel="energy of all modes [J]", ylim=(1e-6 * top, 3.0 * top))
     left.set_title(f"after the test, {result.proof.n_draws} possible rigs (median, 95 %)")
     left.legend(fontsize=8)
     rows = np.arange(len(result.controlled))

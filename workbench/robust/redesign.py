@@ -170,6 +170,7 @@ class Redesign:
             text += f", unstable on {unstable} draws" if unstable else ""
             text += f"; redesigned: {self._does(new, '', named=False)}, {_times(effort)} effort"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
+        text += f" {self.left_undamped}" if self.left_undamped else ""
         text += "" if self.pays else f" {self._kept}"
         return text if self.possible.explained else f"{text} {self._promise}"
 
@@ -180,7 +181,7 @@ class Redesign:
         if new.stable.sum() < old.stable.sum():
             why = "it is stable on more draws"
         elif self._better and np.isfinite(self._over).all():
-            why = f"the new one {_settles(new)} where it {_settles(old)}, but {self._more}"
+            why = f"the new one {self._difference('it')}, but {self._more}"
         else:
             why = "the new one does no better"
         return f"Keep the present controller: {why}."
@@ -189,6 +190,8 @@ class Redesign:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
         if self.redesigned.relays is not None:
             middle, low, high = interval(proof.settling)
+            if not np.isfinite(high):
+                return _settles(proof)
             return f"{'settles in ' * named}{middle:.3g} s ({lead}{low:.3g} to {high:.3g})"
         ratios = _ratios(proof.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
@@ -198,12 +201,32 @@ class Redesign:
         """Which controller to use, and what it does after the test."""
         if not self.pays:
             return self._kept
-        old, new = self.present_proof, self.proof
-        forces = [interval(proof.peak_force)[0] for proof in (new, old)]
+        forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
         return (
-            f"Use the redesigned controller: it {_settles(new)} where the present one {_settles(old)}{forced}"
-            " (medians of the draws)."
+            f"Use the redesigned controller: it {self._difference('the present one')}{forced} (medians of the draws)."
+        )
+
+    def _difference(self, other: str) -> str:
+        """What the redesigned controller does better than the present one, in words."""
+        old, new = self.present_proof, self.proof
+        if new.stable.sum() != old.stable.sum():
+            return f"is stable on {_of(int(new.stable.sum()), new.n_draws)} draws, {other} on {int(old.stable.sum()):,}"
+        if _settles(new) != _settles(old):
+            return f"{_settles(new)} where {other} {_settles(old)}"
+        return f"takes {_percent(1.0 - self._over[0])} less vibration and effort than {other}"
+
+    @property
+    def left_undamped(self) -> str:
+        """Which residual mode the controller to use leaves with less than half of its own damping; empty for none."""
+        ratios = np.median(self._used.damping, axis=0)
+        own = self.loop.modes.zeta[: ratios.size]
+        r = int(np.argmin(ratios))
+        if r in self.controlled or ratios[r] >= 0.5 * own[r] or self._used.share_stable < 0.5:
+            return ""
+        return (
+            f"Mode {r + 1}, which is not controlled, keeps {100.0 * ratios[r]:.2g} % damping of {100.0 * own[r]:.2g} %:"
+            " ask for less damping, or control it too."
         )
 
     @property

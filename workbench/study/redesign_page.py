@@ -15,12 +15,13 @@ from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.robust.proof import Proof, interval
 from workbench.robust.redesign import Redesign
-from workbench.structure.domain import Interval, Where
+from workbench.structure.domain import NamedPoints, Where
 from workbench.study.outcome import Shown
 from workbench.study.page import PageContent, Table, block, write_page
 from workbench.study.verdict_page import case_inputs
 
 MOST = 3000  # samples of a record that are replayed
+RUNS_AWAY = 4.0  # times the redesigned loop's largest modal displacement, at which the present one's is cut off
 NOTHING = 1e-4  # of the vibration and effort: a loss that no step need make up for
 
 
@@ -39,8 +40,7 @@ def redesign_page(
     blocks = []
     if record is not None:
         blocks += _replayed(found, record)
-    impulse = found.test.impulse_at is not None and isinstance(found.possible.rig.modes.domain, Interval)
-    if impulse and record is None:
+    if record is None and found.test.impulse_at is not None and _drawn(found):
         blocks.append(_moving(found, found.before.response, found.after.response, "The test"))
     blocks += [
         block(
@@ -66,11 +66,12 @@ def redesign_page(
             [(s.name, s.what, f"{100.0 * s.loss:.3g}", "yes" if s.kept else "no") for s in found.steps],
         ),
     ]
+    used = found.proof if found.pays else found.present_proof
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
-        lead=f"{found.advice} {found.sentence}" if found.pays else found.sentence,
-        standing="good" if found.safe else "bad" if found.proof.share_stable < 0.95 else "part",
+        lead=f"{found.advice} {found.sentence.replace(found.advice, '').rstrip()}",
+        standing="bad" if used.share_stable < 0.95 else "good" if found.safe and not found.left_undamped else "part",
         lines=[*moved, *found.notes],
         blocks=blocks,
         tables=tables,
@@ -122,7 +123,7 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
         return []
     caption = f"Under the inputs of the measured record {record.name or ''}".rstrip()
     shown = []
-    if isinstance(rig.modes.domain, Interval) and old.bounded and new.bounded:
+    if _drawn(found) and old.bounded and new.bounded:
         shown.append(_moving(found, old.response, new.response, caption))
     read = any(s.quantity == "displacement" for s in rig.sensors)
     where = "the sensor that reads the most, beside what was measured there without control" if read else "an actuator"
@@ -131,14 +132,23 @@ def _replayed(found: Redesign, record: Record) -> list[dict[str, Any]]:
     return shown
 
 
+def _drawn(found: Redesign) -> bool:
+    """Whether it is known where the structure stands."""
+    domain = found.possible.rig.modes.domain
+    return not (isinstance(domain, NamedPoints) and domain.positions is None)
+
+
 def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict[str, Any]:
     scale = np.abs(new.modal[: new.modes.n_modes]).max()
-    limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -1e3 * scale, 1e3 * scale))
+    limit = RUNS_AWAY * scale
+    limited = replace(old, modal=np.clip(np.nan_to_num(old.modal), -limit, limit))
     actuators = [a for a in found.possible.rig.actuators if a.name in found.redesigned.actuators]
     sensors = [s for s in found.possible.rig.sensors if s.name in found.redesigned.sensors]
     both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
     motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours)
-    return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.")
+    grown = np.abs(old.modal[: old.modes.n_modes]).max() > limit
+    cut = f" The present one runs away; its motion is cut off at {RUNS_AWAY:g} times the other's." if grown else ""
+    return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.{cut}")
 
 
 def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -> Shown:
@@ -161,6 +171,6 @@ def _readings(found: Redesign, record: Record, responses: dict[str, Response]) -
             response.time, shape @ response.modal[: response.modes.n_modes], color=colour, linewidth=1.0, label=label
         )
     limit = 1.3 * max(float(np.abs(line.get_ydata()).max()) for line in ax.lines if line.get_label() != "present")
-    ax.set(xlabel="time [s]", ylabel=f"displacement, {name}", ylim=(-limit, limit))
+    ax.set(xlabel="time [s]", ylabel=f"displacement, {name} [m]", ylim=(-limit, limit))
     ax.legend(fontsize=8, ncols=3)
     return figure

@@ -47,39 +47,53 @@ workbench.move = function (root, spec) {
     tracks.forEach(function (t) { for (var k = 0; k < spec.time.length; k += 3) displaced(t.spec, k).forEach(function (w) { most = Math.max(most, Math.abs(w)); }); });
     return most;
   }
-  if (!modes) reach = largest();
+  if (!modes && !spec.net) reach = largest();
 
   var X, Y, height = 240;
-  // a net: spots of a plate or a frame, moved in the plane of the picture
+  // a net: spots of a plate or a frame, moved in the plane of the picture; responses side by side, modes over each other
   var net = spec.net;
-  function spun(track, phase) {
-    var c = Math.cos(phase), moves = track.moves[mode];
-    return moves ? net.rest.map(function (p, i) { return [p[0] + c * moves[i][0], p[1] + c * moves[i][1]]; }) : null;
+  function spun(track, phase, frame) {
+    var c = Math.cos(phase), moves = track.moves;
+    if (modes && !moves[mode]) return null;
+    return net.rest.map(function (p, i) {
+      if (modes) return [p[0] + c * moves[mode][i][0], p[1] + c * moves[mode][i][1]];
+      for (var u = p[0], v = p[1], r = 0; r < moves.length; r++) { u += moves[r][i][0] * track.modal[r][frame]; v += moves[r][i][1] * track.modal[r][frame]; }
+      return [u, v];
+    });
   }
-  function joined(spots) {
-    return net.lines.map(function (l) { return "M" + X(spots[l[0]][0]).toFixed(1) + "," + Y(spots[l[0]][1]).toFixed(1) + "L" + X(spots[l[1]][0]).toFixed(1) + "," + Y(spots[l[1]][1]).toFixed(1); }).join("");
+  function joined(spots, at) {
+    return net.lines.map(function (l) { return "M" + (at[0] + X(spots[l[0]][0])).toFixed(1) + "," + (at[1] + Y(spots[l[0]][1])).toFixed(1) + "L" + (at[0] + X(spots[l[1]][0])).toFixed(1) + "," + (at[1] + Y(spots[l[1]][1])).toFixed(1); }).join("");
   }
   function drawnNet(width) {
     var u = net.rest.map(function (p) { return p[0]; }), v = net.rest.map(function (p) { return p[1]; });
     var low = [Math.min.apply(null, u), Math.min.apply(null, v)], high = [Math.max.apply(null, u), Math.max.apply(null, v)];
     var margin = 0.18 * Math.max(high[0] - low[0], high[1] - low[1]);
+    var apart = modes ? 1 : tracks.length, beside = width > 280 * apart ? apart : 1, all = width;
+    width = all / beside;
     height = Math.max(200, Math.min(380, width * (high[1] - low[1] + 2 * margin) / (high[0] - low[0] + 2 * margin)));
     var unit = Math.min(width / (high[0] - low[0] + 2 * margin), height / (high[1] - low[1] + 2 * margin));
     X = function (x) { return 0.5 * width + unit * (x - 0.5 * (low[0] + high[0])); };
     Y = function (y) { return 0.5 * height - unit * (y - 0.5 * (low[1] + high[1])); };
-    picture.setAttribute("viewBox", "0 0 " + width + " " + height);
-    picture.setAttribute("height", height);
-    svg("path", { d: joined(net.rest), fill: "none", stroke: "var(--line)", "stroke-width": 1 }, picture);
-    tracks.forEach(function (t) { t.line = svg("path", { class: "track", fill: "none", stroke: t.colour, "stroke-width": 1.6 }, picture); });
+    picture.setAttribute("viewBox", "0 0 " + all + " " + height * apart / beside);
+    picture.setAttribute("height", height * apart / beside);
+    tracks.forEach(function (t, i) {
+      t.at = modes ? [0, 0] : beside > 1 ? [i * width, 0] : [0, i * height];
+      if (!modes || i === 0) svg("path", { d: joined(net.rest, t.at), fill: "none", stroke: "var(--line)", "stroke-width": 1 }, picture);
+      t.line = svg("path", { class: "track", fill: "none", stroke: t.colour, "stroke-width": 1.6 }, picture);
+      if (apart > 1) svg("text", { x: t.at[0] + 0.5 * width, y: t.at[1] + 14, "text-anchor": "middle" }, picture, t.spec.label);
+      if (!modes || i === tracks.length - 1) marked(t.at);
+    });
+    show();
+  }
+  function marked(at) {
     (spec.sensors || []).forEach(function (s) {
-      svg("title", {}, svg("circle", { cx: X(s.at[0]), cy: Y(s.at[1]), r: 3.5, fill: "var(--paper)", stroke: "var(--ink)" }, picture), "sensor " + s.name);
+      svg("title", {}, svg("circle", { cx: at[0] + X(s.at[0]), cy: at[1] + Y(s.at[1]), r: 3.5, fill: "var(--paper)", stroke: "var(--ink)" }, picture), "sensor " + s.name);
     });
     (spec.actuators || []).forEach(function (a) {
-      var g = svg("g", { transform: "translate(" + X(a.at[0]) + "," + (Y(a.at[1]) + 9) + ")" }, picture);
+      var g = svg("g", { transform: "translate(" + (at[0] + X(a.at[0])) + "," + (at[1] + Y(a.at[1]) + 9) + ")" }, picture);
       svg("path", { d: "M0,-9L6,3H-6Z", fill: "var(--bad)" }, g);
       svg("title", {}, g, "actuator " + a.name);
     });
-    show();
   }
   function measure() {
     var width = picture.clientWidth || 600;
@@ -115,11 +129,11 @@ workbench.move = function (root, spec) {
     if (!X) return;
     var frame = modes ? 0 : Math.round((clock % spec.seconds) / spec.seconds * (spec.time.length - 1)), words = [];
     if (net) tracks.forEach(function (t) {
-      var spots = spun(t.spec, Math.PI * clock);
+      var spots = spun(t.spec, Math.PI * clock, frame);
       t.line.setAttribute("visibility", t.on && spots ? "visible" : "hidden");
       if (!spots) return;
-      t.line.setAttribute("d", joined(spots));
-      words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " Hz, ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
+      t.line.setAttribute("d", joined(spots, t.at));
+      if (modes) words.push((spec.tracks.length > 1 ? t.spec.label + ": " : "") + workbench.shown(t.spec.frequencies_hz[mode]) + " Hz, ζ " + workbench.shown(100 * t.spec.damping[mode]) + " %");
     });
     else tracks.forEach(function (t) {
       var x = t.spec.x || spec.x, w = modes ? swung(t.spec, Math.PI * clock) : displaced(t.spec, frame);
