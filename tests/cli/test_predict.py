@@ -61,8 +61,9 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
         assert done.exit_code == 0, done.output
         assert json.loads((case / "told.json").read_text())["holds"] is holds
     assert "held on 1 of 2 tests" in done.output
+    assert "held on 1 of 2 tests" in run("check", "late", f"{name}.csv", *options).output, "one record is one test"
     with (case / "late" / "tests.csv").open(newline="") as file:
-        assert [row["holds"] for row in csv.DictReader(file)] == ["yes", "no"]
+        assert [row["holds"] for row in csv.DictReader(file)] == ["yes", "no", "no"]
     assert "The model does not hold" in (case / "out" / "late-check.html").read_text()
 
 

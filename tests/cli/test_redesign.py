@@ -58,6 +58,11 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
     plain.write_text('{"effects": []}')
     refused = run("redesign", folder, "--verdict", plain)
     assert refused.exit_code == 2 and "workbench diagnose CASE --json plain.json" in refused.output
+    told = json.loads(verdict.read_text())
+    told["posterior"]["nominal"]["frequencies_hz"][1] *= 1.001
+    plain.write_text(json.dumps(told))
+    other = run("redesign", folder, "--verdict", plain)
+    assert other.exit_code == 2 and "the verdict is of another rig: its frequencies hz are" in other.output
     unknown = run("redesign", folder, "--verdict", verdict, "--law", "magic")
     assert unknown.exit_code == 2 and "the laws are imsc, coupled, poles, on-off" in unknown.output
     slow = run("redesign", folder, "--verdict", verdict, "--rate-hz", 5)

@@ -53,8 +53,8 @@ def check(
     for line in (*rest, *prediction.notes):
         say(line)
     log_test(log, result)
-    tests = read_log(log)
-    held = sum(test["holds"] == "yes" for test in tests)
+    tests = {test["record"]: test for test in read_log(log)}  # of a record that was checked again, the last
+    held = sum(test["holds"] == "yes" for test in tests.values())
     say(f"  log        {short(log)}: the model held on {held} of {len(tests)} tests")
     write_json(
         json_path,

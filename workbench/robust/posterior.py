@@ -145,6 +145,7 @@ class UncertainRig:
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, from which `from_json` makes the same beside the same nominal rig."""
         return {
+            "nominal": _nominal_json(self.nominal),
             "effects": [_effect_json(effect) for effect in self.effects],
             "covariance": self.covariance.tolist(),
             "unexplained": self.unexplained,
@@ -164,17 +165,43 @@ class UncertainRig:
             catalogue: kinds by which effects are known, where kinds of your own are among them.
 
         Raises:
-            ValueError: an effect of a kind that the catalogue does not hold, or a covariance of another size.
+            ValueError: another rig, an effect of a kind that the catalogue does not hold, or a covariance of another
+                size.
         """
         kinds = {kind.name: kind for kind in (*catalogue, *BEYOND, NOMINAL_ERRORS)}
         unknown = [entry["kind"] for entry in written["effects"] if entry["kind"] not in kinds]
         if unknown:
             raise ValueError(f"no effect is called {unknown[0]!r}; hand a catalogue that holds it")
+        for what, own in _nominal_json(nominal).items():
+            if not _alike(told := written["nominal"][what], own):
+                raise ValueError(
+                    f"the verdict is of another rig: its {what.replace('_', ' ')} are {_listed(told)}, and here"
+                    f" {_listed(own)}; diagnose this case again"
+                )
         effects = tuple(_effect(nominal, kinds[entry["kind"]], entry) for entry in written["effects"])
         n = len(parameters_of(nominal, effects))
         covariance = np.array(written["covariance"], float) if n else np.zeros((0, 0))
         rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in written["rivals"])
         return cls(nominal, effects, covariance, written["unexplained"], written["outcome"], rivals)
+
+
+def _nominal_json(rig: Rig) -> dict[str, list[Any]]:
+    """By what a rig is known again."""
+    return {
+        "inputs": [a.name for a in rig.actuators],
+        "outputs": [s.name for s in rig.sensors],
+        "frequencies_hz": rig.modes.frequencies_hz.tolist(),
+    }
+
+
+def _alike(told: Sequence[Any], own: Sequence[Any]) -> bool:
+    if own and isinstance(own[0], float):
+        return len(told) == len(own) and bool(np.allclose(told, own, rtol=1e-6))
+    return list(told) == list(own)
+
+
+def _listed(values: Sequence[Any]) -> str:
+    return ", ".join(f"{v:.4g}" if isinstance(v, float) else str(v) for v in values)
 
 
 def _widest(parameter: Parameter) -> float:

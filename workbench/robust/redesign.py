@@ -527,7 +527,8 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
             )
             words.append(f"{a.name}: {', '.join(late)}")
         elif step == "dead zone" and (a.dead_zone or a.bias):
-            words.append(f"{a.name}: dead zone {a.dead_zone:.3g} N, bias {a.bias:.3g} N")
+            lost = [f"dead zone {a.dead_zone:.3g} N"] * (a.dead_zone > 0) + [f"bias {a.bias:.3g} N"] * (a.bias != 0)
+            words.append(f"{a.name}: {', '.join(lost)}")
         elif step == "saturation" and (np.isfinite(a.limit) or np.isfinite(a.rate_limit)):
             words.append(
                 f"{a.name}: limit {a.limit:.3g} N"
