@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from workbench.draw.motion import SWAY, mode_motion
+from workbench.design.loop.closed_loop import Response
+from workbench.draw.motion import SWAY, mode_motion, response_motion
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes, PointShapes
@@ -23,6 +24,25 @@ def test_a_plate_is_a_net_that_moves_up_and_down_as_its_modes():
     half = np.abs(rest[:, 0] - 0.4 * rest[:, 1] / 0.45 - 1.0) < 1e-6
     assert half.any() and np.abs(moves[1, half, 1]).max() < 1e-3 * np.abs(moves[1]).max()
     assert np.abs(moves).max(axis=(1, 2)) == pytest.approx([SWAY * 2.4] * 2, rel=1e-4)
+
+
+def test_a_plate_moves_as_its_modal_coordinates_say_both_responses_in_one_scale():
+    plate = Plate(length=(2.0, 1.0), mass_per_area=1.0, bending_stiffness=1.0, poisson_ratio=0.3, edges="clamped")
+    modes, time = plate.modes(3), np.linspace(0.0, 1.0, 21)
+    modal = np.random.default_rng(0).normal(size=(6, 21))
+    both = {
+        "present": Response(time, 2.0 * modal, np.zeros((1, 21)), modes),
+        "new": Response(time, modal, np.zeros((1, 21)), modes),
+    }
+    shown = response_motion(both, actuators=[Actuator("F", (1.0, 0.0))])
+    present, new = (np.einsum("rij,rt->tij", np.array(t["moves"]), np.array(t["modal"])) for t in shown["tracks"])
+    assert np.abs(present).max() == pytest.approx(SWAY * 2.4, rel=1e-3)
+    np.testing.assert_allclose(new, 0.5 * present, atol=1e-4)
+    middle = int(np.argmin(np.hypot(*(np.array(shown["net"]["rest"]) - [1.2, 0.225]).T)))
+    at = np.array(shown["net"]["rest"])[middle]
+    place = (at[0] - 0.4 * at[1] / 0.45, at[1] / 0.45)
+    up = modes.phi_at(place) @ modal[:3]
+    np.testing.assert_allclose(new[:, middle, 1] / np.abs(new[:, middle, 1]).max(), up / np.abs(up).max(), atol=1e-3)
 
 
 def test_a_frame_moves_each_node_in_its_directions_and_closes_its_loop():

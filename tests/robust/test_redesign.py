@@ -58,6 +58,37 @@ def test_at_least_half_of_what_a_fault_costs_is_won_back(rig, controller, fault)
     assert found.safe and "stable on 4 of 4 draws" in found.sentence
 
 
+def test_a_dead_zone_is_made_up_for_though_it_spills_less(rig):
+    """Less force excites the residual modes less: all modes together vibrate less, the controlled ones more."""
+    law = imsc(rig.modes, 2, rig.actuators, weight=0.02)
+    spilling = kalman(rig.modes, law, rig.sensors[:2], disturbance=1.0, noise=1e-5)
+    told = {"sample_time": DT, "impulse_at": 0.8, "draws": 1, "placement": False}
+    free = redesign(possible(rig), spilling, **told).after.response.energy
+    found = redesign(possible(rig, FAULTS["dead zone"]), spilling, **told)
+    before, after = (run.response.energy for run in (found.before, found.after))
+    assert before.sum() < 0.97 * free.sum() and before[:2].sum() > 1.2 * free[:2].sum()
+    assert [s.name for s in found.steps if s.kept][2:] == ["dead zone"]
+    assert after[:2].sum() == pytest.approx(free[:2].sum(), rel=0.02)
+
+
+def test_a_residual_mode_that_control_leaves_undamped_is_named(rig, controller):
+    found = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    own = found.loop.modes.zeta
+    damping = np.maximum(found.proof.damping, own)
+    damping[:, 3] = 0.2 * own[3]
+    alike = {
+        name: replace(proof, damping=damping)
+        for name, proof in (("proof", found.proof), ("present_proof", found.present_proof))
+    }
+    assert "Mode 4, which is not controlled, keeps" in replace(found, **alike).sentence
+    damping[:, 3] = 0.6 * own[3]
+    alike = {
+        name: replace(proof, damping=damping)
+        for name, proof in (("proof", found.proof), ("present_proof", found.present_proof))
+    }
+    assert not replace(found, **alike).left_undamped
+
+
 def test_a_loop_that_a_long_delay_destabilises_is_made_stable(rig, controller):
     late = possible(rig, effect("actuator_delay", "all", delay=6.0 * DT))
     found = redesign(late, controller, sample_time=DT, impulse_at=0.8, draws=8, placement=False)

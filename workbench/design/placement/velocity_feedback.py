@@ -24,6 +24,7 @@ from workbench.structure.printed import Printed
 
 GRID = 4_001  # places at which the largest curvature of the participation is looked for
 BATCH = 2_000  # cells bounded at once
+MOST_CELLS = 2_000_000  # after which the proof stops with the bound that it has reached
 TOLERANCE = 1e-9  # of the length: how near to the spacing an optimum may come
 
 
@@ -113,16 +114,13 @@ class FeedbackPlacement(Printed):
         )
 
 
-def place_pairs(
-    task: FeedbackTask, *, gap: float = 0.01, starts: int = 12, seed: int = 0, most_cells: int = 2_000_000
-) -> FeedbackPlacement:
+def place_pairs(task: FeedbackTask, *, gap: float = 0.01, starts: int = 12, seed: int = 0) -> FeedbackPlacement:
     """The pairs in order along the structure that leave the least E, by SLSQP from many starts, with a proof.
 
     Args:
         gap: share of E to be proven by branch and bound.
         starts: random ones.
         seed: of the starts.
-        most_cells: after which the proof stops with the bound that it has reached.
 
     Raises:
         DesignError: no start ended at a stable loop.
@@ -147,13 +145,13 @@ def place_pairs(
             best, least = found.x, float(found.fun)
     if best is None:
         raise DesignError("no places of these pairs make a stable loop; change the gain")
-    bound, cells, better = _proven(task, least * (1.0 - gap), most_cells)
+    bound, cells, better = _proven(task, least * (1.0 - gap))
     if better is not None:
         raise DesignError(f"the search missed pairs at {better}, which leave less; take more starts")
     return FeedbackPlacement(frozen(best), least, bound, cells)
 
 
-def _proven(task: FeedbackTask, wanted: float, most_cells: int) -> tuple[float, int, np.ndarray | None]:
+def _proven(task: FeedbackTask, wanted: float) -> tuple[float, int, np.ndarray | None]:
     """A bound of E, up to the one wanted, the cells examined, and places that are below it where some are met."""
     n, (first, last) = task.n_pairs, task.reach
     half = np.full(n, (last - first) / 16)
@@ -179,7 +177,7 @@ def _proven(task: FeedbackTask, wanted: float, most_cells: int) -> tuple[float, 
         if below.size:
             return 0.0, count, cells[below[0]]
         open_ = lower < wanted
-        if count > most_cells:
+        if count > MOST_CELLS:
             bound = min(bound, float(lower[open_].min(initial=np.inf)))
             break
         # the axis along which the bound is loosest is halved
