@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import workbench as wb
+from workbench.design.estimation.digital import DigitalController
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
@@ -190,6 +191,24 @@ def test_where_nothing_explains_the_gap_it_says_what_can_still_be_promised(rig, 
         replace(sure, unexplained=0.5), controller, sample_time=DT, impulse_at=0.8, draws=4, placement=False
     )
     assert not unsure.safe and "off by 50 %" in unsure.sentence and "not sure" in unsure.sentence
+
+
+def test_an_impulse_is_as_large_in_volts_as_in_metres(rig):
+    level = np.linspace(0.01, 0.02, 8)
+    volts = replace(rig, sensors=[replace(s, gain=-250.0) for s in rig.sensors])
+    metres, read = (impulse_test(r, [0, 1], DT, level=x) for r, x in ((rig, level), (volts, 250.0 * level)))
+    assert read.impulse == pytest.approx(metres.impulse) and metres.impulse > 0
+    moved = run_loop(rig, silent(rig), metres).response
+    peaks = np.abs(rig.modes.phi([s.at for s in rig.sensors[:4]]) @ moved.modal[:6]).max(axis=1)
+    speeds = np.abs(rig.modes.phi([s.at for s in rig.sensors[4:]]) @ moved.modal[6:]).max(axis=1)
+    assert np.median(level / np.r_[peaks, speeds]) == pytest.approx(1.0, rel=0.02)
+
+
+def silent(rig):
+    """A controller that commands nothing."""
+    return DigitalController(
+        DT, ("d1",), ("F1",), *(np.zeros((n, m)) for n, m in ((0, 0), (0, 1), (1, 0), (1, 1), (0, 1)))
+    )
 
 
 def test_a_motor_at_a_support_is_tested_by_an_impulse_that_moves_the_modes():

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 from workbench.draw.style import COLOURS, GREY, new_figure, plain_ticks
 from workbench.records.record import Record
 from workbench.robust.prediction import LEVEL, Prediction, amplitudes
-from workbench.robust.proof import interval
+from workbench.robust.proof import SETTLED, interval
 from workbench.robust.redesign import Redesign
 
 OLD, NEW = COLOURS[1], COLOURS[0]
@@ -21,10 +21,12 @@ def plot_redesign(result: Redesign) -> Figure:
     both = (("present", result.present_proof, OLD), ("redesigned", result.proof, NEW))
     top = max(float(p.energy[0].max()) for _, p, _ in both if np.isfinite(p.energy[0]).any())
     for name, proof, colour in both:
-        middle, low, high = np.clip(proof.energy, 1e-9 * top, 1e3 * top)
+        middle, low, high = np.clip(proof.energy / max(top, 1e-300), 1e-9, 1e3)
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
         left.semilogy(time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {proof.share_stable:.0%}")
-    left.set(xlabel="time [s]", ylabel="energy of all modes [J]", ylim=(1e-6 * top, 3.0 * top))
+    left.axhline(SETTLED, color=GREY, linewidth=0.8)
+    left.text(time[-1], SETTLED, "settled", fontsize=8, ha="right", va="bottom")
+    left.set(xlabel="time [s]", ylabel="energy of all modes over its peak", ylim=(1e-6, 3.0))
     left.set_title(f"after the test, {result.proof.n_draws} possible rigs (median, 95 %)")
     left.legend(fontsize=8)
     rows = np.arange(len(result.controlled))

@@ -91,7 +91,7 @@ def impulse_test(
     for sensor, reached in zip(rig.sensors, level, strict=True):
         derivative, order = MEASURED[sensor.quantity]
         if order < 2:
-            row = rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
+            row = sensor.gain * rig.modes.phi_at(sensor.at, derivative, direction=sensor.direction)
             peaks.append(reached / max(np.abs(row @ motion[order]).max(), 1e-300))
     return replace(test, impulse=float(np.median(peaks)) if peaks else 1.0)
 
