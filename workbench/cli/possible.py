@@ -70,7 +70,7 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         posterior, noise = content["posterior"], content.get("noise", {}).get("found")
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
+    except (OSError, json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError):
         raise ValueError(
             f"{path} holds no verdict with its uncertainty: write one by `workbench diagnose CASE --json {path.name}`"
         ) from None

@@ -183,7 +183,7 @@ class Redesign:
         elif self._better and np.isfinite(self._over).all():
             why = f"the new one {self._difference('it')}, but {self._more}"
         else:
-            why = "the new one does no better"
+            why = "the new one costs no less and settles no sooner"
         return f"Keep the present controller: {why}."
 
     def _does(self, proof: Proof, lead: str, *, named: bool = True) -> str:
