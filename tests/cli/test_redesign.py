@@ -52,6 +52,25 @@ def test_a_late_actuator_is_made_up_for_and_shown(run, case, tmp_path):
     assert found["sentence"].split(";")[0] in html and "Under the inputs of the measured record low" in html
 
 
+@pytest.mark.slow
+def test_what_is_redesigned_is_what_was_exported(run, case, tmp_path):
+    folder, verdict = case
+    options = ("--law", "poles", "--control", 2, "--damping", 0.15, "--estimator", "luenberger")
+    code, told = tmp_path / "before.py", tmp_path / "kept.py"
+    done = run("export", folder, *options, "--rate-hz", 100, "--to", code)
+    assert done.exit_code == 0, done.output
+    # where nothing may be dearer and nothing is lost, the present one is kept and written
+    none = json.loads(verdict.read_text())
+    none["posterior"] |= {"effects": [], "covariance": []}
+    (tmp_path / "none.json").write_text(json.dumps(none))
+    quick = ("--verdict", tmp_path / "none.json", "--draws", 1, "--more-work", 0, "--more-cost", 0)
+    done = run("redesign", folder, *options, *quick, "--page", tmp_path / "p.html", "--to", told)
+    assert "the present one, which is kept" in done.output, done.output
+    first, second = (run_path(str(path))["Controller"]() for path in (code, told))
+    for readings in np.random.default_rng(0).standard_normal((200, 4)):
+        np.testing.assert_allclose(second.step(readings), first.step(readings), rtol=1e-12)
+
+
 def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
     folder, verdict = case
     plain = tmp_path / "plain.json"

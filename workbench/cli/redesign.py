@@ -53,7 +53,7 @@ def redesign(
 ) -> None:
     """Design the controller anew for what a diagnosis found, and prove both on what remains unknown.
 
-    The controller in use is that of `workbench export` with the same options, designed for the nominal model.
+    The options of `workbench export` say which controller is in use; it is designed for the nominal model.
 
     Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05 --to controller.c
     """
