@@ -22,8 +22,9 @@ from workbench.records.table_layout import LONGEST_LINE, MARK, Layout, check_len
 from workbench.records.units import split_unit, time_factor
 
 BLOCK = 2**21  # characters
-BLANK_LINES = re.compile(r"\n[ \t]*(?=\n)")
-COMMENT_LINES = re.compile(r"^#.*\n?", re.MULTILINE)
+# a run of lines is one match without backtracking, so that 300 MB of them take seconds
+BLANK_LINES = re.compile(r"\n[ \t\n]+(?<=\n)")
+COMMENT_LINES = re.compile(r"^(?:#.*+\n?+)++", re.MULTILINE)
 DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
@@ -93,7 +94,7 @@ def _lines(path: Path, block: str) -> list[str]:
             raise RecordFileError(f"{path} is damaged: the description of its channels stands below its numbers")
         block = COMMENT_LINES.sub("", block)
     if "\n\n" in block or "\n " in block or "\n\t" in block:
-        block = BLANK_LINES.sub("", f"\n{block}")
+        block = BLANK_LINES.sub("\n", f"\n{block}")
     return [line for line in block.split("\n") if line and not line.isspace()]
 
 

@@ -1,6 +1,7 @@
 """HDF5: one dataset a signal at the top of the file, `t` or `time` for the instants."""
 
 import json
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -46,8 +47,8 @@ def _is_numeric(dataset: Any) -> bool:
 
 
 def _numbers(dataset: Any) -> int:
-    """Numbers in a dataset, each of whose elements may be an array."""
-    size = int(dataset.size or 0)
+    """Numbers in a dataset, each of whose elements may be an array, or in a chunk, which is unpacked whole."""
+    size = max(int(dataset.size or 0), math.prod(dataset.chunks or (0,)))
     return max(size, -(-size * int(dataset.dtype.itemsize) // (2 * BYTES_PER_NUMBER)))
 
 

@@ -191,12 +191,13 @@ class Record(Printed):
 
     def only(self, outputs: Sequence[str]) -> "Record":
         """The record with only the named outputs, in that order."""
-        missing = [name for name in outputs if name not in self.output_names]
+        row_of = {name: row for row, name in enumerate(self.output_names)}
+        missing = [name for name in outputs if name not in row_of]
         if missing:
             raise ValueError(
                 f"record {self.name!r} has no output {missing[0]!r}; it has {', '.join(self.output_names)}"
             )
-        rows = [self.output_names.index(name) for name in outputs]
+        rows = [row_of[name] for name in outputs]
         return replace(self, outputs=self.outputs[rows], output_channels=tuple(self.output_channels[r] for r in rows))
 
     def to_control(self) -> "control.TimeResponseData":

@@ -1,6 +1,7 @@
 """UFF 58 (universal file format, functions at nodal degrees of freedom), by pyuff."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ QUANTITIES = {code: name for name, code in TYPES.items()}
 LINE = 80
 TRANSFER = 4  # func_type of the format
 MARK = b"    -1"
+BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
 
 
@@ -28,7 +30,7 @@ def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """The signals of all data sets 58, their instants and their header; to be called in a process of its own."""
-    if sum(line.rstrip() == MARK for line in path.read_bytes().splitlines()) % 2:
+    if not _whole(path.read_bytes()):
         raise RecordFileError(f"{path} is damaged: its last data set has no end")
     sets = pyuff.UFF(str(path)).read_sets()
     sets = sets if isinstance(sets, list) else [sets]
@@ -62,6 +64,14 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         raise RecordFileError(f"{path} is damaged: its description of the record is missing")
     header = (record or {}) | {"channels": channels}
     return arrays | {HEADER: np.array(json.dumps(header))}
+
+
+def _whole(data: bytes) -> bool:
+    """Whether each data set has its end; that of a binary one (58b) stands behind its last number, on no line of its
+    own."""
+    if BINARY.search(data):
+        return data.rstrip().endswith(MARK)
+    return sum(line.rstrip() == MARK for line in data.splitlines()) % 2 == 0
 
 
 def _transfer(path: Path, sets: list[dict[str, Any]]) -> dict[str, np.ndarray]:

@@ -25,6 +25,7 @@ LINES = 4096  # samples of a segment of the spectrum
 PEAKS = 4  # shown of each channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of its surroundings; these as a part of the lines
 SEGMENTS = 4  # of the record at least, so that single lines of noise are no peaks
+MOST_ROWS = 100  # of the table
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,8 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 def _record(record: Record, path: Path) -> Look:
     channels = (*record.input_channels, *record.output_channels)
     signals = (*record.inputs, *record.outputs)
-    rows = tuple(_row(channel, row, record.sample_rate_hz) for channel, row in zip(channels, signals, strict=True))
+    shown = [*zip(channels, signals, strict=True)][:MOST_ROWS]
+    rows = tuple(_row(channel, row, record.sample_rate_hz) for channel, row in shown)
     inputs, outputs = record.n_inputs, record.n_outputs
     seconds = record.n_samples * record.sample_time
     heading = (
@@ -66,7 +68,9 @@ def _record(record: Record, path: Path) -> Look:
     faults = data_faults(record)
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
     remarks = [fault.message for fault in faults]
-    unstated = [channel.name for channel in channels if not channel.quantity]
+    if len(channels) > MOST_ROWS:
+        remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
+    unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
     forces = [] if inputs else [n for n in record.output_names if n not in faulty and FORCES.search(n)]

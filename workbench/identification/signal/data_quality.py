@@ -18,6 +18,7 @@ SLOWEST = 64
 COPIED = 1e-2
 PREDICTOR_ORDER, LONGEST = 16, 20_000
 NOISE_FREE = 1e-9
+BLOCK = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ def data_faults(record: Record) -> tuple[DataFault, ...]:
     by straight lines.
     """
     dead = list(_dead(record))
-    alive = [j for j in range(record.n_outputs) if record.output_names[j] not in {d.outputs[0] for d in dead}]
+    names = {fault.outputs[0] for fault in dead}
+    alive = [j for j, name in enumerate(record.output_names) if name not in names]
     return (*dead, *_copied(record, alive), *_clipped(record, alive), *_upsampled(record, alive))
 
 
@@ -102,19 +104,24 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     # A part that is at rest has no copy.
     moving = size > 1e-12 * size.max()
     scaled = about[moving] / size[moving, None]
-    names = [record.output_names[j] for j, moves in zip(alive, moving, strict=True) if moves]
-    alike = scaled @ scaled.T / part.shape[1]
-    for i, j in zip(*np.nonzero(np.triu(np.abs(alike) > 1.0 - 1e-6, 1)), strict=True):
-        noise = _innovation_std(scaled[i])
-        apart = np.sqrt(((scaled[i] - np.sign(alike[i, j]) * scaled[j]) ** 2).mean())
-        # Without noise, sensors of a single mode are the same but for scale.
-        if noise > NOISE_FREE and apart < COPIED * noise:
-            yield DataFault(
-                "copied",
-                (names[i], names[j]),
-                f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
-                " twice; leave one out",
-            )
+    names = [record.output_channels[j].name for j, moves in zip(alive, moving, strict=True) if moves]
+    copies: set[int] = set()
+    for first in range(0, len(scaled), BLOCK):
+        alike = scaled[first : first + BLOCK] @ scaled[first:].T / part.shape[1]
+        for i, j in (first + np.argwhere(np.triu(np.abs(alike) > 1.0 - 1e-6, 1))).tolist():
+            if i in copies or j in copies:
+                continue
+            noise = _innovation_std(scaled[i])
+            apart = np.sqrt(((scaled[i] - np.sign(alike[i - first, j - first]) * scaled[j]) ** 2).mean())
+            # Without noise, sensors of a single mode are the same but for scale.
+            if noise > NOISE_FREE and apart < COPIED * noise:
+                copies.add(j)
+                yield DataFault(
+                    "copied",
+                    (names[i], names[j]),
+                    f"outputs {names[i]!r} and {names[j]!r} are the same signal, its noise included, which would count"
+                    " twice; leave one out",
+                )
 
 
 def _innovation_std(row: np.ndarray) -> float:
@@ -128,7 +135,7 @@ def _innovation_std(row: np.ndarray) -> float:
 
 def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
-        row, name = record.outputs[j], record.output_names[j]
+        row, name = record.outputs[j], record.output_channels[j].name
         ends = {"above": row.max(), "below": row.min()}
         piled = {side: np.flatnonzero(row == end) for side, end in ends.items()}
         clear = [side for side, at in piled.items() if at.size >= LEAST_PILED and at.size > PILED * _beside(row, at)]
@@ -153,7 +160,7 @@ def _beside(row: np.ndarray, at: np.ndarray) -> int:
 
 def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
     for j in alive:
-        row, name = record.outputs[j], record.output_names[j]
+        row, name = record.outputs[j], record.output_channels[j].name
         for order, how in ((1, "held"), (2, "joined by straight lines")):
             moves = np.abs(np.diff(row, order))
             changes = np.flatnonzero(moves > 1e-9 * np.abs(row).max())

@@ -17,6 +17,7 @@ from workbench.records.record import Record
 # Samples that predict the one before; samples of an update; memory, and that of the error level, in orders.
 ORDER, BLOCK, MEMORY, LEVEL_MEMORY = 32, 4, 4, 2
 MOST_SIGNALS, MOST_SAMPLES = 8, 40_000
+MOST_SENSORS = 256  # whose combinations are sought, evenly among all: of more they take minutes
 # Fewer means are too few to learn the rule and to test it.
 SHORTEST = (4 + LEVEL_MEMORY) * ORDER
 COARSER = 4
@@ -68,8 +69,9 @@ def decay_start(record: Record) -> float:
 def _scaled(record: Record) -> tuple[np.ndarray, float]:
     """Strongest combinations of the outputs about where they end, (n_signals, n_samples), and the variance that
     rounding to the sensors' steps leaves in them."""
-    end = np.median(record.outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
-    about = record.outputs - end
+    outputs = record.outputs[:: -(-record.n_outputs // MOST_SENSORS)]
+    end = np.median(outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
+    about = outputs - end
     # Differences weigh sensors by how they move, not by how they drift.
     size = np.sqrt((np.diff(about, axis=1) ** 2).mean(axis=1))
     moving = size > 0
