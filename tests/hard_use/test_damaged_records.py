@@ -230,9 +230,7 @@ def huge_chunk(path):
 
 def huge_mat_part(path):
     """A small record beside a compressed cell of 40 million numbers."""
-    savemat(
-        path, {"t": TIME, "a": WAVE, "c": np.array([np.zeros(40_000_000, "i1"), 0], object)}, do_compression=True
-    )
+    savemat(path, {"t": TIME, "a": WAVE, "c": np.array([np.zeros(40_000_000, "i1"), 0], object)}, do_compression=True)
 
 
 def huge_csv(path):
