@@ -4,6 +4,7 @@ import http.client
 import json
 import socket
 import threading
+import time
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from itertools import pairwise
@@ -436,6 +437,23 @@ def test_a_client_that_sends_nothing_is_dropped_and_keeps_no_other_waiting(bench
         silent.sendall(b"POST /try HTTP/1.1\r\nHost: 127.0.0.1")
         assert request(bench, "GET", "/")[0] == 200
         assert silent.recv(1) == b"", "the server closes the connection"
+
+
+def test_a_client_that_sends_bytes_one_by_one_is_dropped_in_time(bench, monkeypatch):
+    """Each byte began the wait anew, so that such a client stayed for ever."""
+    monkeypatch.setattr("workbench.study.bench.CLIENT_SECONDS", 0.5)
+    start, ended = time.monotonic(), False
+    with socket.create_connection(("127.0.0.1", bench), timeout=0.05) as slow:
+        slow.sendall(b"POST /try HTTP/1.1\r\nX: ")
+        while not ended and time.monotonic() - start < 5.0:
+            try:
+                slow.sendall(b"a")
+                ended = slow.recv(1) == b""
+            except TimeoutError:
+                continue
+            except OSError:
+                ended = True
+    assert ended and request(bench, "GET", "/")[0] == 200
 
 
 def test_undamped_residual_modes_are_not_called_stable_alone():

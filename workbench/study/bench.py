@@ -1,11 +1,13 @@
 """The bench: a page on this machine alone, where a design is moved about and answers at once."""
 
 import json
+from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from socket import socket
+from socket import SHUT_RDWR, socket
+from threading import Timer
 from typing import Any
 
 from jinja2 import Environment
@@ -26,7 +28,7 @@ SEEN = {
     " without control.",
 }
 MOST_BYTES = 65536
-CLIENT_SECONDS = 10.0  # after which a client that sends nothing is dropped
+CLIENT_SECONDS = 10.0  # in which a request must come whole, or the client is dropped
 MOST_WAITING = 128  # connections not yet taken
 POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'; connect-src 'self';"
@@ -82,7 +84,22 @@ class _Handler(BaseHTTPRequestHandler):
         self.rig, self.structure, self.folder, self.page = rig, structure, folder, page
         super().__init__(*arguments)
 
+    def handle_one_request(self) -> None:
+        """One request; the time limit of a socket is for each read, so bytes one by one would hold it for ever."""
+        self.late = Timer(CLIENT_SECONDS, self._drop)
+        self.late.daemon = True
+        self.late.start()
+        try:
+            super().handle_one_request()
+        finally:
+            self.late.cancel()
+
+    def _drop(self) -> None:
+        with suppress(OSError):  # gone already
+            self.connection.shutdown(SHUT_RDWR)
+
     def do_GET(self) -> None:
+        self.late.cancel()
         if not self._from_here():
             return self._answer(HTTPStatus.FORBIDDEN, {"error": "this bench answers 127.0.0.1 only"})
         if self.path != "/":
@@ -117,7 +134,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             raise StudyError(f"a request has at most {MOST_BYTES} bytes")
         try:
-            return json.loads(self.rfile.read(int(length)))
+            content = self.rfile.read(int(length))
+            self.late.cancel()
+            return json.loads(content)
         except RecursionError:
             raise StudyError("that is no design") from None
 
