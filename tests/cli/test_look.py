@@ -44,6 +44,15 @@ def test_an_input_is_known_by_its_name_and_steady_motion_is_ambient(run, tmp_pat
     assert "--ambient" in run("look", ambient, "--page", tmp_path / "p.html").output
 
 
+def test_units_stand_in_the_table_as_they_are_written(run, tmp_path):
+    """A style of rich's begins like a unit in brackets, which was dropped."""
+    path = write(
+        tmp_path / "g.csv", ["time", "a [g]", "b [g]"], [np.arange(N) / RATE, *np.random.default_rng(0).random((2, N))]
+    )
+    seen = run("look", path, "--page", tmp_path / "p.html").output
+    assert "a        acceleration [m/s^2]" in seen
+
+
 def test_transfer_functions_are_shown(run, tmp_path):
     lines = np.linspace(1.0, 100.0, 400)
     h = 1.0 / (OMEGA**2 - (2.0 * np.pi * lines) ** 2 + 2j * ZETA * OMEGA * 2.0 * np.pi * lines)

@@ -105,7 +105,7 @@ def place(
     if nodes is not None and nodes.size == control:
         rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
     table = Table(
-        "points" if isinstance(domain, NamedPoints) else r"places \[m]",
+        "points" if isinstance(domain, NamedPoints) else "places [m]",
         "W_R",
         "effort",
         "peak force",

@@ -77,7 +77,7 @@ def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
             title=found.question,
             figures_folder=root / "figures",
             # on a terminal a line goes to stderr, where the progress bar makes room for it
-            on_say=lambda text: (errors if console.is_terminal else console).print(f"  {text}", markup=False),
+            on_say=lambda text: (errors if console.is_terminal else console).print(f"  {text}"),
             on_track=track,
             on_report=lambda text, share: progress.update(cases, description=text, completed=share, visible=True),
             cache=root / "out" / "cache",

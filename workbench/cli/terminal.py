@@ -20,10 +20,11 @@ JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results
 Memory = Annotated[float, typer.Option(help="Memory that reading a file may take, GiB.")]
 PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
 
-console = Console(soft_wrap=True, highlight=False)
+# no text is markup: rich would take the unit in "acceleration [m/s^2]" for a style and drop it
+console = Console(soft_wrap=True, highlight=False, markup=False)
 if not console.is_terminal:
     console.width = WIDE
-errors = Console(stderr=True, soft_wrap=True, highlight=False)
+errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
 
 
 def guarded(command: Callable[..., None]) -> Callable[..., None]:
@@ -54,12 +55,12 @@ def complain(fault: str) -> None:
     """Print an error in one line, with options where the library names arguments."""
     for argument, option in OPTIONS.items():
         fault = re.sub(rf"\b{argument}\b", option, fault)
-    errors.print(f"workbench: {_one_line(fault)}", style="red", markup=False)
+    errors.print(f"workbench: {_one_line(fault)}", style="red")
 
 
 def say(text: str, *, bold: bool = False) -> None:
-    """Print a line as it stands: nothing in it is markup."""
-    console.print(text, style="bold" if bold else None, markup=False)
+    """Print a line as it stands."""
+    console.print(text, style="bold" if bold else None)
 
 
 def _one_line(text: str) -> str:
@@ -70,7 +71,7 @@ def _one_line(text: str) -> str:
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     """Print a warning in one line; those of arithmetic are for developers, whose tests see them."""
     if not issubclass(category, RuntimeWarning):
-        errors.print(f"workbench: {_one_line(str(message))}", style="yellow", markup=False)
+        errors.print(f"workbench: {_one_line(str(message))}", style="yellow")
 
 
 def progress_bar() -> Progress:

@@ -114,7 +114,10 @@ def record_of(
         kind: tuple(_channel(path, names[key], described.channels.get(key, {}), units.get(key)) for key in keys[kind])
         for kind in KINDS
     }
-    remarks = [_unit_remark(names[key], split_unit(_name(key))[1], unit) for key, unit in units.items()]
+    written: dict[tuple[str, Unit], list[str]] = {}
+    for key, unit in units.items():
+        written.setdefault((split_unit(_name(key))[1], unit), []).append(names[key])
+    remarks = [_unit_remark(", ".join(alike), text, unit) for (text, unit), alike in written.items()]
     try:
         return Record(
             sample_time=sampling.step,
