@@ -1,5 +1,6 @@
 """`workbench identify`: the modes of measured records."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -75,6 +76,8 @@ def identify(
         found = identification_report(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )
+    as_read = dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ()))
+    found = replace(found, lines=(*found.lines, *(f"as read: {remark}" for remark in as_read)))
     table = Table(box=None, pad_edge=False)
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
@@ -84,8 +87,6 @@ def identify(
     console.print(table)
     for line in found.lines:
         say(f"  {line.replace('`seconds`', '--seconds')}")
-    for remark in dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ())):
-        say(f"  as read: {remark}")
     if page is not None:
         from workbench.study.identification_page import identification_page
         from workbench.study.page import write_page

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from workbench.arrays import Floats
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.gap.effects.beyond import any_beyond
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect, apply_all, label_in_words
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.report.budget import Budget
 from workbench.gap.report.verdict import Verdict
@@ -61,7 +61,7 @@ def plot_gaps(gap: Mapping[str, Mapping[str, float]]) -> Figure:
 
 def plot_budget(budget: Budget) -> Figure:
     """What causes the gap of each record: one bar a record, split by cause."""
-    causes = [label.replace("[", " (").replace("]", ")").replace("_", " ") for label in budget.effects]
+    causes = [label_in_words(label) for label in budget.effects]
     causes += ["small errors of the model", "unexplained", "noise"]
     colours = [*(COLOURS[i % 5] for i in range(len(budget.effects))), COLOURS[5], COLOURS[6], GREY]
     records = list(budget.by_record)
@@ -197,7 +197,7 @@ def plot_rivals(verdict: Verdict) -> Figure:
     beyond = [best] if any_beyond(best.effects) else []
     singles = [*beyond, *verdict.attribution.singles[:8]]
     figure, ax = new_figure(1, 1, width=10, height=0.42 * len(singles) + 1.6)
-    labels = [" + ".join(fit.labels) for fit in singles]
+    labels = [" + ".join(map(label_in_words, fit.labels)) for fit in singles]
     costs = [max(fit.cost, 1e-3) for fit in singles]
     chosen = {effect.label for effect in verdict.effects} if beyond or verdict.outcome == "explained" else set()
     colours = [COLOURS[0] if set(fit.labels) <= chosen and chosen else GREY for fit in singles]

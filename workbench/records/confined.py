@@ -105,7 +105,8 @@ def _confine(limits: Limits) -> None:
         import resource
     except ImportError:  # Windows knows no such limits; the limit by the clock holds there too
         return
-    used = math.ceil(time.process_time() + limits.seconds)
+    # the start of this process counts, and a second is left for the one that waits; a short limit is for the file alone
+    used = max(math.floor(limits.seconds) - 1, math.ceil(time.process_time()) + 1)
     for limit, value in (
         (resource.RLIMIT_AS, int(limits.memory) + OVERHEAD),
         (resource.RLIMIT_CORE, 0),

@@ -67,7 +67,7 @@ def _record(record: Record, path: Path) -> Look:
     )
     faults = data_faults(record)
     faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
-    remarks = [fault.message for fault in faults]
+    remarks = [*record.remarks, *(fault.message for fault in faults)]
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]

@@ -198,19 +198,25 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
     rows = [
         [
             law["law"],
-            law["cost"],
-            law["effort"],
-            law["peak_force"],
-            float(works[law["law"]].sum()),
+            *(_short(law[key]) for key in ("cost", "effort", "peak_force")),
+            _short(works[law["law"]].sum()),
             _loop(poles[law["law"]]),
         ]
         for law in laws
     ]
     sensed = [
-        [one["design"], one["margin"], one["stable"], "" if one.get("robustness") is None else one["robustness"]]
+        [
+            one["design"],
+            _short(one["margin"]),
+            one["stable"],
+            "" if one.get("robustness") is None else one["robustness"],
+        ]
         for one in content.get("through_sensors", ())
         if "stable" in one
     ]
+    heads = ("controller", "margin [1/s]", "stable", "share of perturbed models stable")
+    if sensed and all(row[-1] == "" for row in sensed):
+        heads, sensed = heads[:-1], [row[:-1] for row in sensed]
     unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if not row[2]]
     loops = [row[0] for row in (*rows, *sensed)]
     return {
@@ -222,11 +228,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         ],
         "tables": [
             ("Laws", ("law", "cost", "effort", "peak force", "W_R", "loop"), rows),
-            *(
-                [("With sensors", ("controller", "margin [1/s]", "stable", "share of perturbed models stable"), sensed)]
-                if sensed
-                else []
-            ),
+            *([("With sensors", heads, sensed)] if sensed else []),
         ],
     }
 
@@ -254,7 +256,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
     places = [np.array(one["positions"], float) for one in placements]
     works = {n: np.array(one["by_mode"], float) for n, one in zip(names, placements, strict=True)}
     rows = [
-        [name, *(one[key] for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
+        [name, *(_short(one[key]) for key in ("residual_work", "effort", "peak_force", "condition")), _between(at)]
         for name, one, at in zip(names, placements, places, strict=True)
     ]
     first, bound = placements[0]["residual_work"], content.get("lower_bound")
@@ -264,7 +266,7 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         "title": "Actuator placement",
         "lead": f"Actuators at {_between(places[0])} m leave spillover work W_R = {float(first):.4g}.{proof}",
         "standing": "good" if bound is not None else "",
-        "lines": [f"The search ended with: {placements[0]['status']}."],
+        "lines": [f"The search: {placements[0]['status']}."],
         "blocks": [
             block(
                 plot_places(dict(zip(names, places, strict=True)), content.get("length")), "Where the actuators stand."
@@ -273,6 +275,11 @@ def _placed(content: dict[str, Any]) -> dict[str, Any]:
         ],
         "tables": [("Placements", ("placement", "W_R", "effort", "peak force", "condition of B", "places [m]"), rows)],
     }
+
+
+def _short(number: float) -> float:
+    """To four digits, of which a table of comparison needs no more."""
+    return float(f"{float(number):.4g}")
 
 
 def _between(places: np.ndarray) -> str:

@@ -12,6 +12,7 @@ from workbench.cases.case import Case
 from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.draw.spectra import plot_distortion
+from workbench.gap.effects.effect import label_in_words
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
 from workbench.records.record import Record
@@ -154,9 +155,10 @@ def _could_show(verdict: Verdict) -> str:
     count = len(verdict.readiness.strengths)
     text = f"Before any fit: these records can show {f'all but {len(hidden)} of' if hidden else 'all'} {count} effects"
     if hidden:
-        named = ", ".join(label.replace("_", " ") for label in hidden[:6])
+        named = ", ".join(map(label_in_words, hidden[:6]))
         text += f" (not {named}{', …' if len(hidden) > 6 else ''})"
     if alike:
-        text += f"; at small strength they cannot distinguish {alike[0][0]} from {alike[0][1]}".replace("_", " ")
+        one, other = map(label_in_words, alike[0][:2])
+        text += f"; at small strength they cannot distinguish {one} from {other}"
         text += f", nor {len(alike) - 1} pairs more" if len(alike) > 1 else ""
     return text + "."

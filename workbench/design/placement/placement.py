@@ -37,6 +37,10 @@ POINTS = 40  # a half wave, where nodes are bracketed
 SPLINE_POINTS = {"interval": (15, 120), "side": (10, 30)}  # a mode or half wave, and besides: of the shapes' splines
 DIRECTIONS = 400  # a force, by which the instants of its peaks are chosen
 IPOPT = {"ipopt.max_iter": 200, "ipopt.tol": 1e-9}
+IPOPT_SAYS = {
+    "Solve_Succeeded": "converged",
+    "Solved_To_Acceptable_Level": "converged, to IPOPT's acceptable tolerance",
+}
 OFF_ENDS = 1e-3  # of a side: IPOPT's places keep so far inside
 ON_EDGE = 1e-6  # of a side: so near, an actuator stands on the edge of its box
 
@@ -95,8 +99,9 @@ def place(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 
             continue
         positions = found.positions
         if not any(np.abs(positions - p).max() < SAME * size for p, _ in optima):
+            if found.residual_work <= min((work for _, work in optima), default=np.inf):
+                status = message
             optima.append((positions, found.residual_work))
-            status = message
     if not optima:
         raise DesignError(conflict(task, limits))
     optima.sort(key=lambda optimum: optimum[1])
@@ -263,7 +268,8 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
         )
         # IPOPT keeps its bounds but for 1e-8 of their size
         found = units * np.clip(result["x"].full().ravel(), low, high)
-        return found.reshape(n, sides.size), solver.stats()["return_status"]
+        status = str(solver.stats()["return_status"])
+        return found.reshape(n, sides.size), IPOPT_SAYS.get(status, status.replace("_", " ").lower())
 
     return solve
 

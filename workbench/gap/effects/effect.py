@@ -311,6 +311,11 @@ class Effect:
         return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
 
 
+def label_in_words(label: str) -> str:
+    """A label as a figure or a note shows it: actuator gain (F2)."""
+    return label.replace("[", " (").replace("]", ")").replace("_", " ")
+
+
 def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
     """What distinguishes a set of effects from another, but for numbers and order."""
     return tuple(sorted(effect.label for effect in effects))

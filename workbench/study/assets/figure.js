@@ -110,6 +110,8 @@ var workbench = (function () {
       reset.hidden = !panel;
     }
 
+    function textWidth(text) { return (/[a-z]/i.test(text) ? 7.8 : 6.6) * text.length; }  // px, of a tick: letters take more than digits
+
     function paint(panel) {
       var p = panel.spec, node = panel.svg, width = node.clientWidth || panel.root.clientWidth;
       if (!width) return;
@@ -120,8 +122,8 @@ var workbench = (function () {
       node.setAttribute("viewBox", "0 0 " + width + " " + height);
       node.setAttribute("height", height);
       var bottom = height - (p.x.label ? 38 : 22), yTicks = ticks(p.y, panel.y, Math.max(3, Math.round(bottom / 38)));
-      var longest = Math.max.apply(null, yTicks.map(function (t) { return t[1].length; }).concat([1]));
-      var left = Math.min(0.42 * width, 12 + 6.6 * longest) + (p.y.label ? 17 : 0), right = width - 10, top = 8;
+      var longest = Math.max.apply(null, yTicks.map(function (t) { return textWidth(t[1]); }).concat([6.6]));
+      var left = Math.min(0.42 * width, 12 + longest) + (p.y.label ? 17 : 0), right = width - 10, top = 8;
       var field = p.marks.filter(function (m) { return m.kind === "field"; })[0];
       if (field) right -= 58;
       p.marks.forEach(function (m) {  // room for words that begin at the right edge
@@ -140,7 +142,7 @@ var workbench = (function () {
       yTicks.forEach(function (t) {
         svg("line", { class: "grid", x1: left, x2: right, y1: Y(t[0]), y2: Y(t[0]) }, node);
         var name = svg("text", { x: left - 5, y: Y(t[0]) + 4, "text-anchor": "end" }, node, t[1]);
-        if (6.6 * t[1].length > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
+        if (textWidth(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
       });
       if (p.x.label) svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, p.x.label);
       if (p.y.label) fit(svg("text", { class: "axis", x: 0, y: 0, "text-anchor": "middle",
