@@ -18,6 +18,7 @@ from workbench.identification.input_output.fit_errors import pole_covariance, ve
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.mode_clusters import NARROW, overlap_remarks, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
+from workbench.identification.input_output.peak_shape import one_for_two, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes, time_derivatives
@@ -51,6 +52,8 @@ class TransferModes(ModalEstimates):
         converged: whether the search ended because the step was small.
         parts_hz: of each mode the other members of its cluster (`mode_clusters`), Hz: points measured one after
             another are inconsistent there, or the mode drifts or depends on amplitude.
+        scatter_hz: (n_modes,) rms by which the frequency of a mode scatters where its peak is not that of one pole
+            (`peak_shape`), Hz; else 0: it drifts, depends on amplitude, or a window blurs it.
         full_hz: bands (lowest, highest line) in which the search stopped at the most modes allowed: the residual is
             not noise there; modes are missing, or the points are inconsistent.
         fitted: (n_outputs, n_references, n_frequencies) the model at the lines of the band.
@@ -66,6 +69,7 @@ class TransferModes(ModalEstimates):
     evidence: np.ndarray
     converged: bool
     parts_hz: tuple[tuple[float, ...], ...]
+    scatter_hz: np.ndarray
     full_hz: tuple[tuple[float, float], ...]
     fitted: np.ndarray
     frequencies_hz: np.ndarray
@@ -144,7 +148,7 @@ def identify_transfer(
         inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
         selected = _selected(
-            budget.share(1.0 / (n_bands - k)),
+            own := budget.share(1.0 / (n_bands - k)),
             h[..., inside],
             2.0 * np.pi * f[inside],
             _residual_powers(channels),
@@ -152,10 +156,10 @@ def identify_transfer(
             most_modes=min(most_modes, f[inside].size // each_own),
             false_alarm=false_alarm / n_bands,
         )
-        found.append(_modes_of(*selected, channels, edges, f[first:last]))
+        found.append(_modes_of(*selected, channels, edges, f[first:last], own))
     whole = _together(found, channels) if n_bands > 1 else found[0]
     overlap = overlap_remarks(whole.modes.poles, h.shape[0] * h.shape[1])
-    whole = replace(whole, remarks=(*overlap, *budget.remarks))
+    whole = replace(whole, remarks=(*whole.remarks, *overlap, *_uneven(whole), *budget.remarks))
     if whole.modes.n_modes == 0:
         raise ValueError(
             f"no mode rises above the noise between {f[0]:g} and {f[-1]:g} Hz; widen the band or measure with more"
@@ -198,16 +202,22 @@ def _modes_of(
     channels: Sequence[Channel],
     edges_hz: tuple[float, float],
     shown_hz: np.ndarray,
+    budget: Budget,
 ) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
     fit, parts_hz = _clustered(lines, selected, channels)
+    fit, kept = one_for_two(lines, fit, budget)
+    parts_hz = [parts_hz[r] for r in kept]
+    found = peaks(lines, fit)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
     covariance = pole_covariance(fit, noise_ratio)
     sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < UNSURE * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
-    inside = np.flatnonzero(within & sure & (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1]))
+    within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
+    inside = np.flatnonzero(within & sure)
+    out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
     n = inside.size
     derivative = time_derivatives(channels)[:, None]
     poles, participation = fit.poles[inside], fit.participation[inside]
@@ -228,9 +238,26 @@ def _modes_of(
         evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
         parts_hz=tuple(parts_hz[r] for r in inside),
+        scatter_hz=frozen(np.where(found.uneven, found.scatter, 0.0)[inside] / (2.0 * np.pi)),
         full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),
+        remarks=(f"left out, as negatively damped or of unknown frequency: poles at {out} Hz",) if out else (),
+    )
+
+
+def _uneven(whole: TransferModes) -> tuple[str, ...]:
+    """A remark on the modes whose peaks are not those of one pole."""
+    which = [
+        f"mode {r + 1} ({whole.modes.frequencies_hz[r]:.4g} Hz, by {scatter:.2g} Hz rms)"
+        for r, scatter in enumerate(whole.scatter_hz)
+        if scatter > 0
+    ]
+    if not which:
+        return ()
+    return (
+        f"frequencies scatter in the peaks of {', '.join(which)}: such a mode changes with time or amplitude, or a"
+        " window blurs it, and is the mean of what it was; measure at one level, and longer segments",
     )
 
 
@@ -270,9 +297,11 @@ def _together(found: Sequence[TransferModes], channels: Sequence[Channel]) -> Tr
         evidence=frozen(np.concatenate([band.evidence for band in found])),
         converged=all(band.converged for band in found),
         parts_hz=tuple(parts for band in found for parts in band.parts_hz),
+        scatter_hz=frozen(np.concatenate([band.scatter_hz for band in found])),
         full_hz=tuple(full for band in found for full in band.full_hz),
         fitted=frozen(np.concatenate([band.fitted for band in found], axis=-1), complex),
         frequencies_hz=frozen(np.concatenate([band.frequencies_hz for band in found])),
+        remarks=tuple(remark for band in found for remark in band.remarks),
     )
 
 

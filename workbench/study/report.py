@@ -214,7 +214,7 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         for one in content.get("through_sensors", ())
         if "stable" in one
     ]
-    heads = ("controller", "margin [1/s]", "stable", "share of perturbed models stable")
+    heads: tuple[str, ...] = ("controller", "margin [1/s]", "stable", "share of perturbed models stable")
     if sensed and all(row[-1] == "" for row in sensed):
         heads, sensed = heads[:-1], [row[:-1] for row in sensed]
     unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if not row[2]]

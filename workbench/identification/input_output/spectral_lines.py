@@ -59,6 +59,10 @@ class Lines:
         s = 1j * self.omega
         above = participation[:, None] / (s - pole) ** 2
         below = participation.conj()[:, None] / (s - pole.conjugate()) ** 2
+        return self.stacked_pair(above, below)
+
+    def stacked_pair(self, above: np.ndarray, below: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows (n_rows,) of the real and of the imaginary part of a factor of a pair, (n_references, n_lines) each."""
         pair = (0.5 * (above + below), -0.5j * (above - below))
         real, imaginary = (self._stacked(x[None])[:, 0] for x in pair)
         return real, imaginary

@@ -79,7 +79,7 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget, change: Change | None = 
     Args:
         change: of the modes of the fit, where it is known.
     """
-    for r, s in _pairs(fit):
+    for r, s in pairs_alike(fit):
         if budget.spent("check of modes that change within the record"):
             break
         evidence = [evidence_of(fit, r), evidence_of(fit, s)]
@@ -160,7 +160,7 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
     return found
 
 
-def _pairs(fit: Fit) -> list[tuple[int, int]]:
+def pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     """Modes near each other with shapes alike, the nearest first."""
     poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > ALIKE
     apart = np.abs(np.subtract.outer(poles.imag, poles.imag))

@@ -1,0 +1,111 @@
+"""Modes of transfer functions whose peak is not that of one pole.
+
+The transfer function of a mode that drifts while it is measured is the mean of those of its poles λ + δ,
+
+    <1 / (s - λ - δ)> = 1 / (s - λ) + <δ²> / (s - λ)³ + ...,      <δ> = 0,
+
+and a free decay of λ + δ t / T has the same term: t² e^{λt} / 2 has the transform 1 / (s - λ)³. A mode that depends on
+its amplitude, and one blurred by a window, have it too. No mode of a linear structure has it, so it is fitted to what
+the modes leave, with the shape and the participation of each mode. Where the term of one mode explains what a second
+one beside it does, of the same shape, it is one mode.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from workbench.arrays import Floats
+from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
+from workbench.identification.input_output.model_order import evidence_of
+from workbench.identification.input_output.spectral_lines import Lines
+from workbench.identification.input_output.time_variance import INSTEAD, pairs_alike
+from workbench.identification.signal.least_squares import Budget
+
+FALSE_ALARM = 1e-6  # chance that noise alone makes such a peak
+MATTERS = 0.2  # of the half-power half-width: a smaller scatter of the pole harms no model
+BESIDE = 4.0  # half-power half-widths about a mode in which its noise is measured
+
+
+class Peaks(NamedTuple):
+    """How far the peak of each mode is from that of one pole.
+
+    Attributes:
+        uneven: (n_modes,) where it is so by more than chance, and enough to matter.
+        scatter: (n_modes,) rms of δ, rad/s.
+        evidence: (n_modes,) χ² of the further term, in the noise of the fit.
+    """
+
+    uneven: np.ndarray
+    scatter: Floats
+    evidence: Floats
+
+
+def peaks(lines: Lines, fit: Fit) -> Peaks:
+    """The further term of every mode, beside all that the modes can follow."""
+    n = fit.poles.size
+    if not n:
+        return Peaks(np.zeros(0, bool), np.zeros(0), np.zeros(0))
+    third = [_third(lines, pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
+    slopes = [lines.slopes(pole, l_r) for pole, l_r in zip(fit.poles, fit.participation, strict=True)]
+    real, imaginary = (np.column_stack([s[k] for s in (*third, *slopes)]) for k in (0, 1))
+    phi = columns(lines, fit.poles, fit.participation)[0]
+    phi = phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
+    size = np.maximum(np.hypot(np.linalg.norm(real, axis=0), np.linalg.norm(imaginary, axis=0)), 1e-300)
+    rows, left = [], []
+    for j, (a, noise) in enumerate(zip(fit.amplitudes, fit.noise, strict=True)):
+        weight = 1.0 if lines.weights is None else lines.weights[:, j : j + 1]
+        q = np.linalg.qr(weight * phi)[0]
+        both = np.tile(a, 2) / size
+        moved = weight * np.hstack(
+            [both.real * real - both.imag * imaginary, -both.imag * real - both.real * imaginary]
+        )
+        rows.append((moved - q @ (q.T @ moved)) / noise)
+        left.append(fit.residual[:, j] / noise)
+    m, y = np.vstack(rows), np.concatenate(left)
+    u, s, vt = np.linalg.svd(m, full_matrices=False)
+    kept = s > 1e-9 * s[0]
+    found = vt[kept].T @ ((u[:, kept].T @ y) / s[kept])
+    covariance = (vt[kept].T / s[kept] ** 2) @ vt[kept]
+    rest = lines.unstacked((y - m @ found).reshape(fit.noise.size, -1).T)
+    power = 0.5 * (np.abs(rest) ** 2).mean(axis=(0, 1))
+    uneven, scatter, evidence = np.zeros(n, bool), np.zeros(n), np.zeros(n)
+    for r, pole in enumerate(fit.poles):
+        both = np.array([r, 2 * n + r])
+        beside = np.abs(lines.omega - pole.imag) < max(BESIDE * abs(pole.real), BESIDE * lines.resolution)
+        noise_ratio = max(1.0, float(power[beside].mean())) if beside.any() else 1.0
+        value = found[both]
+        evidence[r] = value @ np.linalg.pinv(covariance[np.ix_(both, both)], hermitian=True) @ value
+        scatter[r] = np.sqrt(np.hypot(*value) / size[r])
+        uneven[r] = evidence[r] > noise_ratio * chi2.isf(FALSE_ALARM, 2) and scatter[r] > MATTERS * abs(pole.real)
+    return Peaks(uneven, scatter, evidence)
+
+
+def one_for_two(lines: Lines, fit: Fit, budget: Budget) -> tuple[Fit, np.ndarray]:
+    """The fit with one mode for two that are alike, where the further term of the one explains the other.
+
+    Returns:
+        The fit, and which modes of the first are left in it.
+    """
+    kept = np.arange(fit.poles.size)
+    for r, s in pairs_alike(fit):
+        if budget.spent("check of modes that change"):
+            break
+        evidence = [evidence_of(fit, r), evidence_of(fit, s)]
+        strong, weak = (r, s) if evidence[0] > evidence[1] else (s, r)
+        left = np.delete(kept, weak)
+        one = settled(lines, projected(lines, fit.poles[left], fit.participation[left]), budget=budget)
+        found, at = peaks(lines, one), int(np.searchsorted(left, strong))
+        worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / one.noise**2).sum())
+        if found.uneven[at] and found.evidence[at] > INSTEAD * worth:
+            fewer, which = one_for_two(lines, one, budget)
+            return fewer, left[which]
+    return fit, kept
+
+
+def _third(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """l / (s - λ)³ as rows, for the real and the imaginary part of its factor."""
+    s = 1j * lines.omega
+    above = participation[:, None] / (s - pole) ** 3
+    below = participation.conj()[:, None] / (s - pole.conjugate()) ** 3
+    return lines.stacked_pair(above, below)
