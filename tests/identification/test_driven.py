@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime
 from scipy.signal import lfilter
+from scipy.stats import binom
 
 from workbench.identification.driven import identify_driven
 from workbench.identification.input_output import time_variance
 from workbench.identification.rig_from import rig_from
+from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -118,9 +120,12 @@ def normalised_errors(draws):
     plant, u = system(), excitation("noise")
     c = plant.C[:, 0::2] - 1j * plant.C[:, 1::2]
     participation = plant.B[0::2] + 1j * plant.B[1::2]
-    figures, shapes, residues = [], [], []
-    for seed in range(draws):
+    figures, shapes, residues, false = [], [], [], 0
+    for seed in range(1000, 1000 + draws):  # 99 draws the inputs: noise that equals them is a direct term
         found = identify_driven(measured(plant, u, fraction=0.01, start=0.3 * np.ones(8), seed=seed))
+        if found.modes.n_modes > 4:
+            false += 1
+            continue
         assert found.modes.n_modes == 4
         omega, zeta = found.modes.omega - OMEGA, found.modes.zeta - ZETA
         figures.append(np.r_[omega / found.omega_std, zeta / found.zeta_std])
@@ -130,6 +135,8 @@ def normalised_errors(draws):
         shapes.append((error[std > 0] / std[std > 0]).ravel())
         true = participation * (0.5 * c[k, r] / found.modes.shapes[k, r])[:, None]
         residues.append(np.abs(found.participation - true) / found.participation_std)
+    # noise alone passes for a mode in one record of a thousand, by the level stated: of 300 in two at most
+    assert binom.sf(false - 1, draws, FALSE_ALARM) > 0.01, f"{false} of {draws} records with a false mode"
     return np.array(figures), np.concatenate(shapes), np.array(residues)
 
 
