@@ -409,10 +409,15 @@ def test_the_change_of_modes_is_found_once_for_each_fit(monkeypatch):
     assert asked and len({id(fit) for fit in asked}) == len(asked)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "seed", "n", "snr"),
-    [(0.02, 4, 1000, 50.0), (0.005, 3, 1500, 60.0), (0.005, 7, 3000, 60.0), (0.02, 7, 3000, 60.0)],
+    [
+        (0.02, 4, 1000, 50.0),
+        *(
+            pytest.param(*each, marks=pytest.mark.slow)
+            for each in ((0.005, 3, 1500, 60.0), (0.005, 7, 3000, 60.0), (0.02, 7, 3000, 60.0))
+        ),
+    ],
 )
 def test_a_change_far_above_the_noise_makes_no_further_modes(change, seed, n, snr):
     """It did, up to the most that there may be, or poles that could not be distinguished ended the search."""
