@@ -251,11 +251,14 @@ class KnownInputs:
         """Of each sample in its record, from -1/2 at the first to 1/2 at the last, (n_samples,)."""
         return np.concatenate([np.linspace(-0.5, 0.5, part.stop - part.start) for part in self.rows])
 
-    def power(self, pole: complex, l_r: np.ndarray) -> Floats:
-        """|z|² of a mode at each sample, over its largest, (n_samples,)."""
+    def modal_coordinate(self, pole: complex, l_r: np.ndarray) -> list[np.ndarray]:
+        """z of a mode at the samples of each record, (n_samples,) complex each."""
         z = np.column_stack(self._modal_coordinate(pole, l_r))
-        squares = np.concatenate([(self._samples(z[part]) ** 2).sum(axis=1) for part in self.rows])
-        return np.asarray(squares / max(squares.max(), 1e-300))
+        return [self._samples(z[part]) @ np.array([1.0, 1j]) for part in self.rows]
+
+    def rows_of(self, samples: Sequence[np.ndarray]) -> Floats:
+        """Columns (n_samples, k) of each record as the fit sees them, one below the other."""
+        return np.vstack([lines_of(each) if self.by_line else each for each in samples])
 
     def responses(self, pole: complex) -> tuple[np.ndarray, np.ndarray]:
         x = np.zeros((self.values.shape[0], self.n_excitations), complex)

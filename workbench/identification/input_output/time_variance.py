@@ -4,14 +4,18 @@ A mode that remembers little of the record feels its pole as it is at the time: 
 z(t) moves by δ (t - T/2) / T ∂z/∂λ to first order. Regressed on that, beside all that a constant model can follow, what
 the model leaves tells δ of every mode, with its standard error.
 
-A change far above the noise is not small to first order, nor always even with time, and other modes stand for it. Its
-motion is then near ∂z/∂λ at frequencies about its own, times low powers of time and of |z|²; the modes are searched
-beside these columns.
+A change far above the noise is not small to first order, nor always even with time, and other modes stand for it. With
+z' = (λ + α t + κ |z|²) z + l u, its motion is the series of Volterra in α and κ, of which each term drives the next,
+
+    δz' = λ δz + t z,    λ δz + |z|² z,    then λ δ²z + t δz,    λ δ²z + |z|² δz,    λ δ²z + 2 Re(z* δz) z,    ...;
+
+the modes are searched beside these columns up to the third order.
 """
 
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
@@ -25,7 +29,6 @@ NEAR, ALIKE = 3.0, 0.9  # half-power bandwidths apart, and modal assurance, of m
 INSTEAD = 0.5  # of what a second mode explains that a change of the first must explain in its place
 MATTERS = 0.1  # of the half-power bandwidth: a smaller change harms no model
 REACH, FAINT = 0.15, 0.2  # of the frequency, and of the evidence, of a mode that may stand for the change of another
-STEPS_ASIDE = (-1.0, 0.0, 1.0)  # half-power half-widths from the frequency of a mode at which it may be found
 STEPS = 12  # of a fit that only decides
 COLLINEAR = 1e-4  # singular value over which columns of unit length count
 FADED = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
@@ -96,9 +99,8 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget, change: Change | None = 
 def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit] | None:
     """The records with what changing modes move as further columns, and the fit without the modes that stood for it.
 
-    A change that is not small makes many modes beside one. Where they go, and the one is found to change, its motion at
-    frequencies about its own, times powers of the time and of its amplitude, follows the change whatever its course.
-    None where no mode is so.
+    A change that is not small makes many modes beside one. Where they go, and the one is found to change, its motion
+    follows the change with time or amplitude. None where no mode is so.
     """
     if fit.amplitudes.shape[0] * data.n_inputs == 1:
         return None  # one signal does not tell whether shapes are alike
@@ -133,15 +135,40 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
 
 def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:
     """Orthonormal columns (n_rows, n_columns) that a mode moves along where it changes, beside those there are."""
-    power, time = data.power(pole, participation), data.time
-    found = []
-    for k in STEPS_ASIDE:
-        slopes = np.column_stack(data.slopes(pole + 1j * k * abs(pole.real), participation))
-        found += [data.modulated(slopes, factor) for factor in (time, time**2, time**3, power, power**2, power * time)]
-    moved = np.hstack(found)
+    moved = data.rows_of([_series(z, pole, data.dt) for z in data.modal_coordinate(pole, participation)])
     moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
     q = np.linalg.qr(data.fixed)[0]
     return _independent(moved - q @ (q.T @ moved))
+
+
+def _series(z: np.ndarray, pole: complex, dt: float) -> Floats:
+    """The terms of the series of Volterra to the third order, real and imaginary parts, (n_samples, n_columns).
+
+    Args:
+        z: (n_samples,) of the constant mode.
+    """
+    mu, time = np.exp(pole * dt), np.linspace(-0.5, 0.5, z.size)
+    z = z / max(float(np.abs(z).max()), 1e-300)
+    power = np.abs(z) ** 2
+    about = power - power.mean()  # the mean is the pole's own
+
+    def driven(force: np.ndarray) -> np.ndarray:
+        """x' = λ x + force by the trapezoidal rule, in units of the mode's time constant."""
+        later = 0.5 * abs(pole.real) * dt * (mu * force[:-1] + force[1:])
+        return np.asarray(lfilter([1.0], [1.0, -mu], np.r_[0.0, later]))
+
+    def turned(x: np.ndarray) -> np.ndarray:
+        """What the change of |z|² by a motion x drives."""
+        return driven(2.0 * np.real(z.conj() * x) * z)
+
+    first = driven(about * z)
+    second = [driven(about * first), turned(first), turned(1j * first)]
+    third = [f(x) for x in second for f in (lambda x: driven(about * x), turned)]
+    by_time = driven(time * z)
+    by_time_twice = driven(time * by_time)
+    found = [by_time, by_time_twice, driven(time * by_time_twice), first, *second, *third, driven(time * first),
+             driven((power**2 - (power**2).mean()) * z)]  # fmt: skip
+    return np.column_stack([part for x in found for part in (x.real, x.imag)])
 
 
 def _independent(rows: Floats) -> Floats:
