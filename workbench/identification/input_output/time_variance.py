@@ -102,8 +102,6 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
     A change that is not small makes many modes beside one. Where they go, and the one is found to change, its motion
     follows the change with time or amplitude. None where no mode is so.
     """
-    if fit.amplitudes.shape[0] * data.n_inputs == 1:
-        return None  # one signal does not tell whether shapes are alike
     strength = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > ALIKE
