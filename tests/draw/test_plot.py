@@ -1,9 +1,15 @@
 """Every result has a figure."""
 
+import numpy as np
+import pytest
+
 import workbench as wb
+from workbench.design.loop.closed_loop import Response
 from workbench.draw.plot import plot
+from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import listed, place_array
 
 
 def test_identified_modes_have_a_figure_of_their_shapes():
@@ -14,3 +20,36 @@ def test_identified_modes_have_a_figure_of_their_shapes():
     for found in (wb.identify(record), wb.ring_down([record])):
         titles = [ax.get_title("left") for ax in plot(found).axes if ax.get_visible()]
         assert titles[0].startswith("mode 1: 0.0157") and titles[1].startswith("mode 2: 0.0628")
+
+
+ON = {"left": "clamped", "right": "free", "bottom": "free", "top": "free"}
+PLATE = wb.Plate(length=(0.6, 0.4), mass_per_area=8.0, bending_stiffness=170.0, poisson_ratio=0.3, edges=ON).modes(3)
+BEAM = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free").modes(3)
+POINTS = wb.NamedPoints(("S1", "S2", "S3"), np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3]]), ("x",) * 3)
+FRAME = wb.FiniteElements(np.eye(3), np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]]), nodes=POINTS).modes(3)
+
+
+@pytest.mark.parametrize("modes", [BEAM, PLATE, FRAME], ids=["beam", "plate", "frame"])
+def test_what_is_known_on_any_domain_has_a_figure(modes):
+    places = list(modes.domain.grid(4))
+    sampled = wb.SampledModes(modes.omega, np.zeros(3), modes.phi(places), place_array(places))
+    assert listed(sampled.positions) == places
+    moving = Response(np.linspace(0.0, 1.0, 30), np.zeros((6, 30)), np.zeros((1, 30)), modes)
+    for result in (modes, sampled, moving):
+        figure = plot(result)
+        figure.draw_without_rendering()
+        assert any(ax.has_data() for ax in figure.axes)
+
+
+def test_the_bands_of_a_plate_are_drawn_where_they_are_wide():
+    at = np.array(PLATE.domain.grid(8))
+    std = np.outer(at[:, 0] / 0.6, [0.1, 0.2, 0.3])
+    bands = Bands(at, PLATE.phi(at), std, 0.5 * std, np.full(3, 3.0), 0.95)
+    figure = plot(bands)
+    below = [ax for ax in figure.axes if ax.has_data()][3:6]
+    for r, ax in enumerate(below):
+        share = 100.0 * std[:, r].max() / np.abs(bands.phi[:, r]).max()
+        assert ax.collections[0].get_array().max() <= 1.2 * share and ax.collections[0].levels[-1] >= share
+    assert "of 3 eigenfunctions at" in str(bands)
+    with pytest.raises(ValueError, match="stand on one line: give a grid"):
+        plot(Bands(at[:3], bands.phi[:3], std[:3], std[:3], np.full(3, 3.0), 0.95))

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, place_in, read_structure_rig, typed_place
 from workbench.cli.terminal import JsonPath, console, guarded, progress_bar, reporter, say, short, write_json
-from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, middle
+from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle
 from workbench.structure.printed import place_text
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def place(
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place as least_work
-    from workbench.design.placement.task import listed, patch_of
+    from workbench.design.placement.task import patch_of
     from workbench.study.whole_file import check_target
 
     check_target(json_path)

@@ -90,8 +90,7 @@ def mode_motion(
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
-            placed = np.isfinite(found.positions).all()
-            x = found.positions if placed else np.arange(1.0, found.positions.size + 1)
+            x = found.positions if found.is_along else np.arange(1.0, found.n_outputs + 1)
             shapes = found.shapes
         else:
             x = np.linspace(0.0, found.length, N_PLACES)

@@ -1,5 +1,6 @@
 """One way to draw any result: `plot(result)`."""
 
+from collections.abc import Sequence
 from functools import singledispatch
 
 import numpy as np
@@ -9,7 +10,7 @@ from matplotlib.figure import Figure
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.how_many import HowMany
-from workbench.design.placement.task import Placement, listed
+from workbench.design.placement.task import Placement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.accuracy import plot_bands
@@ -19,7 +20,7 @@ from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.spectra import plot_distortion
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.draw.surface import plot_point_modes, plot_surface_modes
+from workbench.draw.surface import plot_point_modes, plot_surface_bands, plot_surface_modes, plot_surface_motion
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.shapes.bands import Bands
@@ -28,11 +29,12 @@ from workbench.identification.signal.modal_estimates import ModalEstimates
 from workbench.records.record import Record
 from workbench.robust.prediction import Prediction
 from workbench.robust.redesign import Redesign
-from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.structure.domain import NamedPoints, Rectangle, listed
 from workbench.structure.modes import Modes, SampledModes
 from workbench.structure.printed import place_text
 
 MOST_PANELS = 12
+MOST_INSTANTS = 5
 
 
 @singledispatch
@@ -82,8 +84,8 @@ def _(result: Modes) -> Figure:
 def _(result: SampledModes) -> Figure:
     shapes = result.shapes[:, :MOST_PANELS]
     figure, axes = _panels(shapes.shape[1])
-    placed = np.isfinite(result.positions).all()
-    x = result.positions if placed else np.arange(1, result.positions.size + 1)
+    placed = result.is_along
+    x = result.positions if placed else np.arange(1, result.n_outputs + 1)
     for r, ax in enumerate(axes):
         ax.axhline(0.0, color=GREY, linewidth=0.6)
         ax.plot(x, shapes[:, r].real, "o-", label="real")
@@ -111,7 +113,6 @@ def _(result: Refined) -> Figure:
     return figure
 
 
-plot.register(Bands, plot_bands)
 plot.register(Explanation, plot_spillover_paths)
 plot.register(Verdict, plot_where)
 plot.register(Redesign, plot_redesign)
@@ -119,8 +120,19 @@ plot.register(Prediction, plot_prediction)
 
 
 @plot.register
+def _(result: Bands) -> Figure:
+    return plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result)
+
+
+@plot.register
 def _(result: Response) -> Figure:
-    return plot_motion({"displacement": result}, np.linspace(0.0, result.modes.length, 201))
+    domain = result.modes.domain
+    if isinstance(domain, Rectangle):
+        instants = np.linspace(result.time[0], result.time[-1], MOST_INSTANTS)
+        return plot_surface_motion({"displacement": result}, instants.tolist())
+    if isinstance(domain, NamedPoints):
+        return _point_motion(result, domain.grid()[:MOST_PANELS])
+    return plot_motion({"displacement": result}, np.linspace(0.0, domain.length, 201))
 
 
 @plot.register
@@ -159,6 +171,19 @@ def _(result: ModalFilter) -> Figure:
 @plot.register
 def _(result: Distortion) -> Figure:
     return plot_distortion([result])
+
+
+def _point_motion(result: Response, names: Sequence[str]) -> Figure:
+    """Displacement of each point over time, a panel a point, all in one scale."""
+    figure, axes = new_figure(
+        len(names), 1, width=9, height=0.8 + 1.0 * len(names), sharex=True, sharey=True, squeeze=False
+    )
+    for ax, name, values in zip(axes[:, 0], names, result.displacement(list(names))):
+        ax.plot(result.time, values, linewidth=0.9)
+        ax.set_ylabel(name)
+    axes[0, 0].set_title("displacement [m]")
+    axes[-1, 0].set_xlabel("time [s]")
+    return figure
 
 
 def _panels(count: int) -> tuple[Figure, list[Axes]]:

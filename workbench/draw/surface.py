@@ -15,6 +15,7 @@ from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, PlacementTask
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.identification.shapes.bands import Bands
 from workbench.structure.domain import TRANSLATIONS, NamedPoints, Patch, Rectangle
 from workbench.structure.modes import Modes
 
@@ -70,6 +71,34 @@ def plot_surface_modes(
     return figure
 
 
+def plot_surface_bands(bands: Bands) -> Figure:
+    """Each eigenfunction over a rectangle; below, its standard error as a share of its largest value.
+
+    Raises:
+        ValueError: places that all stand on one line.
+    """
+    x, y = bands.x.T
+    if np.linalg.matrix_rank(np.column_stack([x - x.mean(), y - y.mean()])) < 2:
+        raise ValueError("bands are drawn over a rectangle; their places all stand on one line: give a grid")
+    n = bands.phi.shape[1]
+    wide, high = np.ptp(x), np.ptp(y)
+    figure, grid = new_figure(
+        2, n, width=max(4.0, 2.9 * n), height=2 * (2.5 * min(high / wide, 1.6) + 0.8), squeeze=False
+    )
+    for r in range(n):
+        top, bottom = grid[:, r]
+        largest = np.abs(bands.phi[:, r]).max()
+        top.tricontourf(x, y, bands.phi[:, r], levels=largest * np.linspace(-1.0, 1.0, 2 * LEVELS + 1), cmap="RdBu_r")
+        top.set_title(f"mode {r + 1}", fontsize=10)
+        share = bottom.tricontourf(x, y, 100.0 * bands.std[:, r] / largest, levels=LEVELS, cmap="Purples")
+        figure.colorbar(share, ax=bottom, location="bottom", shrink=0.9, ticks=MaxNLocator(4))
+        for ax in (top, bottom):
+            ax.set(aspect="equal", xticks=[], yticks=[])
+    grid[0, 0].set_ylabel("identified φ(x, y)")
+    grid[1, 0].set_ylabel("standard error\n[% of the largest]")
+    return figure
+
+
 def plot_surface_motion(
     responses: Mapping[str, Response],
     times: Sequence[float],
@@ -93,7 +122,7 @@ def plot_surface_motion(
         nearest = [int(np.argmin(np.abs(response.time - t))) for t in times]
         instants[name] = response.time[nearest]
         drawn[name] = _over(response.modes, response.modal[: response.modes.n_modes, nearest])
-    limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values())
+    limit = max(float(np.abs(fields).max()) for _, _, fields in drawn.values()) or 1.0  # nothing may move at all
     for row, (name, (x, y, fields)) in zip(grid, drawn.items()):
         for ax, time, field in zip(row, instants[name], fields):
             image = _coloured(ax, x, y, field, limit)

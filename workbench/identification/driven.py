@@ -90,14 +90,19 @@ class Driven(ModalEstimates):
     input_channels: tuple[Channel, ...]
 
     @property
+    def shape_covariance(self) -> np.ndarray:
+        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
+        return self.vector_covariance[:, : self.modes.n_outputs, : self.modes.n_outputs]
+
+    @property
     def shape_std(self) -> np.ndarray:
         """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        return self._vector_std[:, : self.modes.positions.size].T
+        return self._vector_std[:, : self.modes.n_outputs].T
 
     @property
     def participation_std(self) -> np.ndarray:
         """Standard error of participation factors (n_modes, n_inputs), rms of real and imaginary part."""
-        real, imaginary = np.split(self._vector_std[:, self.modes.positions.size :], 2, axis=1)
+        real, imaginary = np.split(self._vector_std[:, self.modes.n_outputs :], 2, axis=1)
         return np.asarray(np.sqrt(0.5 * (real**2 + imaginary**2)))
 
     @property

@@ -25,6 +25,7 @@ from workbench.identification.signal.modal_estimates import SURE, ModalEstimates
 from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
+from workbench.structure.domain import place_array
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
@@ -76,9 +77,14 @@ class TransferModes(ModalEstimates):
     remarks: tuple[str, ...] = ()
 
     @property
+    def shape_covariance(self) -> np.ndarray:
+        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
+        return self.vector_covariance[:, : self.modes.n_outputs, : self.modes.n_outputs]
+
+    @property
     def shape_std(self) -> np.ndarray:
         """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        n_outputs = self.modes.positions.size
+        n_outputs = self.modes.n_outputs
         return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)[:, :n_outputs].T))
 
 
@@ -313,7 +319,7 @@ def _residual_powers(channels: Sequence[Channel]) -> list[int]:
 
 
 def _places(channels: Sequence[Channel]) -> np.ndarray:
-    return np.array([np.nan if channel.at is None else channel.at for channel in channels])
+    return place_array([channel.at for channel in channels])
 
 
 def _checked(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from workbench.structure.domain import Where
+from workbench.structure.domain import Where, place_array, same_place
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted, place_text
 
@@ -51,6 +51,7 @@ class Channel:
         if self.noise_std is not None and not self.noise_std >= 0:
             raise ValueError(f"channel {self.name!r}: noise_std must be 0 or more; got {self.noise_std}")
         object.__setattr__(self, "unit", self.unit or QUANTITIES.get(self.quantity, ""))
+        object.__setattr__(self, "at", None if self.at is None else same_place(self.at))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,8 +164,8 @@ class Record(Printed):
 
     @property
     def positions(self) -> np.ndarray:
-        """Places of the outputs along an interval (n_outputs,), m; nan where unknown, or of another kind."""
-        return np.array([c.at if isinstance(c.at, int | float) else np.nan for c in self.output_channels])
+        """Places of the outputs: (n_outputs,) or (n_outputs, 2) m, nan where unknown, or (n_outputs,) names."""
+        return place_array([c.at for c in self.output_channels])
 
     @property
     def output_names(self) -> tuple[str, ...]:

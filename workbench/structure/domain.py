@@ -477,6 +477,26 @@ def same_place(place: Any) -> Any:
     raise PlaceError(f"a place is a position x, a pair (x, y), or the name of a point; got {place!r}")
 
 
+def place_array(places: Sequence[Where | None]) -> np.ndarray:
+    """Places of one kind as an array: (n_places,) m, (n_places, 2) m, or (n_places,) names.
+
+    A place that is not known is nan, or None among names; all are nan where there are several kinds of them.
+    """
+    known = [place for place in places if place is not None]
+    if known and all(isinstance(place, str) for place in known):
+        return np.array(places, object)
+    pairs = [isinstance(place, tuple) and not isinstance(place, Between | Patch) for place in known]
+    if known and all(pairs):
+        return np.array([(np.nan, np.nan) if place is None else place for place in places], float)
+    numbers = all(isinstance(place, int | float) for place in known)
+    return np.array([np.nan if place is None or not numbers else place for place in places], float)
+
+
+def listed(places: np.ndarray) -> list[Place]:
+    """An array of places as a list: floats, pairs of floats, or names."""
+    return [tuple(place) if isinstance(place, list) else place for place in places.tolist()]
+
+
 def middle(where: Where) -> Place:
     """The middle of a patch or of the stretch between two positions; a place itself.
 

@@ -296,28 +296,30 @@ class SampledModes(Printed):
         omega: (n_modes,) rad/s, increasing.
         zeta: (n_modes,) damping ratios.
         shapes: (n_outputs, n_modes) complex, one row a sensor; scale arbitrary.
-        positions: (n_outputs,) places of the sensors, m (nan where unknown).
+        positions: places of the sensors: (n_outputs,) or (n_outputs, 2) m, nan where unknown, or (n_outputs,) names.
     """
 
     omega: Floats
     zeta: Floats
     shapes: Complexes
-    positions: Floats
+    positions: np.ndarray
 
     def __post_init__(self) -> None:
-        for name, dtype in (("omega", float), ("zeta", float), ("shapes", complex), ("positions", float)):
+        named = np.asarray(self.positions).dtype.kind in "OU"
+        for name, dtype in (("omega", float), ("zeta", float), ("shapes", complex)):
             object.__setattr__(self, name, frozen(getattr(self, name), dtype))
-        n = self.omega.size
-        if self.zeta.shape != (n,) or self.shapes.shape != (self.positions.size, n):
+        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+        n, m = self.omega.size, len(self.positions)
+        if self.zeta.shape != (n,) or self.shapes.shape != (m, n):
             raise ValueError(
-                f"SampledModes with {n} frequencies and {self.positions.size} positions needs zeta ({n},) and shapes"
-                f" ({self.positions.size}, {n}); got {self.zeta.shape} and {self.shapes.shape}"
+                f"SampledModes with {n} frequencies and {m} positions needs zeta ({n},) and shapes ({m}, {n}); got"
+                f" {self.zeta.shape} and {self.shapes.shape}"
             )
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         each = enumerate(zip(self.frequencies_hz, self.zeta, self.phase_collinearity))
         rows = [(str(r + 1), f"{f:.6g}", f"{100 * z:.4g}", f"{mpc:.4f}") for r, (f, z, mpc) in each]
-        sensors = counted(self.positions.size, "sensor")
+        sensors = counted(self.n_outputs, "sensor")
         line = f"{counted(self.n_modes, 'mode')} at {sensors}, {_range_hz(self.frequencies_hz)}"
         return line, ("mode", "frequency [Hz]", "damping [%]", "phase collinearity"), rows, ()
 
@@ -329,6 +331,23 @@ class SampledModes(Printed):
     def frequencies_hz(self) -> np.ndarray:
         """Natural frequencies (n_modes,), Hz."""
         return self.omega / (2.0 * np.pi)
+
+    @property
+    def n_outputs(self) -> int:
+        return len(self.shapes)
+
+    @property
+    def unplaced(self) -> Flags:
+        """Which sensors have no known place, (n_outputs,)."""
+        if self.positions.dtype == object:
+            return np.array([place is None for place in self.positions])
+        unknown: Flags = ~np.isfinite(self.positions.reshape(self.n_outputs, -1)).all(axis=1)
+        return unknown
+
+    @property
+    def is_along(self) -> bool:
+        """Whether every sensor has a known place along an interval."""
+        return self.positions.ndim == 1 and self.positions.dtype != object and not self.unplaced.any()
 
     @property
     def poles(self) -> Complexes:

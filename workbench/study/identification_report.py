@@ -195,7 +195,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
             " close modes, or points measured one after another are inconsistent and these are parts of fewer modes"
         )
     band = found.frequencies_hz
-    outputs, inputs = found.modes.positions.size, len(measured.references)
+    outputs, inputs = found.modes.n_outputs, len(measured.references)
     heading = f"transfer functions of {_counted(outputs, 'output')} and {_counted(inputs, 'input')}"
     heading += f", {band.size} lines from {band[0]:.6g} to {band[-1]:.6g} Hz"
     content = {

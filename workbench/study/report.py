@@ -13,6 +13,7 @@ from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.motion import mode_motion
 from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_poles
 from workbench.gap.effects.catalogue import in_words
+from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
 from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study, output_root
@@ -157,8 +158,9 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     hertz = np.array(content["frequencies_hz"], float)
     if not (np.isfinite(shapes).all() and np.isfinite(hertz).all()):
         raise ValueError("a shape or frequency is no number")
-    places = [np.nan if at is None else float(at) for at in content.get("positions") or [None] * len(shapes)]
-    modes = SampledModes(TURN * hertz, np.array(content["damping_ratios"], float), shapes, np.array(places))
+    given = content.get("positions") or [None] * len(shapes)
+    places = place_array([None if at is None else same_place(at) for at in given])
+    modes = SampledModes(TURN * hertz, np.array(content["damping_ratios"], float), shapes, places)
     columns = [content[n] for n in ("frequencies_hz", "frequencies_std_hz", "damping_ratios", "damping_std")]
     names = [f"mode {r + 1}" for r in range(hertz.size)]
     damping = plot_deviations(names, columns[2], columns[3], "damping ratio")
@@ -166,7 +168,7 @@ def identified(content: dict[str, Any]) -> dict[str, Any]:
     blocks = [block(damping, "Damping ratio of each mode, ± 2 standard errors.")]
     if len(shapes) > 1:  # one sensor knows no shape
         moving = mode_motion({"identified": modes})
-        numbered = "" if np.isfinite(places).all() else ", numbered as in the record"
+        numbered = "" if modes.is_along else ", numbered as in the record"
         blocks.insert(0, block(moving, f"The shapes identified, at the sensors{numbered}, with the phase of each."))
     if len(shapes) > 1 and hertz.size > 1:
         blocks.append(

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from workbench.identification.shapes.mode_pairing import pair_modes, subspace_mac
+from workbench.structure.domain import NamedPoints, place_array
+from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.modes import SampledModes, mac
 from workbench.structure.plate import Plate
 
@@ -37,16 +39,20 @@ def test_repeated_modes_agree_as_a_subspace_whatever_their_basis(angle):
 
 def test_every_mode_of_a_turned_basis_is_paired():
     modes = square()
-    measured = SampledModes(modes.omega * (1 + 1e-4 * np.arange(6)), np.zeros(6), turned(np.pi / 4), np.arange(14.0))
-    lookup = Lookup(modes)
-    pairing = pair_modes(measured, lookup)
+    measured = SampledModes(modes.omega * (1 + 1e-4 * np.arange(6)), np.zeros(6), turned(np.pi / 4), PLACES)
+    pairing = pair_modes(measured, modes)
     assert sorted(pairing.model) == [0, 1, 2, 3, 4, 5] and pairing.others.size == 0
     np.testing.assert_allclose(pairing.mac, 1.0, rtol=1e-9)
 
 
-class Lookup:
-    """Modes asked for by the number of a sensor, as `SampledModes` names its places by one coordinate."""
-
-    def __init__(self, modes):
-        self.omega, self.frequencies_hz = modes.omega, modes.frequencies_hz
-        self.phi = lambda positions: modes.phi(PLACES[np.asarray(positions, int)])
+def test_modes_at_named_points_are_paired_with_those_of_a_model():
+    names = ("S1", "S2", "S3")
+    points = NamedPoints(names, np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3]]), ("x",) * 3)
+    stiffness = np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]])
+    model = FiniteElements(np.eye(3), stiffness, nodes=points).modes(3)
+    shapes = model.phi(["S3", "S1", "S2"])[:, [2, 0, 1]]
+    measured = SampledModes(1.1 * model.omega[[2, 0, 1]], np.zeros(3), shapes, place_array(["S3", "S1", "S2"]))
+    pairing = pair_modes(measured, model)
+    assert pairing.matched.tolist() == [1, 2, 0] and pairing.model.tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match=r"sensor 1 has no place.*give its channel `at`"):
+        pair_modes(SampledModes(model.omega, np.zeros(3), shapes, place_array(["S3", None, "S2"])), model)

@@ -1,10 +1,20 @@
 """Eigenfunctions over a rectangle from scattered sensors: exact where a spline is, and within their bands elsewhere."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from workbench.identification.driven import identify_driven
+from workbench.identification.shapes.eigenfunctions import eigenfunctions
 from workbench.identification.shapes.surface_spline import SurfaceSpline, surface_bands, surface_eigenfunctions
-from workbench.structure.domain import Rectangle
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Rectangle, place_array
 from workbench.structure.modes import SampledModes
 from workbench.structure.plate import Plate
 
@@ -33,7 +43,7 @@ def plate():
 def sampled(modes, places, rng):
     shapes = modes.phi(places)
     shapes = shapes / np.abs(shapes).max(axis=0) + NOISE * rng.standard_normal(shapes.shape)
-    return SampledModes(modes.omega, modes.zeta, shapes, np.full(len(places), np.nan))
+    return SampledModes(modes.omega, modes.zeta, shapes, places)
 
 
 def test_a_cubic_is_taken_exactly_with_its_derivatives():
@@ -88,8 +98,8 @@ def test_bands_hold_the_true_shapes(plate):
     where = {"length": LENGTH, "mass_per_area": mass, "edges": EDGES}
     for _ in range(draws):
         found = sampled(plate, places, rng)
-        bands = surface_bands(found, places, GRID, shape_covariance=covariance, **where)
-        shapes = surface_eigenfunctions(found, places, **where).phi(GRID)
+        bands = surface_bands(SimpleNamespace(modes=found, shape_covariance=covariance), GRID, **where)
+        shapes = surface_eigenfunctions(found, **where).phi(GRID)
         np.testing.assert_allclose(shapes, bands.phi, atol=1e-9)
         signed = exact * np.sign((exact * bands.phi).sum(axis=0))
         assert np.abs(bands.phi - signed).max() < 0.05 * np.abs(exact).max()
@@ -111,5 +121,32 @@ def test_what_cannot_be_drawn_is_refused(plate):
     with pytest.raises(ValueError, match="got middle 'clamped'"):
         SurfaceSpline(Rectangle(LENGTH), places, {"middle": "clamped"})
     found = sampled(plate, places, np.random.default_rng(0))
-    with pytest.raises(ValueError, match=r"must have shape \(20, 2\)"):
-        surface_eigenfunctions(found, places[:19], length=LENGTH)
+    unknown = np.where(np.arange(20)[:, None] == 7, np.nan, places)
+    for positions, words in (
+        (unknown, r"sensor 7 has no place; give its channel `at`, \(x, y\)"),
+        (places[:, 0], r"take sensors with places \(x, y\)"),
+        (place_array([f"P{i}" for i in range(20)]), r"take sensors with places \(x, y\)"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            surface_eigenfunctions(SampledModes(found.omega, found.zeta, found.shapes, positions), length=LENGTH)
+    with pytest.raises(ValueError, match="no places along a bar or beam; on a plate take `surface_eigenfunctions`"):
+        eigenfunctions(found, length=1.2)
+
+
+def test_modes_of_a_driven_record_keep_the_places_of_their_sensors_and_the_errors_of_their_shapes():
+    """From a record, on, nothing is typed again: places, covariance, eigenfunctions and their bands."""
+    panel = Plate(length=LENGTH, mass_per_area=8.0, bending_stiffness=170.0, poisson_ratio=0.3, edges="clamped",
+                  damping=ModalDamping(0.01)).modes(2)  # fmt: skip
+    rng, places = np.random.default_rng(4), scattered(24)
+    sensors = [Sensor(f"a{i}", tuple(place), "velocity") for i, place in enumerate(places)]
+    rig = Rig(panel, [Actuator("F", (0.5, 0.3))], sensors)
+    record = simulate(rig, rng.standard_normal((1, 600)), sample_time=0.2 / panel.frequencies_hz[-1])
+    noise = 0.02 * record.outputs.std() * rng.standard_normal(record.outputs.shape)
+    found = identify_driven(replace(record, outputs=record.outputs + noise), at_rest=True)
+    np.testing.assert_allclose(found.modes.positions, places)
+    assert found.shape_covariance.shape == (2, 24, 24)
+    bands = surface_bands(found, GRID, length=LENGTH, mass_per_area=8.0, edges="clamped")
+    truth = panel.phi(GRID) * np.sign((panel.phi(GRID) * bands.phi).sum(axis=0))
+    low, high = bands.pointwise
+    assert ((truth >= low - 1e-9) & (truth <= high + 1e-9)).mean() > 0.9
+    assert (bands.std.max(axis=0) < 0.1 * np.abs(truth).max(axis=0)).all()

@@ -21,8 +21,8 @@ from workbench.design.placement.cell_tree import CellTree
 from workbench.design.placement.limits import Limits, takes_former_limits
 from workbench.design.placement.placement import place
 from workbench.design.placement.scan import MOST_TRIED, allowed_places, scan
-from workbench.design.placement.task import Placement, PlacementTask, listed
-from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.design.placement.task import Placement, PlacementTask
+from workbench.structure.domain import NamedPoints, Rectangle, listed
 from workbench.structure.printed import place_text
 from workbench.threads import one_blas_thread
 

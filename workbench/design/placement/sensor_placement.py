@@ -17,8 +17,7 @@ from scipy.optimize import minimize
 from workbench.design.estimation.surface_filter import filter_of_mass
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.design.placement.places import as_places
-from workbench.design.placement.task import listed
-from workbench.structure.domain import Interval, Place, Rectangle, same_place
+from workbench.structure.domain import Interval, Place, Rectangle, listed, same_place
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import FieldLike, ProfileLike
 from workbench.threads import one_blas_thread

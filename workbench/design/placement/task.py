@@ -21,7 +21,7 @@ from workbench.design.placement.peak import largest
 from workbench.design.placement.places import as_places, coordinates, least_distances
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Place, Rectangle, centred_at, reach
+from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Rectangle, centred_at, listed, reach
 from workbench.structure.modes import Modes, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
@@ -85,8 +85,8 @@ class Placement(Printed):
         return line, ("actuator", "at" if named else "x [m]" if self.positions.ndim == 1 else "x, y [m]"), rows, remarks
 
 
-@dataclass(frozen=True, eq=False)
-class PlacementTask:
+@dataclass(frozen=True, eq=False, repr=False)
+class PlacementTask(Printed):
     """The task; n modes controlled by as many actuators.
 
     Attributes:
@@ -114,6 +114,11 @@ class PlacementTask:
     envelope: np.ndarray
     weight: np.ndarray
     actuator: Actuator
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        modes = self.modes
+        line = f"{self.n_controlled} of {modes.n_modes} modes controlled by as many actuators, on {modes.domain}"
+        return line, (), (), ()
 
     def shapes(self, positions: Any, derivative: int = 0) -> np.ndarray:
         """Participation (..., n_modes) of an actuator at places: (...) m, (..., 2) m or (...) names.
@@ -322,11 +327,6 @@ def patch_of(rig: Rig) -> Actuator | None:
 def extent(actuator: Actuator) -> float:
     """Length of an actuator along an interval, m: from the first to the second of two places, else 0."""
     return float(actuator.at.first - actuator.at.second) if isinstance(actuator.at, Between) else 0.0  # type: ignore
-
-
-def listed(places: np.ndarray) -> list[Place]:
-    """An array of places as a list: floats, pairs of floats, or names."""
-    return [tuple(place) if isinstance(place, list) else place for place in places.tolist()]
 
 
 def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative: int = 0) -> Floats:

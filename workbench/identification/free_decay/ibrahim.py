@@ -249,7 +249,7 @@ def stable_modes(
     modes = SampledModes(
         np.array([m.omega[r] for m, r in best]),
         np.array([m.zeta[r] for m, r in best]),
-        np.array([m.shapes[:, r] for m, r in best]).reshape(len(best), positions.size).T,
+        np.array([m.shapes[:, r] for m, r in best]).reshape(len(best), len(positions)).T,
         positions,
     )
     spread = np.array([np.std([m.omega[r] for m, r in g]) for g in stayed]) / np.maximum(modes.omega, 1e-300)

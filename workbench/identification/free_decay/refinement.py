@@ -96,6 +96,11 @@ class OfRefined(ModalEstimates):
         """(2 n_modes, 2 n_modes) of (ω, ζ)."""
         return self.refined.covariance
 
+    @property
+    def shape_covariance(self) -> np.ndarray:
+        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
+        return self.refined.shape_covariance
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identified(OfRefined):

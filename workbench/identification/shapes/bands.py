@@ -34,17 +34,18 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import ndtri
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.shapes.eigenfunctions import (
     KnownEnds,
     Spline,
     Splines,
+    check_along,
     inertia_of,
     interpolating_spline,
     mass_matrix,
 )
-from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
 from workbench.structure.modes import frozen
+from workbench.structure.printed import Printed, counted
 from workbench.structure.profile import ProfileLike
 from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
@@ -140,18 +141,19 @@ def _power(x: np.ndarray, u: np.ndarray, order: int, derivative: int = 0) -> np.
     return np.where(apart > 0, np.abs(apart) ** k / factorial(k), 0.0)
 
 
-def check_ends(refined: Refined, ends: KnownEnds, *, length: float) -> None:
+def check_ends(found: ShapeEstimates, ends: KnownEnds, *, length: float) -> None:
     """Refuse an end that the shapes contradict; of fewer than five sensors or so none is.
 
     Args:
-        refined: shapes at placed sensors, with their covariance.
+        found: shapes at placed sensors, with their covariance.
         ends: as stated.
         length: m.
 
     Raises:
         ValueError: a boundary condition that the shapes contradict.
     """
-    values, positions = normalised_shapes(refined.modes.shapes).real, refined.modes.positions
+    check_along(found.modes)
+    values, positions = normalised_shapes(found.modes.shapes).real, found.modes.positions
     for name, at in (("left", 0.0), ("right", length)):
         conditions = [d for x, d in ends.zeros if abs(x - at) <= 1e-9 * length]
         others = KnownEnds(tuple(zero for zero in ends.zeros if abs(zero[0] - at) > 1e-9 * length))
@@ -160,7 +162,7 @@ def check_ends(refined: Refined, ends: KnownEnds, *, length: float) -> None:
             continue
         rows, error, leave_one_out = extrapolated
         away, std, against = np.zeros((3, values.shape[1], len(conditions)))
-        for r, (v, noise) in enumerate(zip(values.T, refined.shape_covariance, strict=True)):
+        for r, (v, noise) in enumerate(zip(values.T, found.shape_covariance, strict=True)):
             covariance = rows @ noise @ rows.T + leave_one_out.roughest(v, noise) * error @ error.T
             known = np.linalg.inv(covariance + OF_ITS_OWN * np.diag(np.diag(covariance)))
             # Each conditional on the others.
@@ -200,12 +202,12 @@ def _extrapolated(
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class Bands:
-    """Eigenfunctions along a structure, with their uncertainty by noise and by too few sensors.
+@dataclass(frozen=True, eq=False, repr=False)
+class Bands(Printed):
+    """Eigenfunctions along a structure or over a plate, with their uncertainty by noise and by too few sensors.
 
     Attributes:
-        x: (n_points,) places, m.
+        x: (n_points,) or (n_points, 2) places, m.
         phi: (n_points, n_modes) eigenfunctions, scaled as `eigenfunctions` does.
         std: (n_points, n_modes) standard error at each place.
         interpolation_std: (n_points, n_modes) the part of it by interpolation error; 0 where the sensors predict each
@@ -220,6 +222,18 @@ class Bands:
     interpolation_std: np.ndarray
     width: np.ndarray
     level: float
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        largest = np.abs(self.phi).max(axis=0)
+        rows = [
+            (str(r + 1), f"{100 * std:.2g}", f"{100 * part:.2g}", f"{width:.2f}")
+            for r, (std, part, width) in enumerate(
+                zip(self.std.max(axis=0) / largest, self.interpolation_std.max(axis=0) / largest, self.width)
+            )
+        ]
+        headings = ("mode", "standard error [% of largest]", "of it by interpolation", "half width [standard errors]")
+        line = f"bands of {counted(len(rows), 'eigenfunction')} at {counted(len(self.x), 'place')}, {self.level:.0%}"
+        return line, headings, rows, ()
 
     @property
     def missed(self) -> np.ndarray:
@@ -241,7 +255,7 @@ class Bands:
 
 @one_blas_thread
 def eigenfunction_bands(
-    refined: Refined,
+    found: ShapeEstimates,
     x: Sequence[float] | np.ndarray,
     *,
     length: float,
@@ -259,7 +273,7 @@ def eigenfunction_bands(
     with more sensors there; the eigenfunctions of `choose_structure(...).structure` know what is attached.
 
     Args:
-        refined: from `refine` or `identify(...).refined`, at placed sensors.
+        found: modes and the covariance of their shapes, such as `ring_down` gives, at placed sensors.
         x: (n_points,) m.
         length, mass_per_length, point_masses, ends, degree: as `eigenfunctions` takes them.
         level: between 0 and 1.
@@ -277,8 +291,8 @@ def eigenfunction_bands(
         outside = x[~((x >= -slack) & (x <= length + slack))][0]
         raise ValueError(f"x = {outside:g} lies outside the structure, 0 to {length:g}")
     if ends is not None:
-        check_ends(refined, ends, length=length)
-    modes, rng = refined.modes, np.random.default_rng(seed)
+        check_ends(found, ends, length=length)
+    modes, rng = found.modes, np.random.default_rng(seed)
     where: dict[str, Any] = {"length": length, "ends": ends or KnownEnds()}
     splines = Splines.through(modes, degree=degree, **where)
     inertia = inertia_of(mass_per_length, point_masses, length)
@@ -293,9 +307,9 @@ def eigenfunction_bands(
             q = v @ mass @ v
             phi[:, r] = along @ v / np.sqrt(q)
             jacobian = along / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
-            strengths, directions = np.linalg.eigh(refined.shape_covariance[r])
+            strengths, directions = np.linalg.eigh(found.shape_covariance[r])
             root = jacobian @ (directions * np.sqrt(np.maximum(strengths, 0.0)))
-            roughness = leave_one_out.roughness(v, refined.shape_covariance[r])
+            roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:
                 error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)
                 for y, weights, derivative in inertia.weighted(spline, length):

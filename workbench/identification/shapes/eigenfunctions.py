@@ -201,6 +201,7 @@ def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = Know
         length: m.
         ends: what is known there.
     """
+    check_along(sampled)
     values = normalised_shapes(sampled.shapes).real
     order = np.argsort(sampled.positions)
     errors, degrees = [], []
@@ -208,7 +209,7 @@ def best_degrees(sampled: SampledModes, *, length: float, ends: KnownEnds = Know
         squares = np.zeros(sampled.n_modes)
         try:
             for j in order[1:-1]:
-                others = np.arange(sampled.positions.size) != j
+                others = np.arange(sampled.n_outputs) != j
                 spline = interpolating_spline(sampled.positions[others], length=length, ends=ends, degree=degree)
                 squares += (spline.matrix(sampled.positions[j])[0] @ values[others] - values[j]) ** 2
         except ValueError:
@@ -228,6 +229,7 @@ class Splines:
 
     @classmethod
     def through(cls, sampled: SampledModes, *, length: float, ends: KnownEnds, degree: int | None) -> "Splines":
+        check_along(sampled)
         where: dict[str, Any] = {"length": length, "ends": ends}
         degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
         return cls(
@@ -292,11 +294,24 @@ def quadrature(knots: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
     return x.ravel(), (0.5 * h[:, None] * weights).ravel()
 
 
+def check_along(sampled: SampledModes) -> None:
+    """Refuse sensors that are not all placed along an interval.
+
+    Raises:
+        ValueError: a sensor without a place, or with one of another kind.
+    """
+    if sampled.unplaced.any():
+        raise ValueError(f"sensor {int(np.argmax(sampled.unplaced))} has no place; give its channel `at`")
+    if not sampled.is_along:
+        raise ValueError(
+            "the sensors have no places along a bar or beam; on a plate take `surface_eigenfunctions`, at named points"
+            " `rig_from`"
+        )
+
+
 def _check_places(positions: np.ndarray, length: float, degree: int) -> None:
     if degree < 1 or degree % 2 == 0:
         raise ValueError(f"a spline through sensors has an odd degree; got {degree}")
-    if not np.isfinite(positions).all():
-        raise ValueError(f"sensor {int(np.argmax(~np.isfinite(positions)))} has no place; give its channel `at`")
     slack = 1e-9 * length
     outside = (positions < -slack) | (positions > length + slack)
     if outside.any():

@@ -61,11 +61,19 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     that they span.
 
     Args:
-        measured: shapes at placed sensors.
+        measured: shapes at placed sensors, their places those of the model's domain.
         model: computed modes of the structure it should be; its frequencies count by their ratios only.
         shape: least MAC of a match.
         frequency: largest relative difference from the median ratio.
+
+    Raises:
+        ValueError: a sensor without a place, or at one that the model does not have.
     """
+    if measured.unplaced.any():
+        raise ValueError(
+            f"sensor {int(np.argmax(measured.unplaced))} has no place, so no shape of the model can be compared; give"
+            " its channel `at`"
+        )
     agreement = subspace_mac(measured.shapes, model.phi(measured.positions), model.omega)
     rows, columns = linear_sum_assignment(-np.where(agreement >= shape, agreement, 0.0))
     good = agreement[rows, columns] >= shape

@@ -12,12 +12,13 @@ from functools import cached_property
 from math import factorial
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import null_space
 from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from workbench.identification.shapes.bands import DRAWS, HELD, Bands
-from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import FieldLike, as_field
@@ -71,8 +72,8 @@ class SurfaceSpline:
     Attributes:
         domain: the rectangle, m.
         places: (n_places, 2) of the values, m.
-        edges: "simply supported", "clamped", "free" or "guided", left, right, bottom and top: where they hold the
-            function or its slope at zero; of a side that is left out nothing is known.
+        edges: "simply supported", "clamped", "free" or "guided": one for all, or a mapping of left, right, bottom and
+            top. They hold the function or its slope at zero; of a side that is left out nothing is known.
 
     Raises:
         ValueError: fewer values and held points than the ten of a cubic, two places that are one, a place outside.
@@ -80,9 +81,12 @@ class SurfaceSpline:
 
     domain: Rectangle
     places: np.ndarray
-    edges: Mapping[str, str] = field(default_factory=dict)
+    edges: str | Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if isinstance(self.edges, str):
+            object.__setattr__(self, "edges", dict.fromkeys(SIDES, self.edges))
+        assert isinstance(self.edges, Mapping)
         object.__setattr__(self, "places", frozen(self.domain.locate(self.places)))
         for side, edge in self.edges.items():
             if side not in SIDES or edge not in HELD_BY:
@@ -104,6 +108,7 @@ class SurfaceSpline:
         """Points along the edges, and the derivative that is zero there."""
         a, b = self.domain.length
         found: list[Functional] = []
+        assert isinstance(self.edges, Mapping)
         for side, edge in self.edges.items():
             i = SIDES.index(side)
             along, across = (np.arange(PER_EDGE) + 0.5) / PER_EDGE, np.full(PER_EDGE, float(i % 2))
@@ -186,18 +191,16 @@ class SurfaceSpline:
 @one_blas_thread
 def surface_eigenfunctions(
     sampled: SampledModes,
-    places: np.ndarray,
     *,
     length: tuple[float, float],
     mass_per_area: FieldLike | None = None,
-    edges: Mapping[str, str] | None = None,
+    edges: str | Mapping[str, str] | None = None,
     covariance: np.ndarray | None = None,
 ) -> Modes:
     """`Modes` over a rectangle from shapes at scattered sensors: real parts, interpolated, with ∫∫ m φ_r² dx dy = 1.
 
     Args:
-        sampled: shapes of displacement, (n_outputs, n_modes).
-        places: (n_outputs, 2) of the sensors, m.
+        sampled: shapes of displacement, (n_outputs, n_modes), at sensors with places (x, y).
         length: (a, b), m.
         mass_per_area: kg/m², where known; without it the mean square of φ_r is 1.
         edges: what the edges hold, by side, as `SurfaceSpline` takes them.
@@ -206,9 +209,9 @@ def surface_eigenfunctions(
     How far off the shapes may be between the sensors says `surface_bands`.
 
     Raises:
-        ValueError: as `SurfaceSpline`; places of another number than the outputs.
+        ValueError: as `SurfaceSpline`; a sensor without a place, or with one of another kind.
     """
-    spline, values = _scaled(sampled, places, length, mass_per_area, edges)
+    spline, values = _scaled(sampled, length, mass_per_area, edges)
     return Modes(
         omega=sampled.omega,
         damping=sampled.zeta,
@@ -220,14 +223,12 @@ def surface_eigenfunctions(
 
 @one_blas_thread
 def surface_bands(
-    sampled: SampledModes,
-    places: np.ndarray,
-    at: np.ndarray,
+    found: ShapeEstimates,
+    at: ArrayLike,
     *,
-    shape_covariance: np.ndarray,
     length: tuple[float, float],
     mass_per_area: FieldLike | None = None,
-    edges: Mapping[str, str] | None = None,
+    edges: str | Mapping[str, str] | None = None,
     level: float = 0.95,
     seed: int | np.random.Generator = 0,
 ) -> Bands:
@@ -237,8 +238,9 @@ def surface_bands(
     W dv / √q + e / √q - φ [vᵀ M dv + ∫∫ m W v e dA] / q, as along an interval (`eigenfunction_bands`).
 
     Args:
-        sampled, places, length, mass_per_area, edges: as `surface_eigenfunctions` takes them.
-        shape_covariance: (n_modes, n_outputs, n_outputs) of the real parts of the shapes.
+        found: modes and the covariance of their shapes, such as `identify_driven` gives, at sensors with places (x, y).
+        at: (n_points, 2) m.
+        length, mass_per_area, edges: as `surface_eigenfunctions` takes them.
         level: between 0 and 1.
         seed: of the draws that set the width of the band of the whole surface.
 
@@ -247,7 +249,8 @@ def surface_bands(
     """
     if not 0.0 < level < 1.0:
         raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
-    spline, scaled = _scaled(sampled, places, length, mass_per_area, edges)
+    sampled = found.modes
+    spline, scaled = _scaled(sampled, length, mass_per_area, edges)
     at, rng = spline.domain.locate(at), np.random.default_rng(seed)
     x, weights = _weighted(spline.domain, mass_per_area)
     along, inside = spline.matrix(at), spline.matrix(x)
@@ -257,7 +260,7 @@ def surface_bands(
     values = normalised_shapes(sampled.shapes).real
     for r in range(sampled.n_modes):
         factor = scaled[:, r] @ values[:, r] / (values[:, r] @ values[:, r])  # 1 / √q
-        own = shape_covariance[r] * factor**2
+        own = found.shape_covariance[r] * factor**2
         phi[:, r] = along @ scaled[:, r]
         weighing = (weights * (inside @ scaled[:, r])) @ inside
         noise = (along - np.outer(phi[:, r], weighing)) @ _root(own)
@@ -276,17 +279,16 @@ def surface_bands(
 
 def _scaled(
     sampled: SampledModes,
-    places: np.ndarray,
     length: tuple[float, float],
     mass_per_area: FieldLike | None,
-    edges: Mapping[str, str] | None,
+    edges: str | Mapping[str, str] | None,
 ) -> tuple[SurfaceSpline, np.ndarray]:
     """The spline, and values (n_outputs, n_modes) at the sensors that it makes mass-normalised shapes of."""
-    if np.shape(places) != (sampled.shapes.shape[0], 2):
-        raise ValueError(
-            f"places of the sensors must have shape ({sampled.shapes.shape[0]}, 2), m; got {np.shape(places)}"
-        )
-    spline = SurfaceSpline(Rectangle(length), np.asarray(places, float), edges or {})
+    if sampled.unplaced.any():
+        raise ValueError(f"sensor {int(np.argmax(sampled.unplaced))} has no place; give its channel `at`, (x, y) in m")
+    if sampled.positions.ndim != 2:
+        raise ValueError("eigenfunctions over a rectangle take sensors with places (x, y), m; give their channels `at`")
+    spline = SurfaceSpline(Rectangle(length), sampled.positions, edges or {})
     values = normalised_shapes(sampled.shapes).real
     x, weights = _weighted(spline.domain, mass_per_area)
     return spline, frozen(values / np.sqrt(weights @ (spline.matrix(x) @ values) ** 2))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from html import escape
+from typing import Protocol
 
 import numpy as np
 from scipy.special import ndtri
@@ -14,6 +15,21 @@ from workbench.structure.modes import SampledModes
 # Standard errors below zero from which on a damping ratio is negative.
 SURE = 3.0
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
+
+
+class ShapeEstimates(Protocol):
+    """Modes whose shapes have a covariance: of `refine`, `ring_down`, `identify`, `identify_driven`,
+    `identify_transfer`.
+
+    `shape_covariance` is (n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of
+    each.
+    """
+
+    @property
+    def modes(self) -> SampledModes: ...
+
+    @property
+    def shape_covariance(self) -> np.ndarray: ...
 
 
 class ModalEstimates:

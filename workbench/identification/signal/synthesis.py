@@ -6,11 +6,12 @@ import numpy as np
 
 from workbench.records.record import Channel, Record
 from workbench.rig.sensors import MEASURED
+from workbench.structure.domain import Place, listed, place_array, same_place
 from workbench.structure.modes import Modes, SampledModes
 
 
 def impulse_response_modes(
-    modes: Modes, *, at: float, positions: Sequence[float], impulse: float = 1.0
+    modes: Modes, *, at: Place, positions: Sequence[Place], impulse: float = 1.0
 ) -> SampledModes:
     """The free decay after an impulse, as sampled modes whose shapes carry amplitude and phase.
 
@@ -19,8 +20,8 @@ def impulse_response_modes(
 
     Args:
         modes: with proportional damping below critical.
-        at: x0, m.
-        positions: (n_outputs,) places of the sensors, m.
+        at: x0, m, or another place of the domain.
+        positions: (n_outputs,) places of the sensors.
         impulse: J, N s.
 
     Raises:
@@ -32,8 +33,8 @@ def impulse_response_modes(
             " select such modes, or simulate the rig"
         )
     omega_d = modes.omega * np.sqrt(1.0 - modes.zeta**2)
-    shapes = -1j * impulse * modes.phi(positions) * modes.phi(at)[0] / omega_d
-    return SampledModes(modes.omega, modes.zeta, shapes, np.asarray(positions, float))
+    shapes = -1j * impulse * modes.phi(list(positions)) * modes.phi(at)[0] / omega_d
+    return SampledModes(modes.omega, modes.zeta, shapes, place_array([same_place(x) for x in positions]))
 
 
 def free_decay(
@@ -77,6 +78,7 @@ def free_decay(
     if noise_std:
         outputs = outputs + noise_std * np.random.default_rng(seed).standard_normal(outputs.shape)
     channels = tuple(
-        Channel(f"y{j + 1}", quantity, at=None if np.isnan(x) else float(x)) for j, x in enumerate(modes.positions)
+        Channel(f"y{j + 1}", quantity, at=None if unknown else at)
+        for j, (at, unknown) in enumerate(zip(listed(modes.positions), modes.unplaced))
     )
     return Record(sample_time, outputs, channels, start_time=start_time, name="free decay")

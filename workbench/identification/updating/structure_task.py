@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.shapes.eigenfunctions import check_along
 from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.self_check import SelfCheck
@@ -78,10 +79,8 @@ class Task:
         numbers: Sequence[int] | None = None,
     ) -> "Task":
         modes = measured.modes
-        if not np.isfinite(modes.positions).all():
-            lost = int(np.argmax(~np.isfinite(modes.positions)))
-            raise ValueError(f"sensor {lost} has no place; give its channel `at`")
-        n, m = modes.n_modes, modes.positions.size
+        check_along(modes)
+        n, m = modes.n_modes, modes.n_outputs
         if m < 2:
             raise ValueError("one sensor shows no shape; use two or more")
         # The entry that a shape is measured by has no error of its own.

@@ -177,8 +177,12 @@ def check_plate(
         poisson_ratio, edges: of the plate.
         first_mode: index of the first measured mode among all modes of the plate; 3 leaves out rigid-body modes.
         tolerance: of the frequencies of the eigenproblem.
+
+    Raises:
+        ValueError: modes of another domain.
     """
-    assert isinstance(measured.domain, Rectangle)
+    if not isinstance(measured.domain, Rectangle):
+        raise ValueError(f"m(x, y) and D(x, y) are those of a plate; these modes are on {measured.domain}")
     n = measured.n_modes
     try:
         plate = Plate(
