@@ -181,9 +181,11 @@ def plot_surface_placement(
     _bare(left, modes)
     left.set_title(f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, and its nodal lines", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
-    most = max(float(placement.by_mode.max()) for placement in placements.values())
+    work = np.concatenate([placement.by_mode for placement in placements.values()])
+    most, least = float(work.max()), float(work.min())
     right.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers, yscale="log")
-    right.set_ylim(SHOWN_WORK * most, 3.0 * most)  # a mode at whose nodes they stand takes none but rounding
+    # a mode at whose nodes they stand takes none but rounding
+    right.set_ylim(max(SHOWN_WORK * most, 0.3 * least), 3.0 * most)
     return figure
 
 
