@@ -7,7 +7,7 @@ import threading
 import time
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
@@ -404,6 +404,64 @@ def test_actuators_are_dragged_from_point_to_point_of_a_frame(frame, opened, unt
         ActionChains(browser).send_keys(Keys.ARROW_RIGHT).perform()
         until(lambda: first.get_attribute("aria-valuetext") == "r.y")
         assert [entry for entry in browser.get_log("browser") if "422" not in entry["message"]] == []
+
+
+@pytest.fixture
+def apart(look, until, tmp_path):
+    """Handles, their labels, ticks and the key cover nothing of each other; axes have two ticks at least."""
+
+    def checked(rig, text, width, scheme):
+        with serving(rig, text, tmp_path / "studies") as port:
+            browser = look(f"http://127.0.0.1:{port}/", width, scheme)
+            until(lambda: browser.find_elements("css selector", "#work .marks rect"))
+            for what in ("actuators", "sensors", "sensors"):
+                browser.find_element("css selector", f"[aria-label='add to {what}']").click()
+            until(lambda: len(browser.find_elements("css selector", ".handle")) == len(start(rig).actuators) + 4)
+            until(lambda: min(browser.execute_script(BOXES)["ticks"]) >= 2)
+            found = browser.execute_script(BOXES)
+        for one, other in combinations(found["boxes"], 2):
+            x = min(one["right"], other["right"]) - max(one["left"], other["left"])
+            y = min(one["bottom"], other["bottom"]) - max(one["top"], other["top"])
+            assert x < 1 or y < 1, (one, other)
+        assert len(found["boxes"]) > 12
+
+    return checked
+
+
+SCREENS = [(390, "light"), (390, "dark"), (1400, "light"), (1400, "dark")]
+
+
+@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+def test_nothing_covers_anything_else_beside_a_beam(width, scheme, apart):
+    apart(RIG, TEXT, width, scheme)
+
+
+@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+def test_nothing_covers_anything_else_on_a_plate(width, scheme, apart, plate):
+    apart(*plate, width, scheme)
+
+
+@pytest.mark.parametrize(("width", "scheme"), SCREENS)
+def test_nothing_covers_anything_else_on_a_frame(width, scheme, apart, frame):
+    apart(*frame, width, scheme)
+
+
+BOXES = """
+var boxes = [], add = function (what) {
+  return function (e) {
+    var b = e.getBoundingClientRect(), box = { left: b.left, right: b.right, top: b.top, bottom: b.bottom };
+    if (b.width) boxes.push(Object.assign({ what: what, text: e.textContent }, box));
+  };
+};
+document.querySelectorAll(".handle > path").forEach(add("mark"));
+document.querySelectorAll(".stand text").forEach(add("text"));
+document.querySelectorAll(".key > span").forEach(add("key"));
+document.querySelectorAll(".figures text").forEach(add("axis"));
+var ticks = Array.from(document.querySelectorAll(".figures svg")).map(function (s) {
+  return Array.from(s.querySelectorAll("text[text-anchor=end]")).length;
+});
+return { boxes: boxes, ticks: ticks };
+"""
 
 
 def test_points_without_positions_cannot_be_drawn(tmp_path):

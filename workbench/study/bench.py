@@ -22,10 +22,10 @@ from workbench.study.trying import asked, setting, shown
 HERE = "127.0.0.1"
 DRAG = "Drag a triangle (actuator), a circle (sensor) or the hammer; the arrow keys move them too."
 SEEN = {
-    Interval: f"{DRAG} Grey: without control.",
-    Rectangle: f"{DRAG} Red is up, blue is down.",
-    NamedPoints: "Drag a triangle (actuator) or the hammer from point to point; the arrow keys move them too. Grey:"
-    " without control.",
+    Interval: DRAG,
+    Rectangle: DRAG,
+    NamedPoints: "Drag a triangle (actuator), a circle (sensor) or the hammer from point to point; the arrow keys move"
+    " them too.",
 }
 MOST_BYTES = 65536
 CLIENT_SECONDS = 10.0  # in which a request must come whole, or the client is dropped

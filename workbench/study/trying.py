@@ -29,7 +29,7 @@ MOST_PORTS = 40
 LARGEST = 1e100
 N_TIMES, N_FRAMES, N_PLACES, N_CELLS = 2001, 251, 121, 44
 USUAL_WEIGHT, FIRMNESS = 20.0, 25.0
-BESIDE = 0.03  # of the frame: how far from its node a point is drawn, in its direction
+SLENDER = 0.03  # least share of a frame's larger side that the other one is drawn with
 ON_AXIS = 1e-9  # damping ratio below which a pole stands on the imaginary axis
 MOST_GROWTH = 100.0  # e-folds until the final time that are still shown
 
@@ -266,14 +266,14 @@ def _points(rig: Rig, domain: NamedPoints) -> dict[str, Any]:
     corner, size = net.rest.min(axis=0), float(np.ptp(net.rest, axis=0).max())
     names = domain.grid()
     # points of one node are drawn beside it, each in its own direction
-    beside = {"": (0.0, 0.0), "x": (1.0, 0.0), "y": (0.0, 1.0), "z": (0.6, 0.6)}
-    at = [net.at(n) + BESIDE * size * np.array(beside[domain.directions[domain.locate(n)[0]]]) for n in names]
+    ways = {"": (0.0, 0.0), "x": (1.0, 0.0), "y": (0.0, 1.0), "z": (0.6, 0.6)}
     moves = np.asarray(net.moves(rig.modes))
     return {
-        "length": _plain(np.maximum(np.ptp(net.rest, axis=0), BESIDE * size)),
+        "length": _plain(np.maximum(np.ptp(net.rest, axis=0), SLENDER * size)),
         "points": {
             "names": names,
-            "spots": _plain(np.array(at) - corner),
+            "spots": _plain(np.array([net.at(name) for name in names]) - corner),
+            "ways": [ways[domain.directions[domain.locate(name)[0]]] for name in names],
             "rest": _plain(net.rest - corner),
             "lines": net.lines,
         },

@@ -32,6 +32,21 @@
       .then(function () { busy = false; if (waiting) ask(); });
   }
 
+  // what the marks stand for
+  var TRIANGLE = "M0,-10L8,6H-8Z", RING = "M0,-6A6,6 0 1 1 -0.01,-6Z", HAMMER = "M-9,-6H9V3H2V12H-2V3H-9Z";
+  (function () {
+    var box = document.querySelector(".key"), LINE = "M-11,0H11", BLOCK = "M-9,-6H9V6H-9Z", thin = { fill: "none", stroke: "var(--soft)", "stroke-width": 1.4 };
+    var marks = [[TRIANGLE, { fill: "var(--bad)" }, "actuator"], [RING, { fill: "var(--paper)", stroke: "var(--ink)", "stroke-width": 1.5 }, "sensor"], [HAMMER, { fill: "var(--ink)" }, "impulse"]];
+    if (frame) marks.push(["M0,-3A3,3 0 1 1 -0.01,-3Z", { fill: "var(--soft)" }, "point, beside its node in its direction"]);
+    if (plate) marks.push([BLOCK, { fill: "rgb(202,0,32)" }, "up"], [BLOCK, { fill: "rgb(5,113,176)" }, "down"]);
+    else marks.push([LINE, { fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, "controlled" + (frame ? ", neighbouring nodes joined" : "")], [LINE, thin, "without control"]);
+    marks.forEach(function (mark) {
+      var entry = html("span", {}, box);
+      svg("path", Object.assign({ d: mark[0] }, mark[1]), svg("svg", { viewBox: "-12 -12 24 24", "aria-hidden": "true" }, entry));
+      entry.appendChild(document.createTextNode(mark[2]));
+    });
+  })();
+
   // numbers
   var cards = {};
   [["residual", "W_R, spillover work"], ["effort", "effort ∫ FᵀF dt"], ["peak_force", "largest force"], ["stable", "closed loop"]].forEach(function (card) {
@@ -72,7 +87,7 @@
     [["−", -1], ["+", 1]].forEach(function (way) {
       html("button", { type: "button", "aria-label": (way[1] > 0 ? "add to " : "take from ") + kind }, label, way[0]).addEventListener("click", function () {
         if (way[1] < 0 && design[kind].length > (kind === "actuators" ? 1 : 0)) design[kind].pop();
-        if (way[1] > 0 && design[kind].length < setting.most) design[kind].push(gap(design[kind]));
+        if (way[1] > 0 && design[kind].length < setting.most) design[kind].push(gap(flat ? design.actuators.concat(design.sensors, [design.impulse_at]) : design[kind]));
         reading.textContent = design[kind].length;
         handles();
         ask();
@@ -94,10 +109,13 @@
     for (var i = 1; i < all.length - 1; i++) if (all[i + 1] - all[i] > all[best + 1] - all[best]) best = i;
     return 0.5 * (all[best] + all[best + 1]);
   }
-  // where a named point is taken hold of, and the point nearest to a spot
-  function spotOf(name) { return frame.spots[frame.names.indexOf(name)]; }
+  // where a named point is taken hold of, beside its node in its direction, and the point nearest to a spot, px
+  function spotOf(name) {
+    var i = frame.names.indexOf(name), p = frame.spots[i], way = frame.ways[i];
+    return [X(p[0]) + frame.apart * way[0], Y(p[1]) - frame.apart * way[1]];
+  }
   function nearest(p) {
-    var far = frame.spots.map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); });
+    var far = frame.names.map(spotOf).map(function (q) { return Math.hypot(p[0] - q[0], p[1] - q[1]); });
     return frame.names[far.indexOf(Math.min.apply(null, far))];
   }
   function weights() {
@@ -118,7 +136,7 @@
   }
 
   // the structure with what stands on it: a line seen from the side, or a plate seen from above
-  var X, Y, line, still, free, beamY, reach = 1, INSET = 0.3;
+  var X, Y, line, still, free, beamY, reach = 1, INSET = 0.3, BESIDE_NODE = 18;
   function layout() {
     var width = stand.clientWidth;
     if (!width) return;
@@ -131,7 +149,7 @@
     animate();
   }
   function aside(width) {
-    var height = Math.max(210, Math.min(300, 0.4 * width));
+    var height = Math.max(224, Math.min(314, 0.4 * width));
     beamY = 0.42 * height;
     X = workbench.scale([0, setting.length], false, 18, width - 18);
     svg("line", { x1: X(0), x2: X(setting.length), y1: beamY, y2: beamY, stroke: "var(--line)", "stroke-width": 2 }, stand);
@@ -151,9 +169,18 @@
     X = workbench.scale([0, sides[0]], false, left, left + w);
     Y = workbench.scale([0, sides[1]], false, pad + h, pad);
     frame.sway = 0.07 * Math.max(w, h);
+    var near = Infinity;  // the shortest way from one node to the next, px
+    frame.lines.forEach(function (ends) {
+      var a = frame.rest[ends[0]], b = frame.rest[ends[1]];
+      near = Math.min(near, scale * Math.hypot(a[0] - b[0], a[1] - b[1]));
+    });
+    frame.apart = Math.max(6, Math.min(BESIDE_NODE, 0.45 * near));
     still = svg("path", { fill: "none", stroke: "var(--soft)", "stroke-width": 1.2, opacity: 0.6 }, stand);
     line = svg("path", { class: "track", fill: "none", stroke: "#0072B2", "stroke-width": 2.6 }, stand);
-    frame.spots.forEach(function (p, i) { svg("title", {}, svg("circle", { cx: X(p[0]), cy: Y(p[1]), r: 2, fill: "var(--soft)" }, stand), frame.names[i]); });
+    frame.names.forEach(function (name) {
+      var p = spotOf(name);
+      svg("title", {}, svg("circle", { cx: p[0], cy: p[1], r: 2.4, fill: "var(--soft)" }, stand), name);
+    });
     return h + 2 * pad;
   }
   function joined(values) {
@@ -195,12 +222,54 @@
     paint.putImageData(spots, 0, 0);
     return canvas.toDataURL();
   }
+  // beside each handle its place, where it covers no other one, no other label and no member at rest
+  var tags = [], BESIDE = [[13, 4, "start"], [-13, 4, "end"], [0, 24, "middle"], [0, -15, "middle"], [12, 19, "start"], [-12, 19, "end"], [12, -10, "start"], [-12, -10, "end"]];
+  function boxOf(spot, way, width) {
+    var x = spot[0] + way[0] - (way[2] === "middle" ? width / 2 : way[2] === "end" ? width : 0), y = spot[1] + way[1];
+    return [x - 1, y - 11, x + width + 1, y + 3];
+  }
+  function shared(a, b) { return Math.max(0, Math.min(a[2], b[2]) - Math.max(a[0], b[0])) * Math.max(0, Math.min(a[3], b[3]) - Math.max(a[1], b[1])); }
+  // how much of a segment lies in a box (Liang and Barsky 1984)
+  function inside(box, s) {
+    var t = [0, 1], d = [s[2] - s[0], s[3] - s[1]];
+    for (var k = 0; k < 2; k++) {
+      if (!d[k] && (s[k] < box[k] || s[k] > box[k + 2])) return 0;
+      if (!d[k]) continue;
+      var a = (box[k] - s[k]) / d[k], b = (box[k + 2] - s[k]) / d[k];
+      t = [Math.max(t[0], Math.min(a, b)), Math.min(t[1], Math.max(a, b))];
+    }
+    return Math.max(0, t[1] - t[0]) * Math.hypot(d[0], d[1]);
+  }
+  function settle() {
+    var width = stand.viewBox.baseVal.width, height = stand.viewBox.baseVal.height, members = [];
+    if (frame) members = frame.lines.map(function (ends) { return [].concat.apply([], ends.map(function (i) { return [X(frame.rest[i][0]), Y(frame.rest[i][1])]; })); });
+    if (plate) members = [[0, 0, 1, 0], [1, 0, 1, 1], [1, 1, 0, 1], [0, 1, 0, 0]].map(function (s) { return [X(s[0] * sides[0]), Y(s[1] * sides[1]), X(s[2] * sides[0]), Y(s[3] * sides[1])]; });
+    var taken = tags.map(function (tag) { var s = tag.spot; return [s[0] - 9, s[1] - 10, s[0] + 9, s[1] + 12]; });
+    if (!flat) taken.push([0, beamY - 2, width, beamY + 2]);
+    stand.querySelectorAll(":scope > text").forEach(function (text) { var b = text.getBBox(); taken.push([b.x, b.y, b.x + b.width, b.y + b.height]); });
+    tags.forEach(function (tag, own) {
+      var best = null, long = tag.label.getComputedTextLength();
+      tag.ways.forEach(function (way, i) {
+        var box = boxOf(tag.spot, way, long), cost = 0.1 * i;
+        taken.forEach(function (other, k) { if (k !== own) cost += shared(box, other); });
+        members.forEach(function (s) { cost += 4 * inside(box, s); });
+        cost += 50 * (Math.max(0, -box[0]) + Math.max(0, box[2] - width) + Math.max(0, -box[1]) + Math.max(0, box[3] - height));
+        if (!best || cost < best.cost) best = { cost: cost, way: way, box: box };
+      });
+      taken.push(best.box);
+      tag.label.setAttribute("x", best.way[0]);
+      tag.label.setAttribute("y", best.way[1]);
+      tag.label.setAttribute("text-anchor", best.way[2]);
+    });
+  }
   function handles() {
     if (!free) return;
     free.textContent = "";
-    design.actuators.forEach(function (_, i) { handle("actuators", i, stand.viewBox.baseVal.height - 42, "M0,-10L8,6H-8Z", "var(--bad)", "actuator " + (i + 1)); });
-    design.sensors.forEach(function (_, i) { handle("sensors", i, beamY, "M0,-6A6,6 0 1 1 -0.01,-6Z", "var(--paper)", "sensor " + (i + 1)); });
-    handle("impulse_at", null, 20, "M-9,-6H9V3H2V12H-2V3H-9Z", flat ? "var(--ink)" : "var(--soft)", "hammer");
+    tags = [];
+    design.actuators.forEach(function (_, i) { handle("actuators", i, stand.viewBox.baseVal.height - 56, TRIANGLE, "var(--bad)", "actuator " + (i + 1)); });
+    design.sensors.forEach(function (_, i) { handle("sensors", i, beamY, RING, "var(--paper)", "sensor " + (i + 1)); });
+    handle("impulse_at", null, 20, HAMMER, flat ? "var(--ink)" : "var(--soft)", "hammer");
+    settle();
   }
   // a place inside, all of a patch on the structure
   function held(kind, place) {
@@ -212,35 +281,39 @@
     return plate ? inside : inside[0];
   }
   function handle(kind, i, lane, path, fill, name) {
-    var g = svg("g", { class: "handle " + kind, tabindex: 0, role: "slider", "aria-label": name, "aria-valuemin": 0, "aria-valuemax": sides[0] }, free);
+    var g = svg("g", { class: "handle " + kind, tabindex: 0, role: "slider", "aria-label": name, "aria-valuemin": 0, "aria-valuemax": frame ? frame.names.length - 1 : sides[0] }, free);
     if (kind === "actuators" && setting.patch.length) {
       var w = X(setting.patch[0]) - X(0), h = plate ? Y(0) - Y(setting.patch[1]) : 6;
       svg("rect", { x: -w / 2, y: plate ? -h / 2 : 7, width: w, height: h, fill: "var(--bad)", "fill-opacity": 0.18, stroke: "var(--bad)" }, g);
     }
     svg("circle", { class: "halo", r: 20 }, g);
     svg("path", { d: path, fill: fill, stroke: flat && kind !== "sensors" ? "var(--paper)" : "var(--ink)", "stroke-width": kind === "sensors" ? 1.5 : flat ? 1 : 0 }, g);
-    var beside = kind === "impulse_at" && !flat;
-    var label = svg("text", { y: beside ? 5 : 20, x: beside ? 14 : 0, "text-anchor": beside ? "start" : "middle" }, g);
+    // along a member actuators and sensors keep their lane, and their labels stand below in rows
+    var rows = [20, 33].map(function (y) { return [0, y, "middle"]; }), ways = flat ? BESIDE : kind === "impulse_at" ? [[14, 5, "start"], [-14, 5, "end"]] : rows;
+    var tag = { label: svg("text", { class: "tag" }, g), spot: [0, 0], ways: ways };
+    tags.push(tag);
     function at() { return i === null ? design[kind] : design[kind][i]; }
     function put() {
-      var p = frame ? spotOf(at()) : at(), spot = flat ? [X(p[0]), Y(p[1])] : [X(p), lane];
+      var p = at(), spot = frame ? spotOf(p) : plate ? [X(p[0]), Y(p[1])] : [X(p), lane];
       var text = frame ? at() : [].concat(p).map(function (v) { return v.toPrecision(3); }).join(", ");
       g.setAttribute("transform", "translate(" + spot + ")");
-      g.setAttribute("aria-valuenow", [].concat(p)[0]);
+      g.setAttribute("aria-valuenow", frame ? frame.names.indexOf(p) : [].concat(p)[0]);
       if (flat) g.setAttribute("aria-valuetext", text);
-      label.textContent = text;
+      tag.label.textContent = text;
+      tag.spot = spot;
     }
     function move(place) {
       place = held(kind, place);
       if (i === null) design[kind] = place; else design[kind][i] = place;
       put();
+      settle();
       ask();
     }
     g.addEventListener("pointerdown", function (e) { g.setPointerCapture(e.pointerId); g.focus(); e.preventDefault(); g.dragged = true; });
     g.addEventListener("pointermove", function (e) {
       if (!g.dragged) return;
-      var box = stand.getBoundingClientRect(), x = X.back(e.clientX - box.left);
-      move(flat ? [x, Y.back(e.clientY - box.top)] : x);
+      var box = stand.getBoundingClientRect(), p = [e.clientX - box.left, e.clientY - box.top];
+      move(frame ? p : plate ? [X.back(p[0]), Y.back(p[1])] : X.back(p[0]));
     });
     ["pointerup", "pointercancel"].forEach(function (end) { g.addEventListener(end, function () { g.dragged = false; }); });
     g.addEventListener("keydown", function (e) {
@@ -258,7 +331,7 @@
 
   // what is found
   function present() {
-    ["residual", "effort", "peak_force"].forEach(function (name) { cards[name].textContent = answer[name] === null ? "∞" : answer[name].toExponential(3).replace("e+0", "").replace("e-", "e−"); });
+    ["residual", "effort", "peak_force"].forEach(function (name) { cards[name].textContent = figures(answer[name]); });
     var undamped = answer.stable && answer.undamped > 0;
     cards.stable.textContent = undamped ? "undamped" : answer.stable ? "stable" : "unstable";
     cards.stable.nextSibling.textContent = "closed loop; " + (undamped ?
@@ -284,6 +357,11 @@
     var forces = [].concat.apply([], answer.forces), most = 1.1 * Math.max.apply(null, forces.map(Math.abs).concat([1e-300]));
     figure("forces", { x: axis("time [s]", [0, answer.time[answer.time.length - 1]]), y: axis("force", [-most, most]), title: "actuator forces", legend: answer.forces.length > 1,
       marks: answer.forces.map(function (f, i) { var c = curve(answer.time, f, i); c.label = "F" + (i + 1); return c; }) });
+  }
+  // four digits, with a power of ten where there would be many zeros
+  function figures(v) {
+    if (v === null) return "∞";
+    return Math.abs(v) >= 0.01 && Math.abs(v) < 1e5 ? String(parseFloat(v.toPrecision(4))) : v.toExponential(3).replace("e+0", "").replace("e-", "e−");
   }
   function axis(label, limits, log, ticks) { var a = { label: label, limits: limits, log: !!log, group: 0 }; if (ticks) a.ticks = ticks; return a; }
   function curve(x, y, i) { return { kind: "line", x: x, y: y, width: 1.8, dash: "", colour: COLOURS[i % COLOURS.length], alpha: 1, label: "" }; }

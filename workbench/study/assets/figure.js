@@ -42,7 +42,12 @@ var workbench = (function () {
     if (axis.log && high / low > 12) {
       var first = Math.ceil(Math.log10(low) - 1e-9), last = Math.floor(Math.log10(high) + 1e-9);
       var every = Math.max(1, Math.ceil((last - first + 1) / wanted));
-      for (var e = first; e <= last; e += every) found.push([Math.pow(10, e)]);
+      // of few decades their halves and fifths too
+      var parts = every > 1 || last - first >= 2 ? [1] : 3 * Math.log10(high / low) > 1.5 * wanted ? [1, 3] : [1, 2, 5];
+      for (var e = parts.length > 1 ? first - 1 : first; e <= last; e += every) parts.forEach(function (part) {
+        v = part * Math.pow(10, e);
+        if (v >= low * (1 - 1e-9) && v <= high * (1 + 1e-9)) found.push([v]);
+      });
       var plain = low > 9e-5 && high < 1.1e5;  // else powers of ten
       return found.map(function (t) { return [t[0], plain ? String(parseFloat(t[0].toPrecision(3))) : power(t[0])]; });
     }
@@ -53,9 +58,15 @@ var workbench = (function () {
     }
     return found.length < 2 && wanted < 9 ? ticks(axis, limits, wanted + 1) : found;
   }
+  // how long a word of an axis is, px
+  var pen = document.createElement("canvas").getContext("2d");
+  function long(text) {
+    pen.font = "12px " + getComputedStyle(document.body).fontFamily;
+    return pen.measureText(text).width;
+  }
   function power(v) {
-    var e = Math.round(Math.log10(v)), up = "⁰¹²³⁴⁵⁶⁷⁸⁹";
-    return "10" + String(e).split("").map(function (c) { return c === "-" ? "⁻" : up[+c]; }).join("");
+    var e = Math.floor(Math.log10(v) + 1e-9), part = Math.round(v / Math.pow(10, e)), up = "⁰¹²³⁴⁵⁶⁷⁸⁹";
+    return (part > 1 ? part + "·" : "") + "10" + String(e).split("").map(function (c) { return c === "-" ? "⁻" : up[+c]; }).join("");
   }
 
   function draw(root, spec) {
@@ -122,7 +133,7 @@ var workbench = (function () {
       node.setAttribute("viewBox", "0 0 " + width + " " + height);
       node.setAttribute("height", height);
       var bottom = height - (p.x.label ? 38 : 22), yTicks = ticks(p.y, panel.y, Math.max(3, Math.round(bottom / 38)));
-      var longest = Math.max.apply(null, yTicks.map(function (t) { return textWidth(t[1]); }).concat([6.6]));
+      var longest = Math.max.apply(null, yTicks.map(function (t) { return long(t[1]); }).concat([7]));
       var left = Math.min(0.42 * width, 12 + longest) + (p.y.label ? 17 : 0), right = width - 10, top = 8;
       var field = p.marks.filter(function (m) { return m.kind === "field"; })[0];
       if (field) right -= 58;
@@ -142,7 +153,7 @@ var workbench = (function () {
       yTicks.forEach(function (t) {
         svg("line", { class: "grid", x1: left, x2: right, y1: Y(t[0]), y2: Y(t[0]) }, node);
         var name = svg("text", { x: left - 5, y: Y(t[0]) + 4, "text-anchor": "end" }, node, t[1]);
-        if (textWidth(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
+        if (long(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
       });
       if (p.x.label) svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, p.x.label);
       if (p.y.label) fit(svg("text", { class: "axis", x: 0, y: 0, "text-anchor": "middle",
