@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from workbench.rig.actuators import Actuator
+from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.elements import CoulombFriction, CubicSpring
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import actuator_force, move, read, simulate
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import PlaceError
+from workbench.structure.domain import Between, NamedPoints, PlaceError
 from workbench.structure.member import Beam
-from workbench.structure.modes import Modes
+from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.supports import PointDamper
 
 DT = 0.1
@@ -182,3 +182,36 @@ def test_a_rig_is_refused_whose_actuator_or_sensor_stands_outside_the_structure(
         Rig(modes, (Actuator("F", inside),), (Sensor("d", outside),))
     with pytest.raises(PlaceError, match=r"sensor late: x = 10\.5 lies outside the structure, which runs from 0 to 10"):
         rig(sensors=(Sensor("late", 10.5),))
+
+
+def test_a_rig_is_refused_whose_points_or_directions_are_not_there():
+    """When it is made, not when it is simulated: with the names there are, and the one spelled most like it."""
+    positions = np.array([[0, 0, 3], [0, 0, 6], [0, 0, 6], [0, 0, 6]])
+    points = NamedPoints(("S1x", "S2x", "S2y", "S2rz"), positions, ("x", "x", "y", "rz"), ("S1", "S2", "S2", "S2"))
+    modes = Modes([1.0], [0.0], PointShapes(np.ones((4, 1))), points)
+    fine = Sensor("a", "S1x")
+    for actuators, sensors, elements, words in (
+        ([Actuator("F", "R1x")], [fine], [], "actuator F: there is no point 'R1x'; the points are S1x, S2x, S2y, S2rz: "
+         "give one of these; did you mean 'S1x'?"),
+        ([], [fine, Sensor("b", "S2z")], [], "sensor b: there is no point 'S2z'; node 'S2' has S2x, S2y, S2rz"),
+        ([Actuator("F", Between("S1x", "s2x"))], [], [], "actuator F: there is no point 's2x'; .*did you mean 'S2x'"),
+        ([], [Sensor("b", "S1", direction="y")], [], "sensor b: point 'S1' has no direction 'y'; it has x: give one"),
+        ([], [Sensor("b", "S1x", "slope")], [], "sensor b: named points have no slopes; 'S1x' is no rotation: give a"),
+        ([], [fine], [CubicSpring("T", 1.0)], "element CubicSpring: there is no point 'T'; the points are S1x, S2x"),
+        ([], [Sensor("b", 0.3)], [], "sensor b: there is no point 0.3; the points are S1x"),
+    ):  # fmt: skip
+        with pytest.raises(PlaceError, match=words.replace("?", r"\?")):
+            Rig(modes, tuple(actuators), tuple(sensors), tuple(elements))
+    Rig(modes, (Actuator("F", "S2", direction="y"),), (Sensor("b", "S2", "slope", direction="z"),))
+
+
+def test_a_rig_is_refused_whose_element_or_patch_reaches_outside(square_plate):
+    modes, beam = square_plate.modes(3), rig().modes
+    with pytest.raises(PlaceError, match=r"element CubicSpring: \(x, y\) = \(1.3, 0.4\) lies outside the structure"):
+        Rig(modes, (), (), (CubicSpring((1.3, 0.4), 1.0),))
+    with pytest.raises(PlaceError, match=r"actuator P: a patch of 0.1 m by 0.1 m .* does not lie on the structure"):
+        Rig(modes, (piezo_patch("P", (0.97, 0.5), length=(0.1, 0.1)),), ())
+    with pytest.raises(PlaceError, match=r"actuator P: x = 10.2 lies outside the structure"):
+        Rig(beam, (piezo_patch("P", 9.9, length=0.6),), ())
+    with pytest.raises(PlaceError, match=r"sensor s: a slope or moment on a plate is about an axis"):
+        Rig(modes, (), (Sensor("s", (0.3, 0.4), "slope"),))

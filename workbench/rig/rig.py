@@ -7,7 +7,7 @@ from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import Element
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import Interval, Patch, PlaceError, Rectangle
+from workbench.structure.domain import PlaceError, check_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes
 from workbench.structure.plate import Membrane, Plate
@@ -52,7 +52,7 @@ class Rig(Printed):
 
     Raises:
         ValueError: two actuators or two sensors of one name.
-        PlaceError: an actuator or sensor that stands outside the structure.
+        PlaceError: an actuator, sensor or element at a place, or in a direction, that the structure does not have.
     """
 
     modes: Modes
@@ -70,22 +70,23 @@ class Rig(Printed):
             names = [part.name for part in parts]
             if len(set(names)) != len(names):
                 raise ValueError(f"the {name} of a rig must have different names; got {names}")
-        if isinstance(self.modes.domain, Interval | Rectangle):
-            self._check_places()
+        self._check_places()
 
     def _check_places(self) -> None:
-        both: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
-        ports = [port for port in both if not isinstance(port.at, Patch)]
-        if not ports:
-            return
-        try:  # all at once: a search makes a rig for every prediction
-            self.modes.domain.locate([port.at for port in ports])
-        except PlaceError:
-            for port in ports:
+        domain = self.modes.domain
+        ports: tuple[Actuator | Sensor, ...] = (*self.actuators, *self.sensors)
+        for port in ports:
+            try:
+                check_place(domain, port.at, derivative_of(port), port.direction)
+            except PlaceError as error:
+                raise _misplaced(port, error) from None
+        for element in self.elements:
+            where = getattr(element, "at", None)  # what acts all along has none
+            if where is not None:
                 try:
-                    self.modes.domain.locate(port.at)
+                    check_place(domain, where)
                 except PlaceError as error:
-                    raise _misplaced(port, error) from None
+                    raise PlaceError(f"element {type(element).__name__}: {error}") from None
 
     def in_record(self, name: str) -> "Rig":
         """The rig as it is in a record of that name: itself, but for what differs from record to record."""

@@ -7,7 +7,8 @@ acts along the edges of a patch of a plate stands at `Patch(x, y, width, height)
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from difflib import get_close_matches
+from functools import cache, cached_property, lru_cache
 from itertools import combinations
 from typing import Any, ClassVar, NamedTuple
 
@@ -324,6 +325,14 @@ class NamedPoints:
         return {name: i for i, name in enumerate(self.names)}
 
     @cached_property
+    def _of_nodes(self) -> dict[str, dict[str, str]]:
+        """Of each node its points by their direction."""
+        found: dict[str, dict[str, str]] = {}
+        for name, node, direction in zip(self.names, self.nodes, self.directions, strict=True):
+            found.setdefault(node, {})[direction] = name
+        return found
+
+    @cached_property
     def size(self) -> float:
         """The diagonal of the box that holds all points, m.
 
@@ -351,26 +360,31 @@ class NamedPoints:
         Raises:
             PlaceError: a name that no point has.
         """
-        names = [places] if isinstance(places, str) else list(np.atleast_1d(np.asarray(places, object)))
+        names = _as_list(places)
         found = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
         if -1 in found:
             name = names[found.index(-1)]
-            raise PlaceError(f"there is no point {name!r}; {self._known(name)}: give one of these")
+            raise PlaceError(f"there is no point {name!r}; {self._known(name)}: give one of these{self._alike(name)}")
         return np.array(found, int)
 
     def _known(self, name: Any) -> str:
         """The points of the node that a name begins with, in words; all points where it begins with none."""
         node = max((m for m in self.nodes if str(name).startswith(m)), key=len, default=None)
-        if node is None:
-            return f"the points are {_some(self.names)}"
         points = [n for n, m in zip(self.names, self.nodes, strict=True) if m == node]
+        if node is None or points == [node]:  # a point alone is no node that a name could begin with
+            return f"the points are {_some(self.names)}"
         return f"node {node!r} has {_some(points)}"
+
+    def _alike(self, name: Any) -> str:
+        """The name that is spelled most like another one, as a question; nothing where none is."""
+        alike = get_close_matches(str(name), self.names, n=1)
+        return f"; did you mean {alike[0]!r}?" if alike else ""
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Names, derivative 0 and sign: the point of the same node that moves or turns in the direction."""
         if derivative not in (0, 1):
             raise PlaceError(f"named points know displacements and rotations, no derivative of order {derivative}")
-        names = [places] if isinstance(places, str) else list(places)
+        names = _as_list(places)
         if direction is not None:
             wanted = direction if derivative == 0 or direction.startswith("r") else f"r{direction}"
             return [self.of_node(name, wanted) for name in names], 0, 1.0
@@ -389,11 +403,13 @@ class NamedPoints:
             PlaceError: a node or direction that is not known.
         """
         node = self.nodes[self._index[name]] if name in self._index else name
-        alike = {d: n for n, m, d in zip(self.names, self.nodes, self.directions, strict=True) if m == node}
+        if node not in self._of_nodes:
+            self.locate(name)  # says which points there are
+        alike = self._of_nodes[node]
         if direction not in alike:
             raise PlaceError(
                 f"point {name!r} has no direction {direction!r}; it has"
-                f" {', '.join(d or 'one without a name' for d in alike) or 'none'}: give one of these, or another node"
+                f" {', '.join(d or 'one without a name' for d in alike)}: give one of these, or another node"
             )
         return alike[direction]
 
@@ -447,6 +463,23 @@ class NamedPoints:
 
 
 Domain = Interval | Rectangle | NamedPoints
+
+
+@lru_cache(maxsize=1024)  # a search makes a rig for every prediction, of ports that hardly change
+def check_place(domain: Domain, where: Where, derivative: int = 0, direction: str | None = None) -> None:
+    """Refuse where nothing can act or measure: a place, or both of two, or a patch, and a direction or an axis.
+
+    Raises:
+        PlaceError: what a domain does not have.
+    """
+    if isinstance(where, Patch):
+        if not isinstance(domain, Rectangle):
+            raise PlaceError(f"a patch has its place on a plate; these modes are of {domain}")
+        next(domain.around([where], direction, 1))
+        return
+    for place in where if isinstance(where, Between) else (where,):
+        at = position(place) if isinstance(domain, Interval) else place
+        domain.locate(domain.slope(at, derivative, direction)[0])
 
 
 def as_domain(domain: Domain | float) -> Domain:
@@ -533,6 +566,10 @@ def reach(domain: Interval | Rectangle, where: Where) -> tuple[np.ndarray, np.nd
 
 def _unordered(place: Where) -> Any:
     return frozenset(place) if isinstance(place, Between) else place
+
+
+def _as_list(names: Any) -> list[Any]:
+    return [names] if isinstance(names, str) else list(np.atleast_1d(np.asarray(names, object)))
 
 
 def _some(names: Sequence[str]) -> str:
