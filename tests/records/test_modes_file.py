@@ -106,6 +106,14 @@ def test_a_mass_matrix_scales_the_modes_and_shows_what_does_not_belong_to_them(t
         read_modes(write_arrays(tmp_path / "b.npz", arrays(mass_matrix=np.diag([1.0, 2.0]))))
 
 
+def test_shapes_that_are_stated_as_mass_normalised_and_are_not_are_refused_with_their_modal_mass(tmp_path):
+    vectors = np.linalg.eigh(np.array([[2.0, 1.0], [1.0, 3.0]]))[1] * [1.0, 1.5]
+    path = write_arrays(tmp_path / "a.npz", arrays(shapes=vectors, mass_matrix=np.eye(2)))
+    with pytest.raises(RecordFileError, match=r"mode 2 has a modal mass .* of 2.25 kg .* and 1 kg is stated.* 1.5 tim"):
+        read_modes(path, modal_mass=1.0)
+    read_modes(path, modal_mass=[1.0, 2.25])
+
+
 @pytest.mark.parametrize(
     "values, message",
     [
@@ -114,6 +122,11 @@ def test_a_mass_matrix_scales_the_modes_and_shows_what_does_not_belong_to_them(t
         (arrays(frequencies_hz=np.ones(3)), r"with 3 modes; it is \(2, 2\)"),
         (arrays(names=np.array(["a"])), "2 rows of shapes need as many points; it names 1"),
         (arrays(names=np.array(["a", "a"])), "'a' twice"),
+        (arrays(mass=np.eye(2)), "an array 'mass' is not known; name it mass_matrix or modal_mass"),
+        (arrays(modal_masses=np.ones(2)), "an array 'modal_masses' is not known; name it modal_mass if it is that"),
+        (arrays(mass_matrix=np.eye(3)), r"mass matrix of 2 points must be finite, \(2, 2\); it is \(3, 3\)"),
+        (arrays(mass_matrix=np.full((2, 2), np.nan)), "it is not finite"),
+        (arrays(mass_matrix=-np.eye(2)), "mass matrix is not positive: mode 1 would have a modal mass of -"),
     ],
 )
 def test_a_file_that_is_no_set_of_modes_is_refused(tmp_path, values, message):

@@ -171,3 +171,21 @@ def test_nodes_given_by_their_coordinates_have_points_in_every_direction():
     model = FiniteElements(np.eye(6), np.diag(np.arange(1.0, 7.0)), nodes=[(0, 0, 0), (1, 0, 0)])
     assert model.nodes.names == ("1x", "1y", "1z", "2x", "2y", "2z")
     assert model.nodes.of_node("2", "y") == "2y"
+
+
+def test_a_few_degrees_of_freedom_may_have_no_mass():
+    """Their motion is static: the modes are those of the stiffness condensed to the others (Guyan, exact here)."""
+    n, light = 5, [2]
+    heavy = [0, 1, 3, 4]
+    k = np.diag(np.full(n, 2.0)) - np.eye(n, k=1) - np.eye(n, k=-1)
+    m = np.diag([1.0, 1.0, 0.0, 2.0, 1.0])
+    points = NamedPoints(tuple("abcde"))
+    coupling = k[np.ix_(heavy, light)]
+    condensed = k[np.ix_(heavy, heavy)] - coupling @ np.linalg.solve(k[np.ix_(light, light)], coupling.T)
+    expected = np.sqrt(eigh(condensed, m[np.ix_(heavy, heavy)])[0])
+    modes = FiniteElements(m, k, nodes=points).modes(4)
+    np.testing.assert_allclose(modes.omega, expected, rtol=1e-12)
+    np.testing.assert_allclose(modes.phi(list("abcde")).T @ m @ modes.phi(list("abcde")), np.eye(4), atol=1e-12)
+    few = np.diag([1.0, 0.0, 0.0, 2.0, 0.0])
+    with pytest.raises(ValueError, match=r"2 motions of 5 degrees of freedom have mass.*ask for at most 2"):
+        FiniteElements(few, k, nodes=points).modes(3)

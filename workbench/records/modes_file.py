@@ -1,6 +1,7 @@
 """Modes of a finite-element model or a modal test, from files of other programs."""
 
 from collections.abc import Mapping
+from difflib import get_close_matches
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ FORMATS = {
     ".h5": hdf5_file,
     ".hdf5": hdf5_file,
 }
+SCALES = ("mass_matrix", "modal_mass")  # arrays that say how large the shapes are
 ORTHOGONAL = 1e-3  # of unit modal mass: products of different modes beyond it are no rounding
 NO_OP2 = (
     "Nastran's OP2 is not read: pyNastran 1.4 needs NumPy below 2. Export the modes as a universal file (data set"
@@ -42,8 +44,9 @@ def read_modes(
         damping_ratios: (n_modes,) or one number, in place of what the file says.
 
     Raises:
-        RecordFileError: naming the file and what would be right: no modal mass, modes that are not orthogonal, shapes
-            and frequencies that do not fit one another, complex shapes.
+        RecordFileError: naming the file and what would be right: no modal mass, or another one than the mass matrix
+            gives, modes that are not orthogonal, shapes and frequencies that do not fit one another, complex shapes, an
+            array that is named nearly like a modal mass or a mass matrix.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -67,6 +70,12 @@ def read_modes(
 
 
 def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
+    for name in arrays:  # what else a file holds is left alone, but no scale of the shapes is passed over
+        if name not in SCALES and (name.lower() in ("m", "mass", "masses") or get_close_matches(name.lower(), SCALES)):
+            likely = get_close_matches(name.lower(), SCALES, n=1) or SCALES
+            raise RecordFileError(
+                f"{path}: an array {name!r} is not known; name it {' or '.join(likely)} if it is that, or leave it out"
+            )
     if "shapes" not in arrays or not {"frequencies_hz", "omega"} & set(arrays):
         raise RecordFileError(
             f"{path} needs `shapes` (n_points, n_modes) and `frequencies_hz` or `omega`; it holds"
@@ -94,16 +103,36 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
 
 def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
     """Shapes of unit modal mass."""
-    n_modes = shapes.shape[1]
+    n_points, n_modes = shapes.shape
     if "mass_matrix" in arrays:
-        products = shapes.T @ arrays["mass_matrix"] @ shapes
+        matrix = np.asarray(arrays["mass_matrix"], float)
+        if matrix.shape != (n_points, n_points) or not np.isfinite(matrix).all():
+            raise RecordFileError(
+                f"{path}: the mass matrix of {n_points} points must be finite, ({n_points}, {n_points}); it is"
+                f" {matrix.shape if np.isfinite(matrix).all() else 'not finite'}"
+            )
+        products = shapes.T @ matrix @ shapes
         masses = np.diag(products)
+        if not (masses > 0).all():
+            r = int(np.argmin(masses))
+            raise RecordFileError(
+                f"{path}: its mass matrix is not positive: mode {r + 1} would have a modal mass of {masses[r]:.3g} kg"
+            )
         between = np.abs(products - np.diag(masses)) / np.sqrt(np.outer(masses, masses))
         if between.max(initial=0.0) > ORTHOGONAL:
             r, s = divmod(int(between.argmax()), n_modes)
             raise RecordFileError(
                 f"{path}: modes {r + 1} and {s + 1} are not orthogonal with its mass matrix, by {between.max():.2g} of"
                 " their modal masses; are shapes and matrix of one model, in one order of points?"
+            )
+        stated = np.broadcast_to(np.ravel(arrays.get("modal_mass", masses)).astype(float), (n_modes,))
+        wrong = np.abs(masses / np.where(stated > 0, stated, masses) - 1.0)
+        if wrong.max() > ORTHOGONAL:
+            r = int(wrong.argmax())
+            raise RecordFileError(
+                f"{path}: mode {r + 1} has a modal mass φᵀ M φ of {masses[r]:.4g} kg by its mass matrix, and"
+                f" {stated[r]:.4g} kg is stated: its shape is {np.sqrt(masses[r] / stated[r]):.4g} times too large;"
+                " leave out modal_mass, or correct the matrix"
             )
     elif "modal_mass" in arrays:
         masses = np.broadcast_to(np.ravel(arrays["modal_mass"]).astype(float), (n_modes,))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import LinAlgError, eigh
 from scipy.sparse import coo_array, csc_array, sparray, spmatrix
-from scipy.sparse.linalg import LinearOperator, SuperLU, eigsh, splu
+from scipy.sparse.linalg import ArpackError, LinearOperator, SuperLU, eigsh, splu
 
 from workbench.arrays import Floats
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
@@ -18,6 +18,7 @@ from workbench.structure.supports import Attachment, PointMass, PointSpring
 
 SYMMETRIC = 1e-9  # of the largest entry: more is no rounding of the program that wrote the matrix
 SINGULAR = 1e-12  # smallest pivot of K over the largest: below it the structure can move as a rigid body
+MASSLESS = 1e-12  # of the largest ν = 1 / (ω² - σ): below it a motion has no mass
 SHIFT = 1e-11  # of the highest ω², by which K is shifted where it is singular
 ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot be distinguished from zero
 
@@ -88,7 +89,10 @@ class FiniteElements:
         if n_modes < n:
             inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
             start = np.random.default_rng(0).standard_normal(n)
-            _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
+            try:
+                _, shapes = eigsh(self.stiffness, k=n_modes, M=self.mass, sigma=shift, OPinv=inverse, v0=start)
+            except ArpackError:  # hardly more motions have mass than modes are asked for
+                shapes = self._massive_shapes(n_modes, shift)
         else:
             shapes = self._all_shapes()
         sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
@@ -120,6 +124,19 @@ class FiniteElements:
         except LinAlgError as error:
             raise ValueError("some motion has no mass, so there are fewer modes; ask for fewer") from error
         return shapes
+
+    def _massive_shapes(self, n_modes: int, shift: float) -> Floats:
+        """The lowest shapes by LAPACK, M φ = ν (K - σ M) φ, with ν = 0 for each motion that has no mass."""
+        stiffness = (self.stiffness - shift * self.mass).toarray()
+        values, shapes = eigh(self.mass.toarray(), stiffness)
+        massive = int((values > MASSLESS * values[-1]).sum())
+        if massive < n_modes:
+            raise ValueError(
+                f"{massive} motions of {len(values)} degrees of freedom have mass, so there are no {n_modes} modes; ask"
+                f" for at most {massive}, or give the others mass"
+            )
+        lowest: Floats = shapes[:, ::-1][:, :n_modes]
+        return lowest
 
     def attached(self, parts: Sequence[Attachment]) -> "FiniteElements":
         """The structure with masses, springs and dampers at its points, or between two of them, in its matrices.
