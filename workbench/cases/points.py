@@ -75,8 +75,12 @@ def _number(path: Path, line: int, row: dict[str, Any], column: str) -> float:
     except (TypeError, ValueError):
         value = np.nan
     if not np.isfinite(value):
-        got = shown(row[column])
-        raise CaseError(f"{path}, line {line + 2}, column {column!r}: expected a finite number; got {got}")
+        remedy = ""
+        if column in "xyz" and not row[column]:
+            remedy = "; say where the point stands, m, or give inputs and outputs their `shape` in place of a table"
+        raise CaseError(
+            f"{path}, line {line + 2}, column {column!r}: expected a finite number; got {shown(row[column])}{remedy}"
+        )
     return value
 
 
