@@ -249,6 +249,26 @@ def test_candidates_of_a_plate_are_proven(plate, tmp_path):
     assert json.loads(found.read_text())["placements"][0]["positions"] == [[0.4, 0.4], [0.8, 0.4]]
 
 
+def test_a_grid_over_a_plate_is_proven(plate, tmp_path):
+    """Nodes of a grid that keep out of the zone; its best choice is within the proof of all of them."""
+    found = tmp_path / "places.json"
+    given = ("--control", 2, "--weight", 0.01, "--forbid", "0.3,0.2:0.6,0.5", "--effort", 3, "--proof", 0.05)
+    result = run("place", plate, *given, "--grid", 0.1, "--json", found)
+    assert result.exit_code == 0, result.output
+    best, written = json.loads(found.read_text())["placements"][0], json.loads(found.read_text())
+    for x, y in best["positions"]:
+        assert x == pytest.approx(round(10 * x) / 10) and y == pytest.approx(round(10 * y) / 10)
+        assert not (0.3 < x < 0.6 and 0.2 < y < 0.5)
+    assert written["lower_bound"] >= 0.95 * best["residual_work"]
+    for more, words in (
+        (("--grid", 0.9), "--grid lies between 0 and half the shorter side, 0.4 m; got 0.9"),
+        (("--grid", 0.1, "--at", "0.3,0.2"), "--grid is for a plate, in place of --at; leave one of them out"),
+        ((), "--proof on a plate is among candidate places; give --grid M, so far apart, or --at PLACES"),
+    ):
+        refused = run("place", plate, *given, *more)
+        assert refused.exit_code == 2 and words in refused.output
+
+
 def test_laws_on_a_plate_are_compared_through_a_filter_and_an_observer(plate, tmp_path):
     found = tmp_path / "laws.json"
     result = run("design", plate, "--control", 2, "--weight", 0.01, "--json", found)

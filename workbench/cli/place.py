@@ -42,6 +42,9 @@ def place(
         str | None,
         typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names."),
     ] = None,
+    grid: Annotated[
+        float | None, typer.Option(metavar="M", help="Candidates on a grid over a plate, so far apart, m.")
+    ] = None,
     proof: Annotated[
         float | None, typer.Option(help="Prove the optimum global to within this share, such as 0.05.")
     ] = None,
@@ -70,6 +73,9 @@ def place(
     found = read_structure_rig(rig)
     modes, struck = found.modes, impulse_place(found, impulse_at)
     domain = modes.domain
+    candidates = _candidates(domain, at, grid)
+    if proof is not None and isinstance(domain, Rectangle) and candidates is None:
+        raise ValueError("--proof on a plate is among candidate places; give --grid M, so far apart, or --at PLACES")
     with progress_bar() as progress:
         report = reporter(progress, "placing actuators")
         task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=patch_of(found))
@@ -88,7 +94,7 @@ def place(
             peak_force=peak_force,
             condition=condition,
             forbidden=tuple(_zone(domain, text) for text in forbid or ()),
-            candidates=None if at is None else _places(domain, at),
+            candidates=candidates,
         )
         best = least_work(task, limits)
         certificate = None
@@ -161,6 +167,18 @@ def _places(domain: Domain, text: str) -> tuple[Place, ...]:
     if isinstance(domain, Interval) and not all(_is_number(part) for part in parts):
         raise ValueError(f"--at takes places between commas, such as 0.1,0.25,0.4; got {text!r}")
     return tuple(dict.fromkeys(place_in(domain, part, "--at") for part in parts))
+
+
+def _candidates(domain: Domain, at: str | None, grid: float | None) -> tuple[Place, ...] | None:
+    """The places of --at or --grid; None where neither is given."""
+    if grid is None:
+        return None if at is None else _places(domain, at)
+    if at is not None or not isinstance(domain, Rectangle):
+        raise ValueError("--grid is for a plate, in place of --at; leave one of them out")
+    widest = 0.5 * min(domain.length)
+    if not 0.0 < grid <= widest:
+        raise ValueError(f"--grid lies between 0 and half the shorter side, {widest:g} m; got {grid:g}")
+    return domain.grid(round(max(domain.length) / grid))
 
 
 def _is_number(text: str) -> bool:

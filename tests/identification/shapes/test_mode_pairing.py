@@ -54,5 +54,6 @@ def test_modes_at_named_points_are_paired_with_those_of_a_model():
     measured = SampledModes(1.1 * model.omega[[2, 0, 1]], np.zeros(3), shapes, place_array(["S3", "S1", "S2"]))
     pairing = pair_modes(measured, model)
     assert pairing.matched.tolist() == [1, 2, 0] and pairing.model.tolist() == [0, 1, 2]
+    assert str(pairing).startswith("3 modes paired") and "none of the model" not in str(pairing)
     with pytest.raises(ValueError, match=r"sensor 1 has no place.*give its channel `at`"):
         pair_modes(SampledModes(model.omega, np.zeros(3), shapes, place_array(["S3", None, "S2"])), model)

@@ -33,6 +33,7 @@ def test_without_noise_the_parameters_are_found():
     found = update_model(row_of_masses, [80.0, 30.0], **(measured(0, 0.0) | {"omega_std": 1e-3}))
     np.testing.assert_allclose(found.parameters, TRUTH, rtol=1e-6)
     assert found.converged and list(found.paired) == [0, 1, 2, 3] and found.mac.min() > 0.999999
+    assert str(found).startswith("2 parameters updated") and "1 is 1 (1.000), 2 is 2 (1.000)" in str(found)
 
 
 @pytest.mark.slow

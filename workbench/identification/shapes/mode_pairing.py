@@ -1,15 +1,17 @@
 """Mode pairing: which measured modes are those of a model, and which are not."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from workbench.structure.modes import Modes, SampledModes, mac
+from workbench.structure.printed import Printed, counted
 
 
-@dataclass(frozen=True, eq=False)
-class ModePairing:
+@dataclass(frozen=True, eq=False, repr=False)
+class ModePairing(Printed):
     """Measured modes paired one to one with those of a model.
 
     Attributes:
@@ -25,6 +27,14 @@ class ModePairing:
     mac: np.ndarray
     scaled_hz: np.ndarray
     others: np.ndarray
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        each = zip(self.matched, self.model, self.mac, self.scaled_hz)
+        rows = [(str(r + 1), str(s + 1), f"{m:.4f}", f"{hz:.5g}") for r, s, m, hz in each]
+        lost = ", ".join(str(r + 1) for r in self.others)
+        remarks = (f"measured, and none of the model's: {lost}",) if lost else ()
+        headings = ("measured mode", "mode of the model", "MAC", "its frequency, scaled [Hz]")
+        return f"{counted(len(rows), 'mode')} paired", headings, rows, remarks
 
 
 def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, repeated: float = 1e-3) -> np.ndarray:

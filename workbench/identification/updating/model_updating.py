@@ -4,7 +4,7 @@ Friswell & Mottershead, Finite Element Model Updating in Structural Dynamics (19
 on frequencies, modes paired by their shapes at every step.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,15 +12,17 @@ from numpy.typing import ArrayLike
 from scipy.optimize import least_squares, linear_sum_assignment
 
 from workbench.identification.shapes.mode_pairing import subspace_mac
+from workbench.identification.signal.modal_estimates import rounded
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed, counted
 
 LEAST_MAC = 0.5  # below it a measured mode is no mode of the model
 STEP = 1e-4  # of the logarithm of a parameter, for central differences
 INDISTINCT = 1e-6  # smallest singular value of the scaled Jacobian over the largest: parameters that do the same
 
 
-@dataclass(frozen=True, eq=False)
-class UpdatedModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class UpdatedModel(Printed):
     """A model fitted to measured modes.
 
     Attributes:
@@ -46,6 +48,16 @@ class UpdatedModel:
     def __post_init__(self) -> None:
         for name in ("parameters", "covariance", "mac", "residuals"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        rows = [(str(i + 1), *rounded(p, e)) for i, (p, e) in enumerate(zip(self.parameters, self.std))]
+        pairs = ", ".join(f"{i + 1} is {k + 1} ({m:.3f})" for i, (k, m) in enumerate(zip(self.paired, self.mac)))
+        remarks = (
+            f"measured modes are those of the model (MAC): {pairs}",
+            f"frequencies off by {np.abs(self.residuals).max():.2g} standard errors at most",
+            *(() if self.converged else (f"not converged: {self.reason}",)),
+        )
+        return f"{counted(len(rows), 'parameter')} updated", ("parameter", "value", "±"), rows, remarks
 
     @property
     def std(self) -> np.ndarray:
