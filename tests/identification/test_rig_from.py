@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.draw.plot import plot
 from workbench.identification.ambient import AmbientModes
 from workbench.identification.driven import identify_driven
 from workbench.identification.rig_from import rig_from
@@ -18,6 +19,7 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
 from workbench.structure.modification import attach
+from workbench.structure.plate import Plate
 from workbench.structure.supports import PointMass
 
 DT, NOISE = 0.02, 1e-4
@@ -69,6 +71,25 @@ def test_a_driving_point_scales_the_shapes_so_that_a_mass_changes_the_modes_as_i
     expected = attach(bench.modes, (PointMass(2.6, 0.8),))
     assert abs(expected.omega / bench.modes.omega - 1).max() > 0.05
     np.testing.assert_allclose(changed.omega, expected.omega, rtol=2e-3)
+
+
+def test_points_of_a_plate_keep_their_places_and_answer_to_a_mass_as_the_plate():
+    plate = Plate(length=(0.6, 0.4), mass_per_area=8.0, bending_stiffness=170.0, poisson_ratio=0.3, edges="clamped",
+                  damping=ModalDamping(0.01)).modes(2)  # fmt: skip
+    at, rng = ((0.2, 0.15), (0.4, 0.12), (0.25, 0.3)), np.random.default_rng(2)
+    sensors = tuple(Sensor(f"v{i + 1}", place, "velocity") for i, place in enumerate(at))
+    rig = Rig(plate, (Actuator("F", at[0]),), sensors)
+    record = simulate(rig, rng.standard_normal((1, 1500)), sample_time=0.2 / plate.frequencies_hz[-1])
+    noise = 1e-3 * record.outputs.std() * rng.standard_normal(record.outputs.shape)
+    found = rig_from(identify_driven(replace(record, outputs=record.outputs + noise), at_rest=True, feedthrough=False))
+    points = found.modes.domain
+    assert points.names == ("F", "v1", "v2", "v3") and points.directions == ("z",) * 4
+    np.testing.assert_allclose(points.positions, [(*place, 0.0) for place in (at[0], *at)])
+    assert points.distance("v1", "v2") == pytest.approx(np.hypot(0.2, 0.03))
+    changed, expected = attach(found.modes, (PointMass("v2", 0.1),)), attach(plate, (PointMass(at[1], 0.1),))
+    assert abs(expected.omega / plate.omega - 1).max() > 0.02
+    np.testing.assert_allclose(changed.omega, expected.omega, rtol=2e-3)
+    plot(found.modes).draw_without_rendering()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import NamedPoints, place_array
 from workbench.structure.modes import Modes, PointShapes, SampledModes
 
 COMPLEX = 0.1  # share of a mode's residues that the nearest real mode may leave without a warning
@@ -246,8 +246,13 @@ def _pair(
 
 
 def _points(channels: Sequence[Channel]) -> NamedPoints:
-    """The channels as named points, with positions where all stand along an interval."""
-    along = [channel.at for channel in channels]
-    known = all(isinstance(x, int | float) for x in along)
-    positions = np.array([(x, 0.0, 0.0) for x in along]) if known else None
-    return NamedPoints(tuple(channel.name for channel in channels), positions)
+    """The channels as named points, with positions where all stand along an interval, or on a plate: it moves in z."""
+    names, at = tuple(channel.name for channel in channels), place_array([channel.at for channel in channels])
+    if at.dtype == object or not np.isfinite(at).all():
+        return NamedPoints(names)
+    coordinates = at.reshape(len(names), -1)
+    positions = np.hstack([coordinates, np.zeros((len(names), 3 - coordinates.shape[1]))])
+    if at.ndim == 1:
+        return NamedPoints(names, positions)
+    turning = ("slope", "angular velocity", "moment")
+    return NamedPoints(names, positions, tuple("" if c.quantity in turning else "z" for c in channels))
