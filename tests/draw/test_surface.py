@@ -78,11 +78,21 @@ def test_motion_has_a_row_a_response_and_a_panel_an_instant():
 
 
 def test_named_points_are_drawn_moved_along_their_directions():
-    axes = plot_point_modes(points(), [("1", "2")]).axes[1]
+    axes = plot_point_modes(points()).axes[1]
     moved = axes.lines[-1].get_xydata()
     np.testing.assert_allclose(moved[:, 1], [1.0, 2.0])
     np.testing.assert_allclose(moved[0, 0], -moved[1, 0])
     assert abs(moved[0, 0]) > 0.1
+
+
+def test_points_that_move_up_from_a_plane_are_seen_to():
+    """Three sensors on a plate, moving along z: drawn up, from above the front."""
+    domain = NamedPoints(("a", "b", "c"), np.array([[0.1, 0.1, 0], [0.5, 0.1, 0], [0.3, 0.4, 0]]), ("z",) * 3)
+    modes = Modes([1.0], [0.0], lambda index, _: np.array([[1.0], [0.5], [-1.0]])[index], domain)
+    rest, moved = (line.get_xydata() for line in plot(modes).axes[0].lines if line.get_marker() == "o")
+    np.testing.assert_allclose(rest, [(0.14, 0.045), (0.54, 0.045), (0.46, 0.18)])
+    np.testing.assert_allclose(moved[:, 0], rest[:, 0])
+    np.testing.assert_allclose((moved - rest)[:, 1] / (moved - rest)[0, 1], [1.0, 0.5, -1.0])
 
 
 def test_plot_draws_modes_of_any_domain():

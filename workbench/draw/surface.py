@@ -14,9 +14,10 @@ from matplotlib.ticker import MaxNLocator
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, PlacementTask
+from workbench.draw.motion import SWAY, frame_net
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.shapes.bands import Bands
-from workbench.structure.domain import TRANSLATIONS, NamedPoints, Patch, Rectangle
+from workbench.structure.domain import Patch, Rectangle
 from workbench.structure.modes import Modes
 
 PER_SIDE = 121  # of the longer one: points where a shape is drawn
@@ -27,7 +28,6 @@ HELD = 1e-6  # of a shape's largest value: less all along an edge is held
 CORNERS = np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])  # of a rectangle, one after another
 RED, BLUE = "#b2182b", "#2166ac"  # of the map of colours, up and down
 DOT: Any = {"color": "none", "marker": "o", "markeredgecolor": "black", "markerfacecolor": "none", "markersize": 7}
-SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 
 def plot_surface_modes(
@@ -189,34 +189,29 @@ def plot_surface_placement(
     return figure
 
 
-def plot_point_modes(
-    modes: Modes, lines: Sequence[tuple[str, str]] = (), *, count: int | None = None, axes: tuple[int, int] = (0, 1)
-) -> Figure:
-    """Shapes at named points, a panel a mode: the structure at rest grey, moved blue, its nodes joined by lines.
+def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
+    """Shapes at named points, a panel a mode: the structure at rest grey, moved blue, neighbouring nodes joined.
+
+    A plane structure is seen from the front, any other from above it: x to the right, z up, y away.
 
     Args:
-        lines: pairs of nodes to join; without them the points are drawn alone.
         count: of the lowest modes; all where not given.
-        axes: of the three coordinates, those that the picture shows.
 
     Raises:
         ValueError: modes of another domain, or points without positions.
     """
-    domain = modes.domain
-    if not isinstance(domain, NamedPoints) or domain.positions is None:
-        raise ValueError("shapes at named points are drawn where their positions are known; give positions")
+    net = frame_net(modes.domain)
+    moves, size = net.moves(modes), np.ptp(net.rest, axis=0).max()
     count = min(count or modes.n_modes, modes.n_modes)
-    rest, moves = _nodes(domain, modes)
-    size = np.ptp(np.array(list(rest.values())), axis=0).max()
     columns = min(COLUMNS, count)
-    figure, grid = new_figure(-(-count // columns), columns, width=2.8 * columns, height=3.2, squeeze=False)
+    rows = -(-count // columns)
+    figure, grid = new_figure(rows, columns, width=2.8 * columns, height=0.4 + 2.8 * rows, squeeze=False)
     for r, ax in enumerate(grid.flat[:count]):
-        largest = max(float(np.abs(move[:, r]).max()) for move in moves.values())
-        moved = {node: rest[node] + SWAY * size / largest * moves[node][:, r] for node in rest}
-        for places, colour in ((rest, GREY), (moved, COLOURS[0])):
-            for first, second in lines:
-                ax.plot(*np.array([places[first], places[second]])[:, axes].T, color=colour, linewidth=1.6)
-            ax.plot(*np.array(list(places.values()))[:, axes].T, "o", color=colour, markersize=3)
+        largest = np.abs(moves[:, :, r]).max() or 1.0
+        for at, colour in ((net.rest, GREY), (net.rest + SWAY * size / largest * moves[:, :, r], COLOURS[0])):
+            for ends in net.lines:
+                ax.plot(*at[ends].T, color=colour, linewidth=1.6)
+            ax.plot(*at.T, "o", color=colour, markersize=3)
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
     for ax in grid.flat:
         ax.set_aspect("equal")
@@ -291,17 +286,3 @@ def _bare(ax: Axes, modes: Modes) -> None:
     ax.grid(False)
     for spine in ax.spines.values():
         spine.set_visible(True)
-
-
-def _nodes(domain: NamedPoints, modes: Modes) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Of each node its position (3,) and its displacements (3, n_modes)."""
-    shapes = modes.phi(list(domain.names))
-    rest: dict[str, np.ndarray] = {}
-    moves: dict[str, np.ndarray] = {}
-    assert domain.positions is not None
-    for i, (node, direction) in enumerate(zip(domain.nodes, domain.directions)):
-        rest.setdefault(node, domain.positions[i])
-        move = moves.setdefault(node, np.zeros((3, modes.n_modes)))
-        if direction in TRANSLATIONS:
-            move[TRANSLATIONS.index(direction)] = shapes[i]
-    return rest, moves
