@@ -60,7 +60,7 @@ var workbench = (function () {
   }
   // how long a word of an axis is, px
   var pen = document.createElement("canvas").getContext("2d");
-  function long(text) {
+  function textWidth(text) {
     pen.font = "12px " + getComputedStyle(document.body).fontFamily;
     return pen.measureText(text).width;
   }
@@ -133,7 +133,7 @@ var workbench = (function () {
       node.setAttribute("viewBox", "0 0 " + width + " " + height);
       node.setAttribute("height", height);
       var bottom = height - (p.x.label ? 38 : 22), yTicks = ticks(p.y, panel.y, Math.max(3, Math.round(bottom / 38)));
-      var longest = Math.max.apply(null, yTicks.map(function (t) { return long(t[1]); }).concat([7]));
+      var longest = Math.max.apply(null, yTicks.map(function (t) { return textWidth(t[1]); }).concat([7]));
       var left = Math.min(0.42 * width, 12 + longest) + (p.y.label ? 17 : 0), right = width - 10, top = 8;
       var field = p.marks.filter(function (m) { return m.kind === "field"; })[0];
       if (field) right -= 58;
@@ -153,7 +153,7 @@ var workbench = (function () {
       yTicks.forEach(function (t) {
         svg("line", { class: "grid", x1: left, x2: right, y1: Y(t[0]), y2: Y(t[0]) }, node);
         var name = svg("text", { x: left - 5, y: Y(t[0]) + 4, "text-anchor": "end" }, node, t[1]);
-        if (long(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
+        if (textWidth(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
       });
       if (p.x.label) svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, p.x.label);
       if (p.y.label) fit(svg("text", { class: "axis", x: 0, y: 0, "text-anchor": "middle",
