@@ -5,6 +5,9 @@ import json
 import numpy as np
 import pytest
 
+from workbench.records.files import read_record, write_record
+from workbench.records.record import Channel, Record
+
 RATE, N = 500.0, 2000
 HERTZ, ZETA = np.array([12.0, 47.0]), 0.01
 
@@ -32,6 +35,22 @@ def test_the_page_shows_shapes_mac_stabilisation_and_spectra(run, decay, tmp_pat
     for row, exact in zip(rows, HERTZ / np.sqrt(1.0 - ZETA**2), strict=True):  # HERTZ are damped
         value, error = float(row[1]), float(row[2])
         assert abs(value - exact) < 5.0 * error and len(row[2].lstrip("0.")) == 2
+
+
+@pytest.mark.parametrize("places", [[(0.2, 0.1), (0.5, 0.3)], ["P1", "P2"]], ids=["plate", "named points"])
+def test_places_on_a_plate_and_names_of_points_are_written_and_reported(run, places, tmp_path):
+    time, rng = np.arange(N) / RATE, np.random.default_rng(0)
+    modes = np.exp(-ZETA * 2.0 * np.pi * np.outer(HERTZ, time)) * np.cos(2.0 * np.pi * np.outer(HERTZ, time))
+    outputs = np.array([[1.0, 0.6], [0.5, -0.8]]) @ modes + 1e-3 * rng.standard_normal((2, N))
+    channels = tuple(Channel(name, "displacement", at=at) for name, at in zip("ab", places))
+    write_record(Record(1.0 / RATE, outputs, channels), tmp_path / "ring.csv")
+    assert [channel.at for channel in read_record(tmp_path / "ring.csv").output_channels] == places
+    found = run("identify", tmp_path / "ring.csv", "--json", tmp_path / "modes.json")
+    assert found.exit_code == 0, found.output
+    written = json.loads((tmp_path / "modes.json").read_text())["positions"]
+    assert [tuple(at) if isinstance(at, list) else at for at in written] == places
+    reported = run("report", tmp_path / "modes.json", "--page", tmp_path / "modes.html")
+    assert reported.exit_code == 0, reported.output
 
 
 def test_time_and_memory_are_limited(run, decay):

@@ -10,6 +10,7 @@ from workbench.records.record import Channel
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import state_space
+from workbench.structure.domain import listed
 from workbench.structure.member import Beam
 from workbench.structure.modes import mac
 
@@ -212,6 +213,20 @@ def test_noise_from_coherence():
     assert coherence_noise(h, squared, averages=averages).mean() == pytest.approx(h.real.std(), rel=0.05)
     with pytest.raises(ValueError, match="two averages"):
         coherence_noise(h, squared, averages=1)
+
+
+def test_points_on_a_plate_and_names_of_points_stay_with_the_modes():
+    lines = np.arange(5.0, 60.0, 0.2)
+    s = 2j * np.pi * lines
+    omega = 2.0 * np.pi * np.array([15.0, 40.0])
+    shapes, places = np.array([[1.0, 0.8], [0.7, -1.0], [0.3, 0.5]]), [(0.2, 0.1), (0.5, 0.3), (0.7, 0.2)]
+    h = np.einsum("jr,rf->jf", shapes, 1.0 / (s**2 + 0.02 * omega[:, None] * s + omega[:, None] ** 2))[:, None]
+    h = h * (1.0 + 1e-4 * np.random.default_rng(0).standard_normal(h.shape))
+    for at in (places, ["P1", "P2", "P3"]):
+        channels = tuple(Channel(f"y{j}", "displacement", at=place) for j, place in enumerate(at))
+        found = identify_transfer(h, lines, channels=channels)
+        assert listed(found.modes.positions) == at and found.shape_covariance.shape == (2, 3, 3)
+        np.testing.assert_allclose(np.diag(mac(found.modes.shapes, shapes)), 1.0, atol=1e-6)
 
 
 def test_what_is_no_transfer_function_is_refused():
