@@ -121,7 +121,6 @@ var workbench = (function () {
       reset.hidden = !panel;
     }
 
-    function textWidth(text) { return (/[a-z]/i.test(text) ? 7.8 : 6.6) * text.length; }  // px, of a tick: letters take more than digits
 
     function paint(panel) {
       var p = panel.spec, node = panel.svg, width = node.clientWidth || panel.root.clientWidth;
