@@ -14,7 +14,7 @@ from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import Budget, budget_of, mean_square, power_of_inputs
 from workbench.gap.report.experiment import Experiment, next_experiment
-from workbench.gap.report.readiness import check_modes, check_records, check_stiffness, readiness
+from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.record_to_record import with_held_out
 from workbench.gap.report.shrinkage import Shrinkage, measure
 from workbench.gap.report.verdict import Verdict
@@ -73,7 +73,6 @@ def diagnose(
         _check(rig, record)
     if not records:
         raise ValueError("a diagnosis needs at least one record to fit; got none")
-    check_stiffness(rig)
     check_modes(rig)
     check_records(rig, records, settle=settle)
     check_kept_apart(records, validation)

@@ -9,7 +9,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import COORDINATES, Effect, Kind
-from workbench.gap.effects.structural import modes_of, stiffness_name
+from workbench.gap.effects.structural import modes_of
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.residuals import FitData
 from workbench.records.record import Record
@@ -31,10 +31,6 @@ THINNING = 3
 COARSELY = 2  # substeps of a sample: whether an effect shows needs no more
 STRAY, MISJUDGED = 1e-3, 0.02  # of a frequency, of a damping: what solving a structure anew may differ by
 MISSCALED, QUADRATURE = 0.02, 200  # of a modal mass; points along a member that it is integrated by
-# The least stiffness between two breaks over the largest there. Below it a support or a spring makes fractional powers
-# of the distance from a tip, which polynomials take seconds to follow; a diagnosis solves hundreds of such structures.
-STIFF_ENOUGH = 0.01
-ALONG = np.linspace(1e-6, 1.0 - 1e-6, 101)
 DECADES = (1e2, 1e-2, 1e4, 1e-4)
 
 
@@ -148,30 +144,6 @@ def _about(ratios: np.ndarray) -> str:
 def _units(record: Record) -> str:
     units = (channel.unit for channel in (*record.input_channels, *record.output_channels))
     return ", ".join(dict.fromkeys(unit for unit in units if unit))
-
-
-def check_stiffness(rig: Rig) -> None:
-    """Refuse a bar or beam whose stiffness runs to nearly nothing, as at a tip, before anything is solved on it.
-
-    Raises:
-        ValueError: less than 1 % of the largest stiffness between two breaks.
-    """
-    if not isinstance(rig.structure, Structure):
-        return
-    name, length = stiffness_name(rig.structure), rig.structure.length
-    profile = getattr(rig.structure, name)
-    nodes = np.unique([0.0, *(x for x in profile.breaks if 0 < x < length), length])
-    places = nodes[:-1, None] + np.diff(nodes)[:, None] * ALONG
-    values = profile(places)
-    share = values.min(axis=1) / values.max(axis=1)
-    if share.min() < STIFF_ENOUGH:
-        worst = int(share.argmin())
-        at = length * round(float(places[worst, values[worst].argmin()]) / length, 4)
-        raise ValueError(
-            f"{name} runs down to {values[worst].min():.3g} at x = {at:.4g}, {100 * share[worst]:.2g} % of"
-            f" {values[worst].max():.4g} beside it; a diagnosis tries supports and springs there, which needs at least"
-            f" {100 * STIFF_ENOUGH:g} %: give the stiffness that it has there, or a jump (the same x twice)"
-        )
 
 
 def check_modes(rig: Rig) -> None:
