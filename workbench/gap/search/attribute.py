@@ -366,8 +366,7 @@ def _with_a_second(
         return compared_with(law, search, decision)
     if explained and not (are_common(decision.best.effects) and beside.is_nothing):
         return decision
-    if len(beside.steps) == 1:
-        beside.run()
+    beside.run()
     if not beside.is_settled and beside.decision().outcome != "explained" and pairs.by_exchange():
         decision = pairs.decision(start)
         if not (are_common(decision.best.effects) and beside.is_nothing):

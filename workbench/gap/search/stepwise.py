@@ -196,10 +196,11 @@ class Stepwise:
 
     @property
     def is_settled(self) -> bool:
-        """Whether nothing is left to look for; errors that no model has may stand for effects."""
+        """Whether nothing is left to look for; what is left, and errors that no model has, may stand for effects."""
+        if self.plain is not None:
+            return True
         outcome = self.decision().outcome
-        plausible = self.plain is not None or self.last.is_plausible
-        return (outcome == "explained" and plausible) or (outcome == "none" and self.is_quiet)
+        return self.is_quiet and (outcome == "none" or (outcome == "explained" and self.last.is_plausible))
 
     def decision(self) -> Decision:
         """What the effects of the last set explain."""
