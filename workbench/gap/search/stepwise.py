@@ -418,10 +418,10 @@ class Stepwise:
         equals = [s for s in tried if len(s.effects) > 1 and not self._tells_apart(best, s)]
         fresh = [
             *simpler_sets(best.effects, self.search.rig),
-            *self._simpler_singles(best),
             *(fewer for s in equals for fewer in each_left_out(s.effects)),
         ]
         sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
+        sets += self._simpler_singles(best)
         # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
         best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
         enough = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
@@ -434,14 +434,16 @@ class Stepwise:
         ]
         return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
 
-    def _simpler_singles(self, best: Step) -> list[tuple[Effect, ...]]:
-        """Effects of fewer numbers that one sample ahead are all but as good as a set of one is."""
-        if len(best.effects) != 1:
+    def _simpler_singles(self, best: Step) -> list[Step]:
+        """Effects of fewer numbers that are all but as good as a set of one, one sample ahead and on whole records."""
+        if len(best.effects) != 1 or not self.ahead:
             return []
         size = len(parameters_of(self.search.rig, best.effects))
         nominal = self.search.nominal_ahead
-        good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost) if self.ahead else 0.0
-        return [f.effects for f in spread_over_kinds(self.ahead, 1) if f.cost <= good and f.n_parameters < size]
+        good = nominal - STEPWISE.as_good * (nominal - self.ahead[0].cost)
+        likely = [f.effects for f in spread_over_kinds(self.ahead, 1) if f.cost <= good and f.n_parameters < size]
+        quickly = self._fitted(likely, best, self._slopes(best)) if likely else []
+        return [self._whole(step) for step in quickly if step.fit.cost < STEPWISE.near * best.fit.cost]
 
     def _size(self, step: Step) -> tuple[int, int]:
         """How many numbers and effects a set has: of as many numbers, one effect is simpler than two."""
