@@ -7,11 +7,15 @@ import pytest
 from scipy.signal import lfilter
 
 from workbench.gap.diagnose import diagnose
-from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.residuals import FitData
-from workbench.gap.search.beside_random import looks_random
+from workbench.gap.prediction.workers import ALONE
+from workbench.gap.search.beside_random import looks_random, random_beside
+from workbench.gap.search.fit import Fit
+from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
 from workbench.rig.simulate import simulate
@@ -104,3 +108,16 @@ def test_it_is_found_beside_a_stronger_law(rig, records):
     assert stop.values["at"] == pytest.approx(0.9, abs=0.002)
     assert wind.values["rms"] == pytest.approx(0.01, rel=0.15)  # of its power a part is above what the beam answers to
     assert wind.values["at"] == pytest.approx(1.3, abs=0.01)
+
+
+def test_an_effect_of_a_coarse_sensor_keeps_it(rig, records):
+    """Sensors that round coarsely are left out for a random force, but not where two outputs are exchanged with one."""
+    made = records(rig, 0.0)
+    coarse = replace(rig.sensors[3], step=1e3 * rig.sensors[3].noise_std)
+    rig = replace(rig, actuators=rig.actuators[:1], sensors=(*rig.sensors[:3], coarse))
+    swapped = Effect(kind_named("swapped_outputs"), (rig.sensors[1].name, coarse.name), {})
+    data = FitData(tuple(made), np.array([s.noise_std for s in rig.sensors]))
+    left = data.by_channel(data.residual(rig))
+    search = Search(rig, data, data, data, CATALOGUE, lambda text, share: None, ALONE, left)
+    assert coarse not in search.without_clipped().rig.sensors
+    assert random_beside(search, [Fit((swapped,), 1.0, left, 0, "")]) is None

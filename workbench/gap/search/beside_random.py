@@ -110,10 +110,11 @@ def _nothing(search: Search) -> Fit:
 
 
 def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Evidence) -> tuple[Search, Evidence]:
-    """The search and its evidence without the sensors that clip."""
+    """The search and its evidence without the sensors that clip; with them where an effect is of one of them."""
     unclipped = search.without_clipped()
     deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
-    if not deaf or any(effect.target in deaf for effect in effects):
+    targets = [effect.target if isinstance(effect.target, tuple) else (effect.target,) for effect in effects]
+    if not deaf or any(name in deaf for target in targets for name in target):
         return search, evidence
     return unclipped, unclipped.evidence_of(apply_all(unclipped.rig, effects))
 
