@@ -8,10 +8,10 @@ import pytest
 
 from workbench.gap.effects.beyond import POWER_DAMPER, POWER_SPRING, in_catalogue
 from workbench.gap.effects.catalogue import CATALOGUE, in_words, kind_named
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all
 from workbench.gap.effects.environment import _is_distortion
 from workbench.gap.effects.limiting_cases import contained, simpler_forms
-from workbench.gap.effects.ports import clipped_level
+from workbench.gap.effects.ports import clipped_level, exchanged_last
 from workbench.gap.report.verdict import _described, effect_json
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
@@ -151,6 +151,34 @@ def test_exchanged_channels_are_named_by_both():
     inputs = Effect(kind_named("swapped_inputs"), ("F1", "F2"), {})
     swapped = simulate(inputs.apply(nominal), drive(), sample_time=DT).outputs
     np.testing.assert_allclose(swapped, simulate(nominal, drive()[[1, 0, 2]], sample_time=DT).outputs, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "channel", "values"),
+    [
+        ("actuator_gain", "F2", {"gain": 0.4}),
+        ("actuator_delay", "F1", {"delay": 0.03}),
+        ("actuator_saturation", "all", {"limit": 0.3}),
+        ("actuator_misplacement", "F1", {"at": 0.9}),
+        ("sensor_gain", "d2", {"gain": 0.4}),
+        ("sensor_lag", "d", {"time_constant": 0.1}),
+        ("sensor_bias", "v", {"bias": 0.1}),
+        ("sensor_misplacement", "d", {"at": 0.7}),
+        ("sensor_quantisation", "d", {"step": 0.05}),
+    ],
+)
+def test_effects_are_told_of_the_port_itself_where_wires_are_exchanged(kind, channel, values):
+    """The same model either way: a gain of the channel after the exchange is one of the actuator before it."""
+    nominal, side = rig(), "inputs" if kind.startswith("actuator") else "outputs"
+    pair = ("F1", "F2") if side == "inputs" else ("d", "d2")
+    exchange = Effect(kind_named(f"swapped_{side}"), pair, {})
+    effects = (exchange, Effect(kind_named(kind), channel, values))
+    last = exchanged_last(effects)
+    assert [e.kind.name for e in last] == [kind, f"swapped_{side}"]
+    other = dict(zip(pair, pair[::-1], strict=True)).get(channel, channel)
+    assert last[0].target == (channel if kind == "sensor_quantisation" else other)
+    one, same = (simulate(apply_all(nominal, each), drive(), sample_time=DT).outputs for each in (effects, last))
+    np.testing.assert_allclose(same, one, atol=1e-12)
 
 
 def test_cross_talk_adds_a_share_of_another_reading():

@@ -1,6 +1,6 @@
 """Effects on the way in and on the way out: actuators and sensors."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
 from typing import Any
@@ -22,6 +22,7 @@ from workbench.records.record import QUANTITIES
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval, NamedPoints, Where, centred_at, reach
 
+OF_THE_CHANNEL = "sensor_quantisation"  # what stays where it is when wires are exchanged
 OF_THE_SENSOR = "unit of the sensor"
 ALIKE = 0.05  # of a residual's mean square: what another sensor's reading explains of it, to be tried as cross-talk
 Starts = Callable[[Evidence, Any], Iterable[dict[str, Any]]]
@@ -74,6 +75,28 @@ def _change_swapped(rig: Rig, side: str, pair: tuple[str, str]) -> Rig:
         for name, port in by_name.items()
     )
     return replace(rig, **{side: ports})
+
+
+def exchanged_last(effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The same effects with exchanged wires last, but for errors of the nominal model.
+
+    What comes after an exchange speaks of channels, what comes before it of the actuators and sensors where they stand:
+    a gain of channel F2 after F1 and F2 are exchanged is one of actuator F1 before.
+    """
+    ordered = list(effects)
+    for exchange in [e for e in effects if e.kind in (SWAPPED_INPUTS, SWAPPED_OUTPUTS)]:
+        at, (one, other) = ordered.index(exchange), exchange.target
+        names = {one: other, other: one}
+        later = [e for e in ordered[at + 1 :] if e.kind.path == exchange.kind.path and not e.kind.first]
+        if any(isinstance(e.target, tuple) for e in later):  # each of two channels may be a part of what they do
+            continue
+        moved = [
+            replace(e, target=names.get(e.target, e.target)) if e in later and e.kind.name != OF_THE_CHANNEL else e
+            for e in ordered[at + 1 :]
+        ]
+        errors = sum(e.kind.first for e in moved)
+        ordered[at:] = [*moved[: len(moved) - errors], exchange, *moved[len(moved) - errors :]]
+    return tuple(ordered)
 
 
 def _commands(evidence: Evidence, target: str) -> np.ndarray:

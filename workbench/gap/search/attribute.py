@@ -10,7 +10,7 @@ from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.limiting_cases import each_left_out
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
-from workbench.gap.effects.ports import clipped_level, rounding_step
+from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.logged_inputs import logging_noise
@@ -197,6 +197,7 @@ def attribute(
     if seen:
         best = replace(best, effects=(*seen, *(e for e in best.effects if e not in seen)))
         outcome = "explained" if outcome == "none" else outcome
+    best = replace(best, effects=exchanged_last(best.effects))
     beside = identified if random is None and not any(effect.kind.first for effect in best.effects) else None
     if beside is not None:
         best = beside_identified(within, best, beside, seen)

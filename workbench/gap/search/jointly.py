@@ -101,7 +101,8 @@ def fit_jointly(
         quickly = known is not None or (i == 0 and not to_the_end)
         data = search.quick.stepped(substeps) if quickly else whole
         left = data.residual(apply_all(search.rig, (*effects, errors)))
-        level = max(float(left @ left) / left.size, 1.0)
+        with np.errstate(over="ignore"):  # of a motion that runs away
+            level = max(float(left @ left) / left.size, 1.0)
         if level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
             break
         counted += level > JOINT.falling * before or not np.isfinite(before)
