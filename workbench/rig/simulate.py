@@ -335,11 +335,10 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     bias = np.array([[actuator.bias] for actuator in rig.actuators])
     acting = at_samples[: len(rig.actuators)] - bias
     steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
-    limited = substeps > 1 and any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators)
-    return Motion(
-        *(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)), steps),
-        finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)) if limited else None,
-    )
+    found = Motion(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)), steps)
+    if substeps == 1 or not any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators):
+        return found
+    return replace(found, finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)))
 
 
 def _move_finely(rig: Rig, inputs: Floats, sample_time: float, substeps: int, input_hold: str) -> Motion:

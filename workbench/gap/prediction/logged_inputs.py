@@ -16,7 +16,7 @@ from workbench.rig.simulate import predict
 MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
 LEAST_LOGGED = 1e-3  # likewise: no record distinguishes less from none
 SHARES = tuple(MOST_LOGGED * 0.5**k for k in range(5))  # that are tried; between them the likeliest is interpolated
-DRAWS = 12  # of it
+DRAWS = 12  # of that noise, of which the loudest is what chance may leave
 QUIETEST = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
 
 

@@ -114,7 +114,7 @@ class Verdict:
             if self.budget.errors_are_small:
                 return f"There is no gap beyond small errors of the nominal model{self._errors_in_words} and noise."
             return (
-                f"Errors of the nominal model explain the gap, but larger ones than a careful model has"
+                "Errors of the nominal model explain the gap, but larger ones than a careful model has"
                 f"{self._errors_in_words}: something may be missing that no effect of the catalogue is."
             )
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
