@@ -38,6 +38,7 @@ def diagnose(
         bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without mending them.")
     ] = False,
     workers: Annotated[int | None, typer.Option(help="Processes that share the work; one a core unless given.")] = None,
+    seconds: Annotated[float, typer.Option(help="Processor time to search for, s.")] = 120.0,
 ) -> None:
     """Locate the gap between a simulation and a test, name the missing effect, and measure how far the gap closes.
 
@@ -81,6 +82,7 @@ def diagnose(
             name=found.name,
             free_nominal=free_nominal,
             workers=workers,
+            seconds=seconds,
             report=reporter(progress, "reading"),
         )
     say(verdict.sentence, bold=True)

@@ -138,7 +138,8 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
         yield from (believed(f"mass_{k}", prior.mass, PROFILE_UNIT) for k in range(waves))
     modes = range(1, rig.modes.n_modes + 1)
     if prior.frequency:
-        yield from (believed(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in modes)
+        elastic = (r for r in modes if rig.modes.omega[r - 1] > 0)
+        yield from (believed(f"frequency_{r}", prior.frequency, PROFILE_UNIT) for r in elastic)
     if prior.damping:
         yield from (believed(f"damping_{r}", prior.damping, RATIO_UNIT) for r in modes)
     if prior.delay:
@@ -193,11 +194,11 @@ def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> R
     if not isinstance(rig.structure, Structure):
         rig = replace(rig, structure=None)  # what follows must change these modes, not solve others anew
     rig = _with_profiles(rig, prior, along)
-    frequency, damping = _numbered(values, "frequency"), _numbered(values, "damping")
+    structure, modes = rig.structure, rig.modes
+    frequency, damping = (_by_mode(values, group, modes.n_modes) for group in ("frequency", "damping"))
     if not (frequency.any() or damping.any()):
         return rig
-    structure, modes = rig.structure, rig.modes
-    stretch, more = np.exp(_padded(frequency, modes.n_modes)), np.exp(_padded(damping, modes.n_modes))
+    stretch, more = np.exp(frequency), np.exp(damping)
     if structure is not None and isinstance(structure.damping, ModalDamping):
         structure = replace(structure, damping=ModalDamping(modes.zeta * more))
     root = np.sqrt(stretch * more)
@@ -245,9 +246,9 @@ def deviations_of(values: Mapping[str, float]) -> dict[str, float]:
     return {name.split("_", 1)[1]: value for name, value in values.items() if group_of(name) == "record"}
 
 
-def _padded(values: Floats, size: int) -> Floats:
-    """The values with zeros behind them, or cut: (size,)."""
-    return np.concatenate([values, np.zeros(max(size - values.size, 0))])[:size]
+def _by_mode(values: dict[str, float], group: str, n_modes: int) -> Floats:
+    """The errors of a group (n_modes,), zero for modes that have none."""
+    return np.array([values.get(f"{group}_{r}", 0.0) for r in range(1, n_modes + 1)])
 
 
 def nominal_errors(rig: Rig, prior: NominalPrior | IdentifiedPrior, start: Mapping[str, float] | None = None) -> Effect:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.gap.prediction.deadline import NEVER, Deadline
 from workbench.gap.prediction.innovations import LOOSE, Follower
 from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
 from workbench.records.record import Record
@@ -37,6 +38,7 @@ class FitData:
         follower: what holds the rig beside the records, so that its predictions are of one sample ahead; None where
             they are of the whole record.
         heat: mean square of a residual that counts as noise, for now.
+        deadline: of the search that these records are for; fits end with the best that they have when it is past.
     """
 
     records: tuple[Record, ...]
@@ -47,6 +49,7 @@ class FitData:
     given_way: tuple[np.ndarray, np.ndarray] | None = None
     follower: Follower | None = None
     heat: float = 1.0
+    deadline: Deadline = NEVER
     _memory: OrderedDict[Any, tuple[Modes, Motion]] = field(default_factory=OrderedDict, repr=False, init=False)
     _lock: Lock = field(default_factory=Lock, repr=False, init=False)
 

@@ -24,7 +24,7 @@ from workbench.gap.effects.effect import Kind
 MOST = 8  # processes: to fork one takes a hundredth of a second, every time
 FORKS = sys.platform == "linux"  # elsewhere libraries of the system do not survive one, or there is none
 PR_SET_PDEATHSIG = 1  # <linux/prctl.h>
-LEFT_OVER = 19  # niceness of what is computed in the time that others leave
+LEFT_OVER = 5  # niceness of what is computed in the background: less urgent, but asked for in the end
 TURN = 4  # bytes of a number in the pipe that turns are taken from
 MOST_TURNS = 8192  # what a pipe holds at once, with room to spare
 

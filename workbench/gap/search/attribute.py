@@ -13,6 +13,7 @@ from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
+from workbench.gap.prediction.deadline import NEVER, Deadline
 from workbench.gap.prediction.logged_inputs import logging_noise
 from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
@@ -54,6 +55,8 @@ class Attribution:
         search: what was searched in, the records with the noise of rounded sensors among it.
         noise: (n_outputs,) standard deviation of each sensor's noise as it was found, in its unit.
         logged: noise of the logged inputs, as a share of their rms, as what is left shows it.
+        seen: effects that show in the readings themselves, which no fit alters.
+        is_cut: whether the search ended for want of time, with the best that it had.
     """
 
     outcome: str
@@ -67,11 +70,23 @@ class Attribution:
     search: Search
     noise: np.ndarray
     logged: float
+    seen: tuple[Effect, ...] = ()
+    is_cut: bool = False
 
     @property
     def noise_ratio(self) -> float:
         """Noise found over noise stated, the median of all sensors."""
         return float(np.median(self.noise / self.search.data.noise))
+
+    def without(self, effect: Effect) -> "Attribution":
+        """The same without an effect: the others are fitted anew, with intervals of their own."""
+        search = self.search
+        others = [e for e in self.best.effects if e is not effect and e not in self.seen]
+        data = search.data.stepped(SELECTION.fine)
+        best = fit(search.rig, others, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
+        best = with_intervals(search.rig, best, search.data, search.workers, logged=self.logged)
+        best = replace(best, effects=(*self.seen, *best.effects))
+        return replace(self, best=best, noise=noise_of(search, best))
 
     @cached_property
     def singles(self) -> tuple[Fit, ...]:
@@ -101,7 +116,14 @@ class Baseline:
     evidence: Evidence
 
 
-def baseline(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, workers: Workers = ALONE) -> Baseline:
+def baseline(
+    rig: Rig,
+    records: Sequence[Record],
+    *,
+    settle: float = 0.0,
+    workers: Workers = ALONE,
+    deadline: Deadline = NEVER,
+) -> Baseline:
     """What a rig leaves of its fit records, where a force is missing and what it does there.
 
     Args:
@@ -109,12 +131,14 @@ def baseline(rig: Rig, records: Sequence[Record], *, settle: float = 0.0, worker
         records: to fit; validation records have no business here.
         settle: seconds at the start of each record that are simulated but not counted.
         workers: processes that share the work.
+        deadline: of the search that follows.
     """
     noise = np.array([sensor.noise_std for sensor in rig.sensors])
     if not (noise > 0).all():
         name = rig.sensors[int(np.argmin(noise))].name
         raise ValueError(f"sensor {name} has no noise_std; the diagnosis weights every residual by it")
-    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, lead=round(settle / records[0].sample_time)))
+    lead = round(settle / records[0].sample_time)
+    seen, data = _plain_to_see(rig, FitData(tuple(records), noise, lead=lead, deadline=deadline))
     evidence = Evidence.of(apply_all(rig, seen), data, workers=workers)
     _ = evidence.at_peaks  # found once, before the work parts
     if not seen:
@@ -190,6 +214,7 @@ def attribute(
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, ahead, screened, evidence, tolerance)
     outcome, best, random, rivals, noise, beside_inputs = decision
+    is_cut = search.is_over
     within = beside_inputs or search
     best = common_as_errors(search, best, alone=random is not None)
     if outcome == "explained" and random is None:
@@ -225,6 +250,8 @@ def attribute(
         search=search,
         noise=noise,
         logged=logged,
+        seen=seen,
+        is_cut=is_cut,
     )
 
 
@@ -344,16 +371,16 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
-    random = None if beside.is_enough else random_beside(search, singles)
+    random = None if beside.is_enough or search.is_over else random_beside(search, singles)
     if random is not None:
         return random
     if beside.is_enough or beside.by_singles():
         beside.run()
         return beside.decision()
-    varied = beside_records(beside)
+    varied = None if search.is_over else beside_records(beside)
     if varied is not None:
         return varied.decision()
-    law = one_law(search, evidence)
+    law = None if search.is_over else one_law(search, evidence)
     pairs = Pairs(search)
     # beside errors that no model has, something is missing that may stand in for them: few effects without come first
     nearer = beside.last.is_plausible and beside.last.fit.cost < min(f.cost for f in (start, *singles))
@@ -373,7 +400,8 @@ def _with_a_second(
         if not (are_common(decision.best.effects) and beside.is_nothing):
             return decision
     decision = beside.decision()
-    random = None if decision.outcome in ("explained", "none") else random_beside(search, pairs.found[:1])
+    at_end = decision.outcome in ("explained", "none") or search.is_over
+    random = None if at_end else random_beside(search, pairs.found[:1])
     return random or decision
 
 

@@ -242,6 +242,9 @@ def fit(
     damping, status, falling = 1e-3, "most iterations done", 0.0
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
+        if data.deadline.is_past:
+            status, falling = "no time left", 0.0
+            break
         nearly, coarsely = problem.near(free, residual)
         jacobian = problem.jacobian(free, nearly, coarsely)
         normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual

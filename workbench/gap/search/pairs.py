@@ -46,6 +46,8 @@ class Pairs:
         Args:
             screened: what may be there, with nothing given.
         """
+        if self.search.is_over:
+            return False
         self.search.report("all pairs at once", 0.4)
         return self._explained_by(pairs_at_once(self.search, screened))
 
@@ -66,6 +68,8 @@ class Pairs:
 
     def _and_another(self, given: tuple[Effect, ...]) -> bool:
         """Whether these effects with one more explain the records."""
+        if self.search.is_over:
+            return False
         evidence = self.search.evidence_of(apply_all(self.search.rig, given))
         return self._explained_by(one_more(self.search, given, evidence))
 
@@ -86,6 +90,8 @@ class Pairs:
 
     def beside(self, effect: Effect) -> bool:
         """Whether a pair with this effect explains the records."""
+        if self.search.is_over:
+            return False
         self.search.report(f"{effect.kind.words} and another", 0.55 + 0.05 * min(len(self.given), 8))
         self.given.append(effect)
         return self._explained_by(one_more(self.search, (effect,), _evidence(self.search, effect)))
@@ -134,6 +140,8 @@ class Pairs:
     def _from_elsewhere(self) -> bool:
         """Whether one of the best pairs explains the records with other places, or leads to one that does."""
         search = self.search
+        if search.is_over:
+            return False
         likeliest = best_of_each(self.found)[: PAIRS.tried_further]
         fresh = [f for f in likeliest if search.near(f, PAIRS.very_near) and not _done(f, self.moved)]
         elsewhere = search.side_by_side(relocated, fresh)

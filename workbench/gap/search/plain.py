@@ -10,9 +10,10 @@ from workbench.gap.effects.limiting_cases import each_left_out, simpler_sets
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, group_of, nominal_errors
 from workbench.gap.effects.ports import SENSOR_DELAY
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
+from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.finish import finished
-from workbench.gap.search.fit import Fit, fit
-from workbench.gap.search.jointly import on_their_sides, surely_late
+from workbench.gap.search.fit import Fit, cost_of, fit
+from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import PLAIN, SEARCH, SELECTION
@@ -58,45 +59,47 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
     return replace(found, effects=(*named, replace(errors, values=values)), covariance=None)
 
 
-def in_place_of_errors(
-    search: Search, effects: tuple[Effect, ...], errors: Effect, rivals: Sequence[tuple[Effect, ...]] = ()
-) -> Fit | None:
+def in_place_of_errors(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
     """The effects, or one more, that leave only noise with no errors of the nominal model but common and late ones.
 
-    They say the same with fewer numbers than errors of their own for every mode and wave.
+    They say the same with fewer numbers than errors of their own for every mode and wave, and no worse: where the
+    records surely prefer errors that a careful model has, these stay.
 
     Args:
         search: with the noise found beside the errors.
-        effects: that were found beside the errors.
-        errors: of the nominal model; sensors stay as late as they make them.
+        step: effects and the errors beside which they were found; sensors stay as late as these make them.
         rivals: other sets that explain the records beside errors, which make up for the wrong place or law.
     """
+    effects, errors = step.effects, step.errors
     if errors.target.record:  # no effect differs from record to record
         return None
     named = {effect.kind for effect in effects}
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
     late = _late(search, errors)
     if not effects:
-        both = _explaining(search, [(*common, *late)])
+        both = _explaining(search, [(*common, *late)], step)
         if both is not None and SENSOR_DELAY in {effect.kind for effect in both.effects}:
             return both  # one sensor late alone is an effect beside common errors
         # beside noise of the inputs that an effect made seem louder, common errors may explain what they do not cause
-        more = _one_more(search, (*common, *late), ()) if both is None or search.logged else None
-        return _one_common(search, common, late, both) if more is None and both is not None else more
+        more = _one_more(search, (*common, *late), (), step) if both is None or search.logged else None
+        return _one_common(search, common, late, both, step) if more is None and both is not None else more
     sets = [s for given in (effects, *rivals) for s in (given, *((*given, e) for e in common), (*given, *common))]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
-    return _explaining(search, [(*s, *late) for s in sets]) or _one_more(search, (*effects, *late), common)
+    found = _explaining(search, [(*s, *late) for s in sets], step)
+    return found or _one_more(search, (*effects, *late), common, step)
 
 
-def _one_common(search: Search, common: tuple[Effect, ...], late: tuple[Effect, ...], both: Fit) -> Fit | None:
+def _one_common(
+    search: Search, common: tuple[Effect, ...], late: tuple[Effect, ...], both: Fit, step: Step
+) -> Fit | None:
     """One error common to all as the one effect, where the records do without the other; None where they show both.
 
     A model that is a little off is so in both.
     """
     most = both.cost + PLAIN.needless / search.data.n_values
-    alone = [found for one in common if (found := _explaining(search, [(one, *late)])) and found.cost < most]
+    alone = [found for one in common if (found := _explaining(search, [(one, *late)], step)) and found.cost < most]
     return min(alone, key=lambda f: f.cost, default=None)
 
 
@@ -109,19 +112,33 @@ def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:
     return (nominal_errors(search.rig, timing, errors.values),)
 
 
-def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]]) -> Fit | None:
-    """The simplest of sets that leaves only noise, or another that is surely likelier and no more of the same."""
+def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) -> Fit | None:
+    """The simplest of sets that leaves only noise, or another that is surely likelier and no more of the same.
+
+    None that the records surely prefer the errors of the step to.
+    """
     quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.plainly), list(sets))
-    best: Fit | None = None
-    for candidate in sorted((f for f in quickly if f.cost < PLAIN.near), key=lambda f: f.n_parameters):
+    near = [f for f in quickly if f.cost < PLAIN.near and not _is_worse(search, f, step, search.quick)]
+    whole, best = search.data.stepped(SELECTION.fine), None
+    for candidate in sorted(near, key=lambda f: f.n_parameters):
         if best is not None and _labels(best) <= _labels(candidate):
             continue
         effects = _on_their_sides(search, candidate.effects)
-        found = fit(search.rig, effects, search.data.stepped(SELECTION.fine), iterations=PLAIN.plainly)
+        found = fit(search.rig, effects, whole, iterations=PLAIN.plainly)
         more = 0 if best is None else found.n_parameters - best.n_parameters
-        if search.explains(found) and (best is None or search.surely_better(found, best.cost, more)):
+        explains = search.explains(found) and not _is_worse(search, found, step, whole)
+        if explains and (best is None or search.surely_better(found, best.cost, more)):
             best = found
     return None if best is None else _with_one_late(search, finished(search, best))
+
+
+def _is_worse(search: Search, found: Fit, step: Step, data: FitData) -> bool:
+    """Whether records surely prefer errors that a careful model has to a fit without them."""
+    if not step.is_plausible:
+        return False
+    gain = float(np.log(found.cost / cost_of(search.rig, step.fit.effects, data)))
+    extra = max(step.fit.n_parameters - found.n_parameters, 0)
+    return search.pays(gain, extra, data.n_values)
 
 
 def _labels(found: Fit) -> set[str]:
@@ -150,7 +167,7 @@ def _with_one_late(search: Search, found: Fit) -> Fit:
     return alone if search.explains(alone) else found
 
 
-def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...]) -> Fit | None:
+def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step) -> Fit | None:
     """The effects and another in the structure, linear as errors are, that stands for those of every mode and wave."""
     alike = tuple(kind for kind in search.catalogue if kind.path == "structure" and not kind.nonlinear)
     if not alike:
@@ -160,7 +177,7 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
     screened = Screening.of(replace(search, catalogue=alike), given, evidence).likeliest()
     likeliest = {effect.kind: effect for effect in reversed(screened)}  # the best of each kind
     more = [(*given, effect) for effect in screened if effect is likeliest[effect.kind]][: PLAIN.likeliest]
-    found = _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))])
+    found = _explaining(search, [set_ for one in more for set_ in dict.fromkeys((one, (*one, *common)))], step)
     if found is None:
         return None
     rest = [e for e in found.effects if e.kind in COMMON or any(e.label == other.label for other in given)]

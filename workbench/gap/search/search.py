@@ -55,6 +55,11 @@ class Search:
     logged: float = 0.0
     differs: str = ""
 
+    @property
+    def is_over(self) -> bool:
+        """Whether its time is spent: what is sought next is not, and fits end with what they have."""
+        return self.data.deadline.is_past
+
     def explains(self, candidate: Fit) -> bool:
         """Whether what is left is noise, in every record, up to the error of integration.
 
@@ -98,9 +103,9 @@ class Search:
         """Whether records surely prefer the lower of two costs, for `extra` more numbers, and by more than a trifle."""
         return self.pays(float(np.log(cost / better)), extra)
 
-    def pays(self, gain: float, extra: int) -> bool:
-        """The same of a gain: twice the log-likelihood, a value."""
-        n = self.data.n_values
+    def pays(self, gain: float, extra: int, n_values: int | None = None) -> bool:
+        """The same of a gain: twice the log-likelihood, a value, of all records unless their number is given."""
+        n = self.data.n_values if n_values is None else n_values
         return gain > SEARCH.trifle and n * gain > SEARCH.sure + extra * np.log(n)
 
     def near(self, candidate: Fit, share: float) -> bool:

@@ -7,7 +7,13 @@ from functools import cached_property
 import numpy as np
 
 from workbench.gap.effects.effect import Effect, apply_all, key_of
-from workbench.gap.effects.limiting_cases import contained, each_left_out, simpler_sets, wider_sets
+from workbench.gap.effects.limiting_cases import (
+    contained,
+    each_left_out,
+    simpler_sets,
+    wider_sets,
+    with_one_simpler,
+)
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
@@ -108,6 +114,8 @@ class Stepwise:
             return
         self.is_run = True
         while len(self.last.effects) < STEPWISE.most and not (self.is_enough and self._is_spotless):
+            if self.search.is_over:
+                break
             before = self.last
             step = self._with_one_more(before)
             if step is None:
@@ -120,6 +128,9 @@ class Stepwise:
             self.steps.append(self._without_needless(self.last))
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
                 break
+        limit = self._in_limit(self.last)
+        if limit is not self.last:
+            self.steps.append(replace(limit, others=self.last.others))
         self.plain = self._without_errors(self.last)
         if self.plain is not None:
             return
@@ -217,20 +228,27 @@ class Stepwise:
         return Decision("part" if left < 0.5 else "unknown", self.last.fit, noise=noise, beside=beside)
 
     def _others(self) -> list[Step]:
-        """The set that the effects of the last were chosen as, and other sets that leave only noise too."""
+        """The set that the effects of the last were chosen as, and other sets that leave only noise, or as little."""
         key = key_of(self.last.effects)
         chosen = next((s for s in reversed(self.steps) if s.others and key_of(s.effects) == key), None)
         if chosen is None:
             return []
-        return [chosen, *(s for s in chosen.others if key_of(s.effects) != key and self.explains(s))]
+        others = [s for s in chosen.others if key_of(s.effects) != key]
+        return [chosen, *(s for s in others if self.explains(s) or self._is_alike(s, chosen))]
 
     def _rivals(self) -> tuple[tuple[Fit, float], ...]:
-        """Other sets that leave only noise too, with their probabilities by description length."""
+        """Other sets that leave as little, with their probabilities by description length.
+
+        What differs between sets that all leave more than noise is a trifle, of which no law of chance is known.
+        """
         sets = self._others()
         if not sets:
             return ()
-        a_number = 0.5 * np.log(self.search.data.n_values)
-        length = [s.description(sets[0].sensor_noise) + a_number * s.fit.n_parameters for s in sets]
+        key, rig = key_of(sets[0].effects), self.search.rig
+        sets = [s for s in sets if key not in contained(s.effects, rig)]
+        a_number, alike = 0.5 * np.log(self.search.data.n_values), not self.explains(sets[0])
+        noise = sets[0].sensor_noise
+        length = [s.description(noise, of_errors_alone=alike) + a_number * s.fit.n_parameters for s in sets]
         odds = np.exp(min(length) - np.array(length))
         likely = sorted(zip(sets[1:], odds[1:] / odds.sum(), strict=True), key=lambda each: -each[1])
         return tuple((s.fit, float(p)) for s, p in likely if p > STEPWISE.excluded)
@@ -425,14 +443,35 @@ class Stepwise:
         # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
         best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
         enough = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
+        limits = contained(best.effects, self.search.rig)
         fewer = [
             step
             for step in sets
-            if self._size(step) < self._size(best)
+            if (self._size(step) < self._size(best) or key_of(step.effects) in limits)
             and step.excess(best.sensor_noise) < enough
             and not self._tells_apart(best, step)
         ]
         return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
+
+    def _in_limit(self, step: Step) -> Step:
+        """The set as what it comes to at bounds of its parameters, where what is left for good is more than noise.
+
+        What is left of a measured gap bends to any law: a trifle of it is no reason for a wider one.
+        """
+        if self.explains(step):
+            return step
+        sets = list(with_one_simpler(step.effects, self.search.rig))
+        limits = self._fitted(sets, step, self._slopes(step)) if sets else []
+        alike = [s for s in map(self._whole, limits) if self._is_alike(s, step)]
+        return self._in_limit(min(alike, key=lambda s: s.fit.cost)) if alike else step
+
+    def _is_alike(self, step: Step, best: Step) -> bool:
+        """Whether a set leaves more than the best by a trifle of a gap that this does not close, or less.
+
+        Not by errors that no model has: they may stand in for an effect.
+        """
+        more = step.excess(best.sensor_noise) - best.excess(best.sensor_noise)
+        return step.is_plausible and not self.explains(best) and more < STEPWISE.least * self._gap
 
     def _simpler_singles(self, best: Step) -> list[Step]:
         """Effects of fewer numbers that are all but as good as a set of one, one sample ahead and on whole records."""
@@ -472,7 +511,7 @@ class Stepwise:
             search = beside_inputs(self.at_first, step.fit, step.sensor_noise) or search
         key, rig = key_of(step.effects), self.search.rig
         rivals = [s.effects for s in self._others()[1:] if key not in contained(s.effects, rig)]
-        found = in_place_of_errors(search, step.effects, step.errors, rivals)
+        found = in_place_of_errors(search, step, rivals)
         if found is None:
             return None
         # both common errors are errors of the model; one alone is an effect

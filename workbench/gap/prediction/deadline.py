@@ -1,0 +1,35 @@
+"""How long a search may go on."""
+
+import os
+from time import process_time
+
+
+class Deadline:
+    """Processor time that a search may take; one that finds it spent ends with the best that it has.
+
+    Not time by the clock: a machine that others load gives the same verdict. A forked process counts on from what was
+    spent when it was last asked before the fork.
+
+    Attributes:
+        seconds: of processor time of this process, from the construction on; None for no limit.
+    """
+
+    def __init__(self, seconds: float | None = None) -> None:
+        if seconds is not None and not seconds > 0:
+            raise ValueError(f"a search needs time: seconds must be positive; got {seconds:g}")
+        self.seconds = seconds
+        self._process, self._spent = os.getpid(), process_time()
+        self._end = float("inf") if seconds is None else self._spent + seconds
+
+    @property
+    def is_past(self) -> bool:
+        """Whether the time is spent."""
+        now = process_time()
+        if os.getpid() == self._process:
+            self._spent = now
+        else:
+            now += self._spent
+        return now > self._end
+
+
+NEVER = Deadline()
