@@ -14,7 +14,7 @@ NEEDS_DATA = "a folder of case folders"
 def verdict_on(folder: Path) -> dict:
     """The verdict on one case, as JSON."""
     case = read_case(folder)
-    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1).to_json()
+    return diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1, seconds=None).to_json()
 
 
 def verdicts(folders: list[Path]) -> Iterator[dict]:

@@ -8,6 +8,8 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.report.budget import budget_of
 
 
 @pytest.mark.parametrize("gain", [1.0, 1.006])
@@ -25,6 +27,26 @@ def test_a_gap_below_the_tolerance_is_said(hinged_rig, record_of, gain):
         r"The gap beyond the noise is ([\d.]+) % of the signal, below the tolerance of 1 %\.", verdict.sentence
     )
     assert float(told[1]) == pytest.approx(100 * 0.006 / 1.006, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("delays", "words"),
+    [
+        ((0.4, 0.5, 0.45, 0.42), "all sensors late by 4.4 ms, or the actuators"),
+        ((-0.2, -0.2, -0.2, -0.2), "all sensors early by 2 ms, or the actuators"),
+        ((0.3, -0.2, 0.1, 0.0), "sensors off by 1.9 ms"),
+    ],
+)
+def test_a_delay_of_all_sensors_may_be_one_of_the_actuators(hinged_rig, record_of, delays, words):
+    """In open loop the records of both are the same."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    record = record_of(rig, np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    prior = NominalPrior(delay=0.1, sample_time=0.01)
+    late = {f"delay_{sensor.name}": delay for sensor, delay in zip(rig.sensors, delays, strict=True)}
+    budget = budget_of(rig, (), nominal_errors(rig, prior, late), (record,), noise_found=np.full(4, 1e-5))
+    found = diagnose(rig, (record,), catalogue=(kind_named("actuator_gain"),))
+    shown = replace(found, budget=replace(budget, nominal=0.3), outcome="explained", effects=())
+    assert words in shown.sentence
 
 
 @pytest.mark.parametrize(

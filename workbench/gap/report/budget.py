@@ -21,6 +21,7 @@ IN_PERCENT = ("stiffness", "mass", "frequency", "damping")
 # per cent, root mean square: a quarter to a half more than the worst models of trials have; in false valleys it is more
 MOST = (("stiffness", 5.0), ("mass", 5.0), ("frequency", 2.5), ("damping", 90.0))
 RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
+COMMON = 2.0  # times the scatter of delays: the mean from which on they are told as one delay of all
 PLURAL = {"stiffness": "stiffness", "mass": "mass", "frequency": "frequencies", "damping": "damping"}
 
 
@@ -36,7 +37,8 @@ class Budget:
         unexplained: share that is left and is not noise.
         noise: share of the sensors' noise.
         by_record: the same four shares (n_shares,) of each record by name, effects first.
-        errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on.
+        errors: root mean squares of the small errors: "frequencies_percent", "inputs_percent", "delays_ms" and so on;
+            "common_delay_ms", what all sensors are late by.
         noise_stated, noise_found: (n_outputs,) standard deviation of each sensor's noise, in its unit.
         sensors: (n_outputs,) names.
     """
@@ -177,7 +179,10 @@ def power_of_inputs(rig: Rig, records: Sequence[Record], settle: float) -> np.nd
 
 
 def sizes_of(errors: Effect | None) -> dict[str, float]:
-    """Root mean squares of the errors of a nominal model, by group; of delays about their mean, in ms."""
+    """Root mean squares of the errors of a nominal model, by group, and what delays have in common, ms.
+
+    Sensors that are all late, and actuators that are, read alike in open loop.
+    """
     if errors is None:
         return {}
     values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*IN_PERCENT, "delay")}
@@ -188,7 +193,12 @@ def sizes_of(errors: Effect | None) -> dict[str, float]:
     }
     if values["delay"]:
         sample_time = getattr(errors.target, "sample_time", 1.0)
-        sizes["delays_ms"] = 1e3 * sample_time * float(np.sqrt(np.mean(np.square(values["delay"]))))
+        delays = 1e3 * sample_time * np.array(values["delay"])
+        common = float(delays.mean())
+        if delays.size > 1 and abs(common) > COMMON * delays.std():
+            sizes["common_delay_ms"] = common
+            delays = delays - common
+        sizes["delays_ms"] = float(np.sqrt(np.mean(delays**2)))
     return sizes
 
 

@@ -175,7 +175,11 @@ class Verdict:
         words = [
             f"{n.removesuffix('_percent')} {v:.2g} %" for n, v in sizes.items() if n.endswith("percent") and v > 0.01
         ]
-        words += [f"sensors off by {v:.2g} ms" for n, v in sizes.items() if n == "delays_ms" and v > 0]
+        common = sizes.get("common_delay_ms", 0.0)
+        if common:
+            words.append(f"all sensors {'late' if common > 0 else 'early'} by {abs(common):.2g} ms, or the actuators")
+        elif sizes.get("delays_ms", 0.0) > 0:
+            words.append(f"sensors off by {sizes['delays_ms']:.2g} ms")
         return f" ({', '.join(words)})" if words else ""
 
     @property
