@@ -13,9 +13,10 @@ from scipy.special import ndtri
 
 from workbench.draw.accuracy import plot_bands
 from workbench.identification.free_decay.ibrahim import stacked_delays
-from workbench.identification.free_decay.refinement import Refined, cramer_rao_bound, refine
+from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.shapes.bands import eigenfunction_bands
 from workbench.identification.shapes.eigenfunctions import KnownEnds
+from workbench.identification.signal.modal_estimates import Refined
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes

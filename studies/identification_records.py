@@ -18,7 +18,7 @@ from scipy.stats import norm
 from workbench.draw.accuracy import records_errors
 from workbench.identification.ambient import identify_ambient
 from workbench.identification.driven import identify_driven
-from workbench.identification.free_decay.amplitude import amplitude_dependence
+from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.order import identify
 from workbench.identification.ring_down import ring_down
 from workbench.identification.transfer import identify_transfer

@@ -10,7 +10,7 @@ from scipy.stats import binom
 from workbench.identification.driven import identify_driven
 from workbench.identification.input_output import time_variance
 from workbench.identification.rig_from import rig_from
-from workbench.identification.signal.order_selection import FALSE_ALARM
+from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator

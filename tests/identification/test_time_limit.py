@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import workbench as wb
-from workbench.identification.free_decay.refinement import Identified, Refined
-from workbench.identification.signal.modal_estimates import credible
+from workbench.identification.signal.modal_estimates import Identified, Refined, credible
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes

@@ -22,10 +22,9 @@ from workbench.draw.spectra import plot_distortion
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.draw.surface import plot_point_modes, plot_surface_bands, plot_surface_modes, plot_surface_motion
 from workbench.gap.report.verdict import Verdict
-from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
-from workbench.identification.signal.modal_estimates import ModalEstimates
+from workbench.identification.signal.modal_estimates import ModalEstimates, Refined
 from workbench.records.record import Record
 from workbench.robust.prediction import Prediction
 from workbench.robust.redesign import Redesign

@@ -14,10 +14,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.output_only.subspace import StablePole, Subspace
-from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes, time_derivatives
-from workbench.identification.signal.order_selection import FALSE_ALARM
 from workbench.identification.signal.projection import project
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread

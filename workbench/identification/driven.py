@@ -18,20 +18,19 @@ from workbench.identification.input_output.fit_errors import fixed_std, pole_cov
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.mode_clusters import overlap_remarks
 from workbench.identification.input_output.model_order import DECIDED, Selected, evidence_of, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
+from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import (
     ModalEstimates,
     credible,
     normalised_shapes,
     time_derivatives,
 )
-from workbench.identification.signal.order_selection import FALSE_ALARM
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread

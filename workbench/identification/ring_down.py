@@ -6,23 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.legendre import legvander
 
-from workbench.identification.free_decay.amplitude import AmplitudeDependence, amplitude_dependence
-from workbench.identification.free_decay.drift import HIGHEST_DEGREE, without_drift
+from workbench.identification.free_decay.assumptions import (
+    AmplitudeDependence,
+    ProportionalFit,
+    amplitude_dependence,
+    proportional_fit,
+)
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
-from workbench.identification.free_decay.proportional import ProportionalFit, proportional_fit
-from workbench.identification.free_decay.refinement import (
-    Identified,
-    OfRefined,
-    Refined,
-    in_coloured_noise,
-    refine,
-    unshaped,
-)
+from workbench.identification.free_decay.preparation import HIGHEST_DEGREE, decay_start, without_drift
+from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
-from workbench.identification.signal.decay import decay_start
-from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
+from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.projection import project
+from workbench.identification.signal.searches import SECONDS, Budget, Progress
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
 from workbench.threads import one_blas_thread

@@ -16,13 +16,11 @@ from scipy.linalg import block_diag
 
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.mode_clusters import NARROW, overlap_remarks, parts_of
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
-from workbench.identification.input_output.peak_shape import one_for_two, peaks
+from workbench.identification.input_output.peak_shape import NARROW, one_for_two, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
-from workbench.identification.signal.least_squares import SECONDS, Budget, Progress
 from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes, time_derivatives
-from workbench.identification.signal.order_selection import FALSE_ALARM
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
 from workbench.structure.domain import place_array
@@ -51,7 +49,7 @@ class TransferModes(ModalEstimates):
             none was stated, of real and imaginary part each, in the unit of the output.
         evidence: (n_modes,) χ² of each mode in the noise.
         converged: whether the search ended because the step was small.
-        parts_hz: of each mode the other members of its cluster (`mode_clusters`), Hz: points measured one after
+        parts_hz: of each mode the other members of its cluster (`peak_shape`), Hz: points measured one after
             another are inconsistent there, or the mode drifts or depends on amplitude.
         scatter_hz: (n_modes,) rms by which the frequency of a mode scatters where its peak is not that of one pole
             (`peak_shape`), Hz; else 0: it drifts, depends on amplitude, or a window blurs it.

@@ -8,11 +8,11 @@ import numpy as np
 
 from workbench.identification.ambient import AmbientModes, identify_ambient
 from workbench.identification.driven import Driven, identify_driven
-from workbench.identification.free_decay.proportional import ProportionalFit
+from workbench.identification.free_decay.assumptions import ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
 from workbench.identification.signal.data_quality import check_data_quality
-from workbench.identification.signal.least_squares import SECONDS, Progress
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
+from workbench.identification.signal.searches import SECONDS, Progress
 from workbench.identification.transfer import TransferModes, identify_transfer
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions

@@ -12,8 +12,8 @@ from scipy.signal import find_peaks, welch
 
 from workbench.draw.plot import plot
 from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
+from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.signal.data_quality import data_faults
-from workbench.identification.signal.decay import decay_start
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
 from workbench.study.page import PageContent, block

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from workbench.identification.free_decay.amplitude import amplitude_dependence
+from workbench.identification.free_decay.assumptions import amplitude_dependence
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.signal.synthesis import free_decay

@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.identification.free_decay.drift import without_drift
 from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.preparation import without_drift
 from workbench.identification.free_decay.refinement import cramer_rao_bound
 from workbench.identification.ring_down import remarks
 from workbench.identification.signal.synthesis import free_decay

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from workbench.identification.free_decay.assumptions import proportional_fit
 from workbench.identification.free_decay.ibrahim import stacked_delays
-from workbench.identification.free_decay.proportional import proportional_fit
 from workbench.identification.free_decay.refinement import refine
 from workbench.identification.signal.synthesis import free_decay
 from workbench.structure.modes import SampledModes

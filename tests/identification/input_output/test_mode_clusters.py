@@ -1,6 +1,6 @@
 import numpy as np
 
-from workbench.identification.input_output.mode_clusters import overlap_remarks, parts_of
+from workbench.identification.input_output.peak_shape import overlap_remarks, parts_of
 
 
 def poles(hz, zeta):

@@ -4,7 +4,7 @@ difficulty)."""
 import numpy as np
 import pytest
 
-from workbench.identification.signal.least_squares import Budget, minimise
+from workbench.identification.signal.searches import Budget, minimise
 
 Y = [10.07, 14.73, 17.94, 23.93, 29.61, 35.18, 40.02, 44.82, 50.76, 55.05, 61.01, 66.40, 75.47, 81.78]
 X = [77.6, 114.9, 141.1, 190.8, 239.9, 289.0, 332.8, 378.4, 434.8, 477.3, 536.8, 593.1, 689.1, 760.0]

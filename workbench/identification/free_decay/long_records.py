@@ -24,16 +24,15 @@ from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import (
     MOST_STEPS,
-    Identified,
     as_refined,
     in_coloured_noise,
     noise_level,
     search,
     unshaped,
 )
-from workbench.identification.signal.least_squares import Budget
-from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, spurious_modes
+from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import Projection
+from workbench.identification.signal.searches import FALSE_ALARM, MOST_DAMPED, Budget, spurious_modes
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 

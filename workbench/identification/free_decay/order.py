@@ -5,7 +5,7 @@ What the modes so far leave of the record, r_j for output j, is compared with da
     χ²(λ) = Σ_j |Q^T r_j|² / s_j²,     Q an orthonormal basis of (I - Φ Φ^+) [Re e^{λt}, Im e^{λt}],
 
 which is chi-square with two degrees of freedom an output where only white noise s_j is left. The strongest enters, and
-`signal/order_selection` decides whether it stays. What is tried and rejected is reported as noise. The search ends when
+`signal/searches` decides whether it stays. What is tried and rejected is reported as noise. The search ends when
 the strongest candidate is no stronger than the strongest of so many in noise.
 """
 
@@ -20,18 +20,20 @@ from scipy.stats import chi2
 from workbench.arrays import Complexes
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
-from workbench.identification.free_decay.refinement import (
-    MOST_STEPS,
-    Identified,
-    in_coloured_noise,
-    refine,
-    search,
-    unshaped,
-)
+from workbench.identification.free_decay.refinement import MOST_STEPS, in_coloured_noise, refine, search, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
-from workbench.identification.signal.least_squares import SEARCH, SECONDS, Budget, Progress
-from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, Stepwise, spurious_modes
+from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import differ, project, variances, whitened
+from workbench.identification.signal.searches import (
+    FALSE_ALARM,
+    MOST_DAMPED,
+    SEARCH,
+    SECONDS,
+    Budget,
+    Progress,
+    Stepwise,
+    spurious_modes,
+)
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
@@ -152,7 +154,7 @@ class _Model:
 
 
 class _FreeDecay:
-    """The `order_selection.Problem` of free decays."""
+    """The `searches.Selection` of free decays."""
 
     def __init__(
         self, records: Sequence[Record], false_alarm: float, measured: Sequence[Record], budget: Budget

@@ -11,19 +11,14 @@ gives the whole Gauss-Newton matrix H, and s² H^-1 is at the same time the Cram
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.least_squares import Budget, minimise
-from workbench.identification.signal.modal_estimates import (
-    ModalEstimates,
-    credible,
-    normalised_shapes,
-    time_derivatives,
-)
+from workbench.identification.signal.modal_estimates import Refined, normalised_shapes, time_derivatives
 from workbench.identification.signal.projection import Projection, noise_near, project, variances
+from workbench.identification.signal.searches import Budget, minimise
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
@@ -35,121 +30,6 @@ NEGLIGIBLE = 1e-6
 ROUND_OFF = 1e-13
 # Growth e^20 over a record, and decay e^-1 within one sample: no pole is searched beyond.
 MOST_GROWTH, FASTEST_DECAY = 20.0, 1.0
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Refined(ModalEstimates):
-    """Maximum likelihood modes of free decays, with their standard errors.
-
-    Attributes:
-        modes: refined; shapes of displacement, largest entry 1.
-        covariance: (2 n_modes, 2 n_modes) of (ω, ζ), the Cramér-Rao bound at the estimate.
-        amplitudes: one (n_outputs, n_modes) complex a record: y = Re Σ a_r e^{λ_r (t - t_first)}, in its own units.
-        shape_covariance: (n_modes, n_outputs, n_outputs) of the real parts of the shapes, relative to each one's
-            largest entry (which is 1 and so without error).
-        noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
-        converged: whether the search ended because the step was small.
-        steps: taken.
-    """
-
-    modes: SampledModes
-    covariance: np.ndarray
-    amplitudes: tuple[np.ndarray, ...]
-    shape_covariance: np.ndarray
-    noise: np.ndarray
-    converged: bool
-    steps: int
-
-    def select(self, which: np.ndarray) -> "Refined":
-        """Some of the modes, by index; the others were fitted beside them."""
-        both = np.r_[which, which + self.modes.n_modes]
-        return replace(
-            self,
-            modes=self.modes.select(list(which)),
-            covariance=frozen(self.covariance[np.ix_(both, both)]),
-            amplitudes=tuple(frozen(each[:, which], complex) for each in self.amplitudes),
-            shape_covariance=frozen(self.shape_covariance[which]),
-        )
-
-    @property
-    def noise_std(self) -> np.ndarray:
-        """Of each output (n_outputs,), root mean square over the records."""
-        return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))
-
-    @property
-    def shape_std(self) -> np.ndarray:
-        """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        return np.asarray(np.sqrt(np.einsum("rjj->jr", self.shape_covariance)))
-
-
-class OfRefined(ModalEstimates):
-    """What was found about refined modes, whose figures and errors are its own."""
-
-    refined: Refined
-
-    @property
-    def modes(self) -> SampledModes:  # type: ignore[override]  # read-only here
-        return self.refined.modes
-
-    @property
-    def covariance(self) -> np.ndarray:  # type: ignore[override]
-        """(2 n_modes, 2 n_modes) of (ω, ζ)."""
-        return self.refined.covariance
-
-    @property
-    def shape_covariance(self) -> np.ndarray:
-        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
-        return self.refined.shape_covariance
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Identified(OfRefined):
-    """The modes of a record, and what was taken for noise.
-
-    Attributes:
-        refined: the modes, with covariance.
-        evidence: (n_modes,) χ² of each mode's amplitudes in the noise, 2 degrees of freedom a signal.
-        limit: what the strongest mode fitted to white noise alone exceeds with the chance `false_alarm`.
-        noise_modes: candidates rejected, each with an evidence below the limit, overdamped, or part of another.
-        noise_evidence: (n_noise,) theirs.
-        remarks: what was left undone, where the time was up.
-    """
-
-    refined: Refined
-    evidence: np.ndarray
-    limit: float
-    noise_modes: SampledModes
-    noise_evidence: np.ndarray
-    remarks: tuple[str, ...] = field(default=())
-
-    def without_artefacts(self, nyquist: float, *, growing: bool = False) -> "Identified":
-        """Only poles that can be modes (`credible`); the others join `noise_modes`.
-
-        Args:
-            nyquist: frequency, rad/s.
-            growing: whether poles of negative damping stay.
-        """
-        zeta_std = np.full(self.modes.n_modes, np.inf) if growing else self.zeta_std
-        good = credible(self.modes, self.omega_std, zeta_std, nyquist)
-        if good.all() or not good.any():
-            return self
-        kept, out = np.flatnonzero(good), np.flatnonzero(~good)
-        evidence = self.evidence if self.evidence.size else np.zeros(good.size)
-        joined = np.r_[self.noise_modes.omega, self.modes.omega[out]]
-        order = np.argsort(joined)
-        noise_modes = SampledModes(
-            joined[order],
-            np.r_[self.noise_modes.zeta, self.modes.zeta[out]][order],
-            np.hstack([self.noise_modes.shapes, self.modes.shapes[:, out]])[:, order],
-            self.modes.positions,
-        )
-        return replace(
-            self,
-            refined=self.refined.select(kept),
-            evidence=frozen(self.evidence[kept]) if self.evidence.size else self.evidence,
-            noise_modes=noise_modes,
-            noise_evidence=frozen(np.r_[self.noise_evidence, evidence[out]][order]),
-        )
 
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
@@ -444,7 +324,7 @@ class _Fitted:
 
 
 class _Poles:
-    """The `least_squares.Problem` of free decays."""
+    """The `searches.LeastSquares` of free decays."""
 
     def __init__(self, records: Sequence[Record], weights: np.ndarray, offset: bool, hold: bool) -> None:
         self.records, self.weights, self.offset, self.hold = records, weights, offset, hold

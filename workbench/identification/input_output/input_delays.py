@@ -17,7 +17,7 @@ from workbench.identification.input_output.fit_errors import fixed_std
 from workbench.identification.input_output.known_inputs import KnownInputs, sources
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import evidence_of
-from workbench.identification.signal.order_selection import FALSE_ALARM
+from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 
 # Lags of the ARX model at most, and rows for each of its coefficients at least; rows of one part of its sums.

@@ -28,8 +28,8 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
-from workbench.identification.signal.order_selection import MOST_DAMPED
 from workbench.identification.signal.projection import noise_along, noise_near, variances
+from workbench.identification.signal.searches import MOST_DAMPED
 from workbench.records.record import Record
 
 # φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.

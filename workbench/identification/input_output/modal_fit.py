@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from workbench.identification.signal.least_squares import Budget, minimise
+from workbench.identification.signal.searches import Budget, minimise
 
 MOST_STEPS = 60
 # A step is negligible once it moves the estimate by less than a thousandth of its standard error, squared.
@@ -215,7 +215,7 @@ def search(
 
 
 class _OutputError:
-    """The `least_squares.Problem` of a measurement."""
+    """The `searches.LeastSquares` of a measurement."""
 
     def __init__(self, data: Measurement, noise: np.ndarray, least: float) -> None:
         self.data, self.noise, self.least = data, noise, least

@@ -16,8 +16,7 @@ from workbench.identification.input_output.modal_fit import (
     search,
     settled,
 )
-from workbench.identification.signal.least_squares import Budget
-from workbench.identification.signal.order_selection import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Stepwise
+from workbench.identification.signal.searches import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Budget, Stepwise
 from workbench.structure.modes import mac
 
 # Candidates below the limit one after the other from which on only noise is left.
@@ -149,7 +148,7 @@ def _of_rank_one(residues: np.ndarray, norm: np.ndarray) -> np.ndarray:
 
 
 class _Modes:
-    """The `order_selection.Problem` of a measurement; a candidate is a pole and its participation."""
+    """The `searches.Selection` of a measurement; a candidate is a pole and its participation."""
 
     def __init__(self, data: Measurement, false_alarm: float, budget: Budget) -> None:
         self.data, self.budget = data, budget

@@ -1,4 +1,4 @@
-"""Modes of transfer functions whose peak is not that of one pole.
+"""Modes of transfer functions that one pole does not describe: uneven peaks, and clusters.
 
 The transfer function of a mode that drifts while it is measured is the mean of those of its poles λ + δ,
 
@@ -8,6 +8,10 @@ and a free decay of λ + δ t / T has the same term: t² e^{λt} / 2 has the tra
 its amplitude, and one blurred by a window, have it too. No mode of a linear structure has it, so it is fitted to what
 the modes leave, with the shape and the participation of each mode. Where the term of one mode explains what a second
 one beside it does, of the same shape, it is one mode.
+
+Points measured one after another are inconsistent: a roving sensor loads the structure elsewhere, a harder hit rings
+lower. A linear model fits such a mode only by a cluster: three and more modes within each other's half-power bands,
+with complex shapes of no common phase. Only one is then reported.
 """
 
 from typing import NamedTuple
@@ -20,7 +24,7 @@ from workbench.identification.input_output.modal_fit import Fit, columns, projec
 from workbench.identification.input_output.model_order import evidence_of
 from workbench.identification.input_output.spectral_lines import Lines
 from workbench.identification.input_output.time_variance import INSTEAD, pairs_alike
-from workbench.identification.signal.least_squares import Budget
+from workbench.identification.signal.searches import Budget
 
 FALSE_ALARM = 1e-6  # chance that noise alone makes such a peak
 MATTERS = 0.2  # of the half-power half-width: a smaller scatter of the pole harms no model
@@ -109,3 +113,52 @@ def _third(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.n
     above = participation[:, None] / (s - pole) ** 3
     below = participation.conj()[:, None] / (s - pole.conjugate()) ** 3
     return lines.stacked_pair(above, below)
+
+
+# Two modes of one structure may overlap; shapes of more than two do so only where damping makes them complex.
+FEWEST, IN_PHASE = 3, 0.95
+NARROW = 3.0  # half-power bands of the strongest: broader ones do not extend the cluster
+
+
+def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) -> dict[int, list[int]]:
+    """The representative of each cluster, with its other members; modes in no cluster are absent.
+
+    Args:
+        poles: (n_modes,) rad/s.
+        collinearity: (n_modes,) modal phase collinearity, 1 where all points move in phase.
+        strength: (n_modes,) the strongest of a cluster represents it.
+    """
+    width = np.abs(poles.real)
+    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width
+    left, clusters = list(np.argsort(-strength)), dict[int, list[int]]()
+    while left:
+        first = left.pop(0)
+        cluster, leads = [int(first)], [first]
+        while leads:
+            lead = leads.pop()
+            met = [r for r in left if near[r, lead]]
+            left = [r for r in left if r not in met]
+            cluster += [int(r) for r in met]
+            leads += [r for r in met if width[r] < NARROW * width[first]]
+        if len(cluster) >= FEWEST and collinearity[cluster].min() < IN_PHASE:
+            clusters[cluster[0]] = cluster[1:]
+    return clusters
+
+
+def overlap_remarks(poles: np.ndarray, n_channels: int) -> tuple[str, ...]:
+    """A remark on modes within each other's half-power bands that one pair of input and output cannot distinguish.
+
+    Args:
+        poles: (n_modes,) rad/s, by rising frequency.
+        n_channels: outputs times inputs; two and more distinguish modes by their shapes.
+    """
+    width = np.abs(poles.real)
+    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < width[:, None] + width
+    first, second = np.nonzero(np.triu(near, 1))
+    if n_channels > 1 or not first.size:
+        return ()
+    pairs = ", ".join(f"{r + 1} and {s + 1}" for r, s in zip(first, second, strict=True))
+    return (
+        f"modes {pairs} overlap: one mode that drifts or depends on amplitude looks like that to a single input and"
+        " output; compare parts of the record, or measure at another place",
+    )

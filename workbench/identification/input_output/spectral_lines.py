@@ -6,7 +6,7 @@ from scipy.stats import chi2, spearmanr
 
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import bases_of, weights_of
-from workbench.identification.signal.order_selection import MOST_DAMPED
+from workbench.identification.signal.searches import MOST_DAMPED
 
 MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
 # Half-power bandwidths beside a mode, and the chance that noise of one level is taken for louder.

@@ -21,7 +21,7 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
 from workbench.identification.input_output.model_order import evidence_of
-from workbench.identification.signal.least_squares import Budget
+from workbench.identification.signal.searches import Budget
 from workbench.structure.modes import mac
 
 SURE = 5.0  # standard errors that a change must have

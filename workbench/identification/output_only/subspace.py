@@ -23,7 +23,7 @@ from scipy.linalg import solve_triangular
 from scipy.signal import resample_poly
 from scipy.stats import t as student
 
-from workbench.identification.signal.least_squares import Budget
+from workbench.identification.signal.searches import Budget
 from workbench.structure.modes import mac
 
 # Samples of past and of future; least and most of the highest model order.

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.signal.modal_estimates import Refined
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.identification.updating.structure_fit import MOST_TERMS, choose, with_spare_terms

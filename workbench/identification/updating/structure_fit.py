@@ -9,7 +9,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from workbench.identification.free_decay.refinement import Refined
+from workbench.identification.signal.modal_estimates import Refined
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import FittedStructure, GaussianPrior, Task

@@ -7,9 +7,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.identification.free_decay.refinement import Refined
 from workbench.identification.shapes.eigenfunctions import check_along
-from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.identification.signal.modal_estimates import Refined, normalised_shapes
 from workbench.identification.updating.distributions import Basis
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure

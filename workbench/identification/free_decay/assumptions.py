@@ -1,7 +1,8 @@
-"""Amplitude dependence of frequency and damping: the modes of successive segments of a decay.
+"""Do two assumptions hold in a free decay: modes that do not depend on amplitude, and proportional damping?
 
-Segments double in length as the motion dies away. In each, the modes still there are refined by themselves; in a
-linear structure all segments agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square.
+Amplitude: segments double in length as the motion dies away. In each, the modes still there are refined by themselves;
+in a linear structure all segments agree within their errors, Σ_w ((ω_w - ω̄) / s_w)² being chi-square. Damping: the
+constants g1 and g2 of (3.32), and whether they explain what was measured.
 """
 
 from collections.abc import Sequence
@@ -10,8 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refinement import Refined, in_coloured_noise, refine
+from workbench.identification.free_decay.refinement import in_coloured_noise, refine
+from workbench.identification.signal.modal_estimates import Refined
 from workbench.records.record import Record
+from workbench.structure.damping import ProportionalDamping
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
 
@@ -131,3 +134,49 @@ def _alike(values: np.ndarray, std: np.ndarray) -> np.ndarray:
     mean = (weights * known).sum(axis=0) / np.maximum(weights.sum(axis=0), 1e-300)
     free = np.isfinite(values).sum(axis=0) - 1
     return np.where(free > 0, chi2.sf((weights * (known - mean) ** 2).sum(axis=0), np.maximum(free, 1)), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class ProportionalFit:
+    """The best g1 and g2, and how well they do.
+
+    Attributes:
+        damping: g1 in s and g2 in 1/s.
+        standard_errors: (2,) of g1 and g2.
+        left_over: (n_modes,) ζ_r minus the fit, in standard errors of ζ_r.
+        probability: of so bad a fit if the damping is proportional; below 0.01 it hardly is.
+    """
+
+    damping: ProportionalDamping
+    standard_errors: np.ndarray
+    left_over: np.ndarray
+    probability: float
+
+
+def proportional_fit(refined: Refined, only: Sequence[int] | slice = slice(None)) -> ProportionalFit:
+    """Weighted least squares of ζ_r = (g1 ω_r + g2 / ω_r) / 2 (3.32), weights from the covariance of ζ.
+
+    Args:
+        refined: modes with the errors of their damping.
+        only: the modes to fit, from 0; all unless given.
+
+    Raises:
+        ValueError: fewer than two modes.
+    """
+    modes = refined.modes.select(only)
+    n = modes.n_modes
+    if n < 2:
+        raise ValueError(f"g1 and g2 take at least two modes; there are {n}: identify more")
+    columns = 0.5 * np.column_stack([modes.omega, 1.0 / modes.omega])
+    which = refined.modes.n_modes + np.arange(refined.modes.n_modes)[only]
+    covariance = refined.covariance[np.ix_(which, which)]
+    root = np.linalg.cholesky(covariance)
+    a, b = np.linalg.solve(root, columns), np.linalg.solve(root, modes.zeta)
+    g = np.linalg.lstsq(a, b, rcond=None)[0]
+    misfit = float(((b - a @ g) ** 2).sum())
+    return ProportionalFit(
+        damping=ProportionalDamping(float(g[0]), float(g[1])),
+        standard_errors=frozen(np.sqrt(np.diag(np.linalg.inv(a.T @ a)))),
+        left_over=frozen((modes.zeta - columns @ g) / np.sqrt(np.diag(covariance))),
+        probability=float(chi2.sf(misfit, n - 2)) if n > 2 else 1.0,
+    )

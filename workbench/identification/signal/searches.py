@@ -1,0 +1,359 @@
+"""The searches of an identification, whatever was measured: over parameters, over modes, and the time they take.
+
+Nonlinear least squares, by Levenberg and Marquardt: problems differ in what they linearise, squares with the linear
+unknowns projected out (variable projection, Golub & Pereyra 1973) or a likelihood (Fisher scoring). All give, at a
+state, a matrix N and a right-hand side g, and share the damped step (Marquardt 1963), which does not depend on the
+units of the unknowns:
+
+    (D N D + μ I) D⁻¹ s = D g,     D = diag(N)^-½
+
+Model order, by stepwise selection. Forward: the strongest candidate enters, all modes are fitted anew, and it stays if
+twice the logarithm of the likelihood ratio is more than noise would give in one record of a thousand. Backward: each
+mode that is weak, close to another or spurious is left out in turn, and goes for good if the likelihood does not miss
+it. Both in turn until the modes stay the same.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from time import thread_time
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+from workbench.structure.modes import mac
+
+State = TypeVar("State")
+SECONDS = 30.0  # of processor time
+# Share of the time in which modes are searched; the rest is for refinement, standard errors and remarks.
+SEARCH = 0.6
+
+# (the search under way, the share of the time that is spent)
+Progress = Callable[[str, float], None]
+
+
+class Budget:
+    """Processor time left for an identification; searches that find it spent return the best they have.
+
+    Not time by the clock: a machine that others load gives the same result.
+
+    Attributes:
+        seconds: of processor time of this thread allowed, from the construction on.
+        progress: called as the searches go on.
+        unfinished: the searches that were ended early, each once.
+    """
+
+    def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
+        if seconds is not None and not seconds > 0:
+            raise ValueError(f"identification needs time: seconds must be positive; got {seconds:g}")
+        self.seconds, self.progress = seconds, progress
+        self.unfinished: list[str] = []
+        self._begun = thread_time()
+        self._end = self._whole = float("inf") if seconds is None else self._begun + seconds
+
+    def spent(self, search: str) -> bool:
+        """Whether the time is up; the search that asks is then noted as unfinished."""
+        now = thread_time()
+        if self.progress is not None:
+            self.progress(search, min((now - self._begun) / (self._whole - self._begun), 1.0))
+        if now < self._end:
+            return False
+        if search not in self.unfinished:
+            self.unfinished.append(search)
+        return True
+
+    def share(self, share: float) -> "Budget":
+        """A share of the time left, in (0, 1]; what it leaves unfinished counts here."""
+        part = Budget(None if self.seconds is None else share * max(self._end - thread_time(), 1e-3))
+        part.unfinished, part.progress = self.unfinished, self.progress
+        part._begun, part._whole = self._begun, self._whole
+        return part
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What was left undone, in one sentence; empty where all was finished."""
+        if not self.unfinished:
+            return ()
+        what = ", ".join(self.unfinished)
+        return (f"stopped after {self.seconds:g} s, unfinished: {what}; allow more time by `seconds`",)
+
+
+@dataclass(frozen=True)
+class Damping:
+    """How the damping μ, a share of the diagonal of N, follows what the steps achieve.
+
+    The result does not depend on these numbers, only the number of steps does; they are Marquardt's habit.
+
+    Attributes:
+        first: at the start.
+        raised: factor after a step that raised the cost.
+        lowered: factor after a step that lowered it.
+        least: below which N is not regularised any further.
+        most: from which on no step is tried: s has shrunk to a gradient step of 1e-8 standard errors.
+        stuck: from which on the search ends after a step.
+    """
+
+    first: float = 1e-3
+    raised: float = 8.0
+    lowered: float = 0.1
+    least: float = 1e-12
+    most: float = 1e8
+    stuck: float = 1e6
+
+
+DAMPING = Damping()
+# From here on, where N is not positive definite as it stands.
+INDEFINITE = 1e-9
+
+
+class LeastSquares(Protocol[State]):
+    """What the engine asks of a problem."""
+
+    def cost(self, state: State) -> float:
+        """What is minimised; infinite where the state is not admissible."""
+        ...
+
+    def normal_equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """N (n_unknowns, n_unknowns), half the Hessian or near it, and g (n_unknowns,), half the negative gradient."""
+        ...
+
+    def moved(self, state: State, step: np.ndarray) -> tuple[State | None, np.ndarray]:
+        """The state after a step, None where it is not admissible, and what of the step was taken."""
+        ...
+
+    def negligible(self, decrease: float, cost: float) -> bool:
+        """Whether a step that promises such a decrease of the cost need not be followed by another."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[State]):
+    """What a search ended with.
+
+    Attributes:
+        state: the best found.
+        cost: there.
+        converged: whether it ended because the step was negligible.
+        steps: taken.
+    """
+
+    state: State
+    cost: float
+    converged: bool
+    steps: int
+
+
+def minimise(
+    problem: LeastSquares[State],
+    start: State,
+    *,
+    most_steps: int,
+    round_off: float = 0.0,
+    budget: Budget | None = None,
+) -> Minimum[State]:
+    """The local minimum of a problem next to `start`.
+
+    Args:
+        problem: see `LeastSquares`.
+        start: admissible.
+        most_steps: at which to end at the latest.
+        round_off: of the cost: a step that raises it by no more is as good as one that does not.
+        budget: of time; none unless given.
+    """
+    state, cost, damping, small = start, problem.cost(start), DAMPING.first, False
+    for taken in range(1, most_steps + 1):
+        normal, right = problem.normal_equations(state)
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        scaled, one = normal * np.outer(scale, scale), np.eye(right.size)
+        while True:
+            try:
+                step = scale * cho_solve(cho_factor(scaled + damping * one), scale * right)
+            except np.linalg.LinAlgError:
+                damping = max(DAMPING.raised * damping, INDEFINITE)
+                continue
+            trial, step = problem.moved(state, step)
+            small = problem.negligible(float(step @ right), cost)
+            cost_there = np.inf if trial is None else problem.cost(trial)
+            accepted = trial is not None and cost_there <= cost + round_off
+            if accepted or small or damping > DAMPING.most:
+                break
+            damping *= DAMPING.raised
+        if accepted and trial is not None:
+            state, cost = trial, cost_there
+        damping = max(DAMPING.lowered * damping, DAMPING.least)
+        if small or damping > DAMPING.stuck:
+            return Minimum(state, cost, small, taken)
+        if budget is not None and budget.spent("refinement"):
+            return Minimum(state, cost, False, taken)
+    return Minimum(state, cost, False, most_steps)
+
+
+# Chance that a record of nothing but noise yields a mode.
+FALSE_ALARM = 1e-3
+# Damping ratio above which a pole is no mode.
+MOST_DAMPED = 0.3
+# MAC from which on two overlapping poles are one mode, split.
+SAME_SHAPE = 0.95
+# Chance that shapes of three signals agree so far, (1 - MAC)^(n_signals - 1); fewer must agree better to say as much.
+BY_CHANCE = (1.0 - SAME_SHAPE) ** 2
+# Where noise is not white, or modes depend on amplitude, modes may enter and leave for ever.
+MOST_ROUNDS = 4
+
+Model = TypeVar("Model")
+Candidate = TypeVar("Candidate")
+
+
+class Selection(Protocol[Model, Candidate]):
+    """What the selection asks of a measurement; a model is a fitted set of modes."""
+
+    def n_modes(self, model: Model) -> int: ...
+
+    def strongest(self, model: Model, rejected: list[tuple[complex, float]]) -> Candidate | None:
+        """The candidate most likely to be a mode beside those of a model; None where only noise is left."""
+        ...
+
+    def pole_of(self, candidate: Candidate) -> complex: ...
+
+    def extended(self, model: Model, candidate: Candidate) -> Model:
+        """The model with one more mode, all fitted anew; LinAlgError where they cannot be distinguished."""
+        ...
+
+    def gain(self, smaller: Model, larger: Model) -> float:
+        """Twice the logarithm of the likelihood ratio of two models."""
+        ...
+
+    def threshold(self, model: Model, pole: complex) -> float:
+        """What noise about a pole gains by one more mode with the chance of a false alarm."""
+        ...
+
+    def splits(self, model: Model, trial: Model) -> bool:
+        """Whether the mode that a trial adds splits one of the model, or is none."""
+        ...
+
+    def settled(self, model: Model) -> Model:
+        """The model fitted to convergence."""
+        ...
+
+    def suspects(self, model: Model) -> Iterable[tuple[complex, Model, bool]]:
+        """Modes that may be none: their pole, the model without each, and whether it is none for certain."""
+        ...
+
+
+@dataclass
+class Stepwise(Generic[Model, Candidate]):
+    """The selection.
+
+    Attributes:
+        problem: see `Selection`.
+        most_modes: where to stop at the latest.
+        most_weak: candidates below the threshold, one after the other, from which on only noise is left.
+        most_splits: candidates that split a mode before the search ends; None where they count as weak ones.
+        forgets: whether a rejected candidate may be tried again once another mode has entered.
+        budget: of time.
+        rejected: poles tried and rejected, with their gain.
+        full: whether the search stopped at the most modes.
+    """
+
+    problem: Selection[Model, Candidate]
+    most_modes: float
+    most_weak: float
+    most_splits: int | None
+    forgets: bool
+    budget: Budget = field(default_factory=Budget)
+    rejected: list[tuple[complex, float]] = field(default_factory=list)
+    full: bool = False
+
+    def select(self, model: Model) -> Model:
+        """The modes of a measurement, from those of a model on."""
+        for _ in range(MOST_ROUNDS):
+            before = self.problem.n_modes(model)
+            grown = self.forward(model)
+            most = self.problem.n_modes(grown)
+            self.full = most >= self.most_modes
+            if grown is model:
+                break
+            model = self.backward(self.problem.settled(grown))
+            left = self.problem.n_modes(model)
+            # With nothing remembered the next round would only repeat this one.
+            if left == most or (self.forgets and left <= before):
+                break
+        return model
+
+    def forward(self, model: Model) -> Model:
+        """With every candidate that the likelihood asks for."""
+        weak = splits = 0
+        if self.forgets:
+            self.rejected.clear()
+        while (
+            self.problem.n_modes(model) < self.most_modes
+            and weak < self.most_weak
+            and (self.most_splits is None or splits < self.most_splits)
+            # The first mode is worth the wait.
+            and not (self.problem.n_modes(model) and self.budget.spent("search for further modes"))
+        ):
+            candidate = self.problem.strongest(model, self.rejected)
+            if candidate is None:
+                break
+            pole = self.problem.pole_of(candidate)
+            try:
+                trial = self.problem.extended(model, candidate)
+                gain = self.problem.gain(model, trial)
+                is_weak = gain < self.problem.threshold(model, pole)
+            except np.linalg.LinAlgError:
+                gain, is_weak = 0.0, True
+            if is_weak:
+                weak += 1
+            elif self.problem.splits(model, trial):
+                weak, splits = (weak + 1, splits) if self.most_splits is None else (weak, splits + 1)
+            else:
+                model, weak = trial, 0
+                if self.forgets:
+                    self.rejected.clear()
+                continue
+            self.rejected.append((complex(pole), gain))
+        return model
+
+    def backward(self, model: Model) -> Model:
+        """Without the modes that the likelihood does not miss."""
+        while self.problem.n_modes(model) and not self.budget.spent("check of each mode"):
+            weakest: tuple[float, complex, Model] | None = None
+            for pole, without, certainly in self.problem.suspects(model):
+                gain = self.problem.gain(without, model)
+                out = certainly or gain < self.problem.threshold(model, pole)
+                if out and (weakest is None or gain < weakest[0]):
+                    weakest = gain, pole, without
+            if weakest is None:
+                return model
+            self.rejected.append((complex(weakest[1]), weakest[0]))
+            model = weakest[2]
+        return model
+
+
+def spurious_modes(
+    poles: np.ndarray,
+    shapes: np.ndarray,
+    strength: np.ndarray,
+    bin_width: float,
+    distinct: Callable[[int, int], bool] | None = None,
+) -> np.ndarray:
+    """Which poles are damped too much to ring, or split a stronger mode that has their shape and their band.
+
+    Args:
+        poles: (n_modes,) rad/s.
+        shapes: (n_signals, n_modes) amplitudes over the noise, complex.
+        strength: (n_modes,) of two alike the weaker splits the other.
+        bin_width: rad/s, the resolution of the record.
+        distinct: whether modes r and s, which one signal cannot distinguish by shape, are two all the same.
+    """
+    band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
+    near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
+    damped = -poles.real > MOST_DAMPED * np.abs(poles)
+    # An overdamped one has every band; it is split itself.
+    # One signal has no shape, and a mode that depends on amplitude looks like two there.
+    others = len(shapes) - 1
+    alike = max(SAME_SHAPE, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SAME_SHAPE
+    split = near & (mac(shapes, shapes) > alike) & (strength[:, None] < strength) & ~damped
+    if distinct is not None and others == 0:
+        for r, s in np.argwhere(split):
+            split[r, s] = not distinct(r, s)
+    return np.asarray(split.any(axis=1) | damped)
