@@ -21,17 +21,22 @@ from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-MOST_REFERENCES = 4
-# A record is at least twice so many times as long as its longest lag.
-BLOCKS = 20
-# Combinations of outputs that modes are identified from.
-MOST_DIRECTIONS = 6
-# Lags are kept while their energy is so many times that of the errors.
-ABOVE_ERRORS = 4.0
-LEAST_LAGS = 64
-# Standard error of a frequency up to which a mode counts as found, over √(ζω/T) of a mode alone without noise: poles
-# that only fit noise are not as sure.
-LEAST_SURE = 5.0
+
+@dataclass(frozen=True)
+class AmbientSettings:
+    """Constants of the identification under unknown forces."""
+
+    most_references: int = 4
+    blocks: int = 20  # twice so many times its longest lag a record is long, at least
+    most_directions: int = 6  # combinations of outputs that modes are identified from
+    above_errors: float = 4.0  # times that of the errors, that the energy of a lag must be to be kept
+    least_lags: int = 64
+    # standard error of a frequency up to which a mode counts as found, over √(ζω/T) of a mode alone without noise:
+    # poles that only fit noise are not as sure
+    least_sure: float = 5.0
+
+
+AMBIENT = AmbientSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,7 +122,7 @@ def identify_ambient(
     if n_modes is None:
         modes = subspace.with_errors([mode for mode in stable if mode.evidence > limit], budget)
         least = 1.0 / (record.n_samples * record.sample_time)
-        modes = [mode for mode in modes if mode.variance[1, 1] < LEAST_SURE**2 * least * abs(mode.pole.real)]
+        modes = [mode for mode in modes if mode.variance[1, 1] < AMBIENT.least_sure**2 * least * abs(mode.pole.real)]
     else:
         modes = subspace.with_errors(sorted(stable, key=lambda mode: -mode.evidence)[:n_modes], budget)
     if not modes or len(modes) < (n_modes or 0):
@@ -129,10 +134,10 @@ def identify_ambient(
 def _directions(record: Record) -> np.ndarray:
     """The outputs, or as many combinations of them as hold most of what they share, each of unit variance."""
     outputs = np.asarray(record.outputs / record.outputs.std(axis=1, keepdims=True))
-    if record.n_outputs <= MOST_DIRECTIONS:
+    if record.n_outputs <= AMBIENT.most_directions:
         return outputs
     about = outputs - outputs.mean(axis=1, keepdims=True)
-    vectors = np.linalg.eigh(about @ about.T)[1][:, -MOST_DIRECTIONS:]
+    vectors = np.linalg.eigh(about @ about.T)[1][:, -AMBIENT.most_directions :]
     return np.asarray(vectors.T @ about)
 
 
@@ -162,13 +167,13 @@ def _shapes(decays: Sequence[Record], poles: np.ndarray) -> np.ndarray:
 def _lags(record: Record, longest: float | None, references: Sequence[str] | None) -> tuple[int, list[int]]:
     """How many lags, and the rows of the references."""
     if references is None:
-        strongest = np.argsort(-record.outputs.std(axis=1))[:MOST_REFERENCES]
+        strongest = np.argsort(-record.outputs.std(axis=1))[: AMBIENT.most_references]
         rows = sorted(int(j) for j in strongest)
     else:
         rows = [record.output_names.index(name) for name in record.only(references).output_names]
-    most = record.n_samples // (2 * BLOCKS)
+    most = record.n_samples // (2 * AMBIENT.blocks)
     lags = most if longest is None else round(longest / record.sample_time)
-    if not LEAST_LAGS // 4 <= lags <= most:
+    if not AMBIENT.least_lags // 4 <= lags <= most:
         raise ValueError(
             f"record {record.name!r} has {record.n_samples} samples, enough for lags up to"
             f" {most * record.sample_time:g} s; {lags * record.sample_time:g} s were asked for: measure longer"
@@ -176,9 +181,15 @@ def _lags(record: Record, longest: float | None, references: Sequence[str] | Non
     if longest is None:
         found = _correlations(record, 4 * lags, rows, 1)[0]
         energy = (found / found.std(axis=2, keepdims=True)) ** 2
-        windows = energy.sum(axis=(0, 1))[: 4 * lags // LEAST_LAGS * LEAST_LAGS].reshape(-1, LEAST_LAGS).mean(axis=1)
+        windows = (
+            energy.sum(axis=(0, 1))[: 4 * lags // AMBIENT.least_lags * AMBIENT.least_lags]
+            .reshape(-1, AMBIENT.least_lags)
+            .mean(axis=1)
+        )
         errors = np.median(windows[windows.size // 2 :])
-        lags = min(lags, LEAST_LAGS * max(1, int(np.argmax(np.r_[windows, 0.0] < ABOVE_ERRORS * errors))))
+        lags = min(
+            lags, AMBIENT.least_lags * max(1, int(np.argmax(np.r_[windows, 0.0] < AMBIENT.above_errors * errors)))
+        )
     return lags, rows
 
 

@@ -18,7 +18,7 @@ from workbench.identification.input_output.fit_errors import fixed_std, pole_cov
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.model_order import DECIDED, Selected, evidence_of, fit_of_poles, select_modes
+from workbench.identification.input_output.model_order import ORDER, Selected, evidence_of, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.subspace_poles import subspace_poles
@@ -30,19 +30,22 @@ from workbench.identification.signal.modal_estimates import (
     normalised_shapes,
     time_derivatives,
 )
-from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
+from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-# Modes for the first estimate of the noise, and how often noise and modes are estimated in turn.
-STRONGEST, LEARNT = 8, 4
-# States of a subspace model beyond two for each of the most modes: for noise.
-SPARE = 20
-# Times the limit up to which a mode may be noise; nepers over a record above which a pole grows.
-DOUBTED, MOST_GROWTH = 4.0, 0.5
-# Steps of a fit that only decides whether inputs act late.
-STEPS = 12
+
+@dataclass(frozen=True)
+class DrivenSettings:
+    """Constants of the course of an identification from known inputs."""
+
+    strongest: int = 8  # modes for the first estimate of the noise
+    learnt: int = 4  # times that noise and modes are estimated in turn
+    spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
+
+
+DRIVEN = DrivenSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -297,14 +300,20 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
 def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
     """Whether these modes leave what the inputs a sample earlier explain."""
     other = data.delayed_by(data.delays, any_fraction=True)
-    trial = settled(other, projected(other, selected.fit.poles, selected.fit.participation), STEPS, budget, DECIDED)
+    trial = settled(
+        other,
+        projected(other, selected.fit.poles, selected.fit.participation),
+        SELECTION.few_steps,
+        budget,
+        ORDER.decided,
+    )
     return bool(act_later(other, trial).any())
 
 
 def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selected:
     """Those of a start, or else of a subspace model, and as many more as the first estimate of the noise needs."""
     if start is None:
-        poles = subspace_poles(data.records, data.whole, 2 * how["most_modes"] + SPARE)
+        poles = subspace_poles(data.records, data.whole, 2 * how["most_modes"] + DRIVEN.spare)
         start = fit_of_poles(data, poles, how["false_alarm"])
     few = _few(how)
     few["most_modes"] = max(few["most_modes"], start.poles.size)
@@ -312,7 +321,7 @@ def _strongest(data: KnownInputs, start: Fit | None = None, **how: Any) -> Selec
 
 
 def _few(how: dict[str, Any]) -> dict[str, Any]:
-    return {**how, "most_modes": min(STRONGEST, how["most_modes"])}
+    return {**how, "most_modes": min(DRIVEN.strongest, how["most_modes"])}
 
 
 def _late_remarks(data: KnownInputs) -> tuple[str, ...]:
@@ -348,7 +357,7 @@ def _selected(
     strongest = _strongest(data, **how) if strongest is None else strongest
     few["most_modes"] = max(few["most_modes"], strongest.fit.poles.size)
     data, selected = _with_noise(data, strongest, few, how, budget)
-    doubtful = (selected.evidence < DOUBTED * selected.limit) | ~_oscillate(data, selected)
+    doubtful = (selected.evidence < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
         return data, selected
     sure = settled(
@@ -410,14 +419,14 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
 def _oscillate(data: KnownInputs, selected: Selected) -> np.ndarray:
     """Which modes oscillate within a record and hardly grow; others may be noise that is not white."""
     poles, span = selected.fit.poles, 2.0 * np.pi / data.resolution
-    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < MOST_GROWTH))
+    return np.asarray((np.abs(poles) > data.resolution) & (poles.real * span < SELECTION.most_growth))
 
 
 def _with_noise(
     data: KnownInputs, selected: Selected, once: dict[str, Any], how: dict[str, Any], budget: Budget
 ) -> tuple[KnownInputs, Selected]:
     """Modes and noise estimated in turn until both stay the same; `once` is how `selected` was selected."""
-    for _ in range(LEARNT):
+    for _ in range(DRIVEN.learnt):
         changing = beside_changing(data, selected.fit, budget)
         if changing is not None:
             fewer = select_modes(changing[0], start=changing[1], **once)

@@ -24,24 +24,30 @@ from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
 from workbench.threads import one_blas_thread
 
-MOST_MODES = 20
-# Rounds of modes and drift; before any mode is known, the degree of a drift, and the share of the variance that it must
-# leave at most to be removed.
-DRIFT_ROUNDS, PARABOLA, DOMINANT = 3, 2, 0.5
-# Energy of the second half over that of the first, either way; least correlation of such a record after a third of it.
-AS_STRONG, CORRELATED = 0.5, 0.5
-# Correlation of noise, times the root of its samples, is 1; more is an oscillation.
-UNCORRELATED = 3.0
-# Share of the energy about the modes that the residual may have, and how far it may stand out of the residual beside;
-# and of all, if it is not white.
-LEFT_OVER, MOST_LEFT, STANDS_OUT = 0.1, 0.25, 5.0
-# Bins about a mode, and beside.
-BAND, BESIDE = 6, 60
+
+@dataclass(frozen=True)
+class RingDownSettings:
+    """Constants of what is said of a ring-down."""
+
+    most_modes: int = 20  # of a stabilisation diagram
+    drift_rounds: int = 3  # of modes and drift
+    parabola: int = 2  # degree of a drift before any mode is known
+    dominant: float = 0.5  # share of the variance that it must leave at most, to be removed
+    as_strong: float = 0.5  # energy of the second half over that of the first, either way, of what does not decay
+    correlated: float = 0.5  # least correlation of a free decay as strong at its end, after a third of it
+    uncorrelated: float = 3.0  # correlation of noise, times the root of its samples, is 1; more is an oscillation
+    left_over: float = 0.1  # share of the energy about the modes that the residual may have
+    most_left: float = 0.25  # likewise of all, if it is not white
+    stands_out: float = 5.0  # times the residual beside them that it may stand out by
+    band: int = 6  # bins about a mode
+    beside: int = 60  # bins beside it
+    highest_overtone: int = 9
+    overtone_at_most: float = 0.03  # amplitude of an overtone, relative to its base
+    within: float = 2e-3  # of a whole multiple of the base's frequency
+
+
+RING_DOWN = RingDownSettings()
 SURE = 3.0
-HIGHEST_OVERTONE = 9
-# Amplitude of an overtone, relative to its base, at most.
-OVERTONE_AT_MOST = 0.03
-WITHIN = 2e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -158,12 +164,15 @@ def _without_drift(
     poles = np.zeros(0, complex)
     cleared, size = records, np.zeros((len(records), records[0].n_outputs))
     # A drift larger than the modes would be searched for modes first; a parabola is none.
-    drifts = [without_drift(record, poles, most=PARABOLA) for record in records]
+    drifts = [without_drift(record, poles, most=RING_DOWN.parabola) for record in records]
     pairs = zip(drifts, records, strict=True)
-    if any((drift.record.outputs.var(axis=1) < DOMINANT * record.outputs.var(axis=1)).any() for drift, record in pairs):
+    if any(
+        (drift.record.outputs.var(axis=1) < RING_DOWN.dominant * record.outputs.var(axis=1)).any()
+        for drift, record in pairs
+    ):
         cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
     span = max(record.n_samples * record.sample_time for record in records)
-    for _ in range(DRIFT_ROUNDS):
+    for _ in range(RING_DOWN.drift_rounds):
         found = _identified(cleared, n_modes, budget)
         before, poles = poles, found.modes.poles
         poles = poles[np.abs(poles) * span > 2.0 * np.pi]
@@ -192,7 +201,7 @@ def _identified(records: list[Record], n_modes: int | None, budget: Budget) -> I
 
 
 def _by_stabilisation(records: list[Record], budget: Budget) -> Identified:
-    highest = max(2, min(MOST_MODES, min(record.n_samples for record in records) // 8))
+    highest = max(2, min(RING_DOWN.most_modes, min(record.n_samples for record in records) // 8))
     start = stable_modes(stabilise(records, orders=range(2, highest + 1))).modes
     if start.n_modes == 0:
         name = records[0].name
@@ -224,8 +233,12 @@ def _check_undriven(record: Record) -> None:
         float(np.sqrt((part**2).mean())) for part in (correlation[: n // 20 + 1], correlation[n // 3 : n // 2])
     )
     # Noise is uncorrelated, and holds no mode; other checks say so.
-    oscillates = soon > UNCORRELATED / np.sqrt(n)
-    if oscillates and AS_STRONG < energy[1] / max(energy[0], 1e-300) < 1.0 / AS_STRONG and late < CORRELATED * soon:
+    oscillates = soon > RING_DOWN.uncorrelated / np.sqrt(n)
+    if (
+        oscillates
+        and RING_DOWN.as_strong < energy[1] / max(energy[0], 1e-300) < 1.0 / RING_DOWN.as_strong
+        and late < RING_DOWN.correlated * soon
+    ):
         raise ValueError(
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
             f" correlated over its length. {WAY_OUT}"
@@ -259,13 +272,13 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
         power, motion = ((np.abs(np.fft.rfft(part, axis=1)[:, 1:]) ** 2).sum(axis=0) for part in scaled)
         bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
         away = np.abs(np.arange(1, power.size + 1)[:, None] - refined.modes.poles.imag / bin_width)
-        narrow = np.maximum(BAND, np.abs(refined.modes.poles.real) / bin_width)
+        narrow = np.maximum(RING_DOWN.band, np.abs(refined.modes.poles.real) / bin_width)
         inside = (away < narrow).any(axis=1)
-        beside = ((away > 2.0 * narrow) & (away < BESIDE + narrow)).any(axis=1) & ~inside
+        beside = ((away > 2.0 * narrow) & (away < RING_DOWN.beside + narrow)).any(axis=1) & ~inside
         share, whole = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
         level = np.median(power[beside]) if beside.any() else 0.0
-        about = share > LEFT_OVER and power[inside].mean() > STANDS_OUT * level
-        if about or (whole > MOST_LEFT and coloured):
+        about = share > RING_DOWN.left_over and power[inside].mean() > RING_DOWN.stands_out * level
+        if about or (whole > RING_DOWN.most_left and coloured):
             return (
                 f"in record {record.name!r} the residual is {100 * np.sqrt(share):.0f} % of the motion about the"
                 f" modes, {100 * np.sqrt(whole):.0f} % of all: it is driven, or depends strongly on amplitude."
@@ -343,7 +356,7 @@ def _base(frequencies: np.ndarray, size: np.ndarray, r: int) -> tuple[int | None
     """The mode of which r may be an overtone, and which."""
     for base in np.argsort(-size):
         times = round(frequencies[r] / frequencies[base])
-        near = abs(frequencies[r] / frequencies[base] - times) < WITHIN * times
-        if 2 <= times <= HIGHEST_OVERTONE and near and size[r] < OVERTONE_AT_MOST * size[base]:
+        near = abs(frequencies[r] / frequencies[base] - times) < RING_DOWN.within * times
+        if 2 <= times <= RING_DOWN.highest_overtone and near and size[r] < RING_DOWN.overtone_at_most * size[base]:
             return int(base), times
     return None, 0

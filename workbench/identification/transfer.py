@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, settled
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
-from workbench.identification.input_output.peak_shape import NARROW, one_for_two, overlap_remarks, parts_of, peaks
+from workbench.identification.input_output.peak_shape import PEAKS, one_for_two, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
@@ -27,12 +27,22 @@ from workbench.structure.domain import place_array
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-# Lines that are fitted together; of more, the lines of a band and beyond each of its edges; and lines for each mode.
-MOST_LINES, BAND, BESIDE_BAND, LINES_A_MODE = 1500, 600, 75, 50
-# Relative standard error of a frequency from which on a mode is not reported.
-UNSURE = 0.01
-# Modes for the first estimate of the noise, how often it is estimated, and the tolerance (rms of log).
-STRONGEST, REWEIGHTED, ALIKE = 4, 2, 0.2
+
+@dataclass(frozen=True)
+class TransferSettings:
+    """Constants of the course of an identification from transfer functions."""
+
+    most_lines: int = 1500  # that are fitted together
+    band: int = 600  # of more, the lines of a band
+    beside_band: int = 75  # lines beyond each of its edges
+    lines_a_mode: int = 50  # of a band, at least
+    unsure: float = 0.01  # relative standard error of a frequency from which on a mode is not reported
+    strongest: int = 4  # modes for the first estimate of the noise
+    reweighted: int = 2  # times that it is estimated
+    alike: float = 0.2  # rms of the logarithm by which two estimates may differ and be one
+
+
+TRANSFER = TransferSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,11 +155,13 @@ def identify_transfer(
     """
     budget = Budget(seconds, progress)
     h, f, noise = _checked(transfer, frequencies_hz, channels, band_hz, noise_std)
-    n_bands, each_own = (1, 3) if f.size <= MOST_LINES else (-(-f.size // BAND), LINES_A_MODE)
+    n_bands, each_own = (
+        (1, 3) if f.size <= TRANSFER.most_lines else (-(-f.size // TRANSFER.band), TRANSFER.lines_a_mode)
+    )
     found, share = [], f.size / n_bands
     for k in range(n_bands):
         first, last = round(k * share), round((k + 1) * share)
-        inside = slice(max(first - BESIDE_BAND, 0), last + BESIDE_BAND)
+        inside = slice(max(first - TRANSFER.beside_band, 0), last + TRANSFER.beside_band)
         edges = f[first] if k else 0.0, f[last] if last < f.size else np.inf
         selected = _selected(
             own := budget.share(1.0 / (n_bands - k)),
@@ -179,9 +191,9 @@ def _selected(
     lines, how = Lines(h, omega, powers, noise), {**how, "budget": budget}
     if noise is not None:
         return lines, select_modes(lines, **how)
-    selected = select_modes(lines, **how | {"most_modes": min(STRONGEST, how["most_modes"])})
+    selected = select_modes(lines, **how | {"most_modes": min(TRANSFER.strongest, how["most_modes"])})
     before: np.ndarray | None = None
-    for _ in range(REWEIGHTED):
+    for _ in range(TRANSFER.reweighted):
         guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
         if guessed is None or (before is not None and _alike(guessed, before)):
             break
@@ -197,7 +209,7 @@ def _selected(
 
 def _alike(one: np.ndarray, other: np.ndarray) -> bool:
     """Whether two noise spectra are the same but for their size."""
-    return bool(np.log(one / other).std(axis=(1, 2)).max() < ALIKE)
+    return bool(np.log(one / other).std(axis=(1, 2)).max() < TRANSFER.alike)
 
 
 def _modes_of(
@@ -216,7 +228,7 @@ def _modes_of(
     damped_hz = fit.poles.imag / (2.0 * np.pi)
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
     covariance = pole_covariance(fit, noise_ratio)
-    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < UNSURE * np.abs(fit.poles)
+    sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < TRANSFER.unsure * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
@@ -277,7 +289,7 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
         return fit, parts_hz
     middle = fit.poles.copy()
     for r, others in parts.items():
-        cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < NARROW * np.abs(fit.poles.real[r]))]
+        cluster = [r, *(k for k in others if np.abs(fit.poles.real[k]) < PEAKS.narrow * np.abs(fit.poles.real[r]))]
         middle[r] = np.average(fit.poles[cluster], weights=selected.evidence[cluster])
     return settled(lines, projected(lines, middle[kept], fit.participation[kept])), parts_hz
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workbench.gap.localisation import force_lines
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.force_lines import lines_of
 from workbench.gap.localisation.force_localisation import locate_force
@@ -110,7 +111,7 @@ def test_a_long_record_is_placed_by_some_of_its_lines(rig, measured, monkeypatch
     real = replace(rig, elements=(CubicSpring(1.37, 300.0),))
     records = [measured(real, str(seed), 0.3, seed) for seed in (2, 3)]
     every = placed_by(rig, records)
-    monkeypatch.setattr("workbench.gap.localisation.force_lines.MOST_LINES", 300)
+    monkeypatch.setattr(force_lines, "LINES", replace(force_lines.LINES, most_lines=300))
     fewer = placed_by(rig, records)
     assert fewer.holds and every.at_std < fewer.at_std < 8.0 * every.at_std
     assert abs(fewer.at - 1.37) < 4.0 * fewer.at_std

@@ -23,17 +23,29 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion
 from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Rectangle, Where
 
-LEVELS = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
-MEMORIES = (10.0, 1000.0)  # its correlation time, in samples
-MOST_PEAKS = 3
-PLACES, FEWER_PLACES = 40, 20  # where a force is looked for: the first, and one beside what is given
-BESIDE, RESOLVED = 0.95, 2e-3  # of the spacing of places
-STILL = 1e-6  # of what moves most: a point, or what is between two, that no force moves
-BROAD, NARROW = 0.1, 0.03  # of a rectangle's diagonal: between tops of its profile, and once they are refined
-FINER = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
-POINTS_TRIED, PAIRS_TRIED = 4, 4  # named points, and pairs of them, whose motion is looked at
-ALIKE = 1e-4  # 1 - cos² of the angle between the motions of two pairs of points: less is one place
-MANY_POINTS = 12  # named points, of which all are looked at
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """Constants of the search for where a force acts."""
+
+    levels: tuple[float, ...] = (1e-3, 1e-2, 1e-1, 1.0)  # rms of an unmodelled force over that of the inputs
+    memories: tuple[float, ...] = (10.0, 1000.0)  # its correlation time, in samples
+    most_peaks: int = 3
+    places: int = 40  # where a force is looked for
+    beside: float = 0.95  # of the spacing of places: how far about a peak it is refined
+    resolved: float = 2e-3  # of the spacing of places: to how much
+    still: float = 1e-6  # of what moves most: a point, or what is between two, that no force moves
+    broad: float = 0.1  # of a rectangle's diagonal: between tops of its profile
+    narrow: float = 0.03  # likewise, once they are refined
+    finer: int = 5  # steps from one place of a rectangle's grid to the next, once the likeliest are known
+    points_tried: int = 4  # named points whose motion is looked at
+    pairs_tried: int = 4  # pairs of them, likewise
+    alike: float = 1e-4  # 1 - cos² of the angle between the motions of two pairs of points: less is one place
+    many_points: int = 12  # named points, of which all are looked at
+
+
+EVIDENCE = EvidenceSettings()
+FEWER_PLACES = 20  # where a force is looked for beside what is given
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +100,7 @@ class Evidence:
     data: FitData
     motions: tuple[Motion, ...]
     residuals: tuple[np.ndarray, ...]
-    n_places: int = PLACES
+    n_places: int = EVIDENCE.places
     given_places: tuple[Where, ...] = ()
     given_size: tuple[float, float] | None = None
     workers: Workers = ALONE
@@ -96,7 +108,7 @@ class Evidence:
 
     @classmethod
     def of(
-        cls, rig: Rig, data: FitData, n_places: int = PLACES, workers: Workers = ALONE, *, bent: bool = False
+        cls, rig: Rig, data: FitData, n_places: int = EVIDENCE.places, workers: Workers = ALONE, *, bent: bool = False
     ) -> "Evidence":
         """Simulate the rig on the fit records."""
         motions = data.motions(rig)
@@ -141,7 +153,7 @@ class Evidence:
         if isinstance(self.domain, NamedPoints):
             places: tuple[Any, ...] = (*self.domain.grid(), *self.domain.pairs())
             moved = [float(np.abs(self.rig.modes.phi_at(where)).max()) for where in places]
-            return tuple(where for where, size in zip(places, moved, strict=True) if size > STILL * max(moved))
+            return tuple(where for where, size in zip(places, moved, strict=True) if size > EVIDENCE.still * max(moved))
         return self.domain.grid(self._along)
 
     @cached_property
@@ -150,7 +162,7 @@ class Evidence:
         if isinstance(self.domain, Interval):
             return [float(x) for x in self.places[::2]]
         if isinstance(self.domain, NamedPoints):
-            many = len(self.domain.names) > MANY_POINTS
+            many = len(self.domain.names) > EVIDENCE.many_points
             return [p for p in self.peaks if not isinstance(p, Between)] if many else self.domain.grid()
         return self.domain.grid(6)
 
@@ -160,7 +172,7 @@ class Evidence:
         if self.given_size is not None:
             return self.given_size
         quick = list(self.residuals[: max(2, len(self.residuals) - 2)])
-        sizes = [(share * self.data.force_rms, memory) for memory in MEMORIES for share in LEVELS]
+        sizes = [(share * self.data.force_rms, memory) for memory in EVIDENCE.memories for share in EVIDENCE.levels]
 
         coarse = self._coarse
 
@@ -175,9 +187,9 @@ class Evidence:
         if isinstance(self.domain, Interval):
             every_fifth: Sequence[Any] = self.places[::5]
             return every_fifth
-        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= MANY_POINTS:
+        if isinstance(self.domain, NamedPoints) and len(self.domain.names) <= EVIDENCE.many_points:
             return self.domain.grid()
-        return self._screened[:MOST_PEAKS]
+        return self._screened[: EVIDENCE.most_peaks]
 
     @cached_property
     def profile(self) -> np.ndarray:
@@ -207,7 +219,7 @@ class Evidence:
             return self._tops_over(self.domain, ranked)
         pairs = [i for i, where in enumerate(ranked) if isinstance(where, Between)]
         points = [i for i, where in enumerate(ranked) if not isinstance(where, Between)]
-        most = len(points) if len(points) <= MANY_POINTS else POINTS_TRIED
+        most = len(points) if len(points) <= EVIDENCE.many_points else EVIDENCE.points_tried
         return tuple(ranked[i] for i in sorted((*points[:most], *self._unlike(ranked, pairs))))
 
     def _unlike(self, ranked: Sequence[Any], pairs: Sequence[int]) -> list[int]:
@@ -218,10 +230,10 @@ class Evidence:
         for i in pairs:
             shape = self.rig.modes.phi_at(ranked[i])
             shape = shape / max(float(np.linalg.norm(shape)), 1e-300)
-            if all((shape @ other) ** 2 < 1.0 - ALIKE for other in shapes):
+            if all((shape @ other) ** 2 < 1.0 - EVIDENCE.alike for other in shapes):
                 kept.append(i)
                 shapes.append(shape)
-            if len(kept) == PAIRS_TRIED:
+            if len(kept) == EVIDENCE.pairs_tried:
                 break
         return kept
 
@@ -232,9 +244,9 @@ class Evidence:
 
     def _tops_over(self, rectangle: Rectangle, ranked: Sequence[Any]) -> tuple[tuple[float, float], ...]:
         """The tops of the profile over a rectangle, and their images: a symmetric plate all but repeats itself."""
-        (a, b), tops = rectangle.length, _apart(ranked, rectangle, BROAD, MOST_PEAKS)
+        (a, b), tops = rectangle.length, _apart(ranked, rectangle, EVIDENCE.broad, EVIDENCE.most_peaks)
         mirrored = [image for x, y in tops for image in ((x, y), (a - x, y), (x, b - y), (a - x, b - y))]
-        offsets = max(a, b) / self._along * np.arange(-FINER, FINER + 1) / FINER
+        offsets = max(a, b) / self._along * np.arange(-EVIDENCE.finer, EVIDENCE.finer + 1) / EVIDENCE.finer
         around = [
             [(float(np.clip(x + dx, 0.0, a)), float(np.clip(y + dy, 0.0, b))) for dx in offsets for dy in offsets]
             for x, y in mirrored
@@ -243,7 +255,7 @@ class Evidence:
         refined = [places[int(np.argmin(row))] for places, row in zip(around, misfits, strict=True)]
         judged = self.workers.map(self._misfit, refined)
         order = np.argsort(judged, kind="stable")
-        return tuple(_apart([refined[i] for i in order], rectangle, NARROW, MOST_PEAKS))
+        return tuple(_apart([refined[i] for i in order], rectangle, EVIDENCE.narrow, EVIDENCE.most_peaks))
 
     def _misfit(self, where: Where) -> float:
         """What one force of any law there leaves, in units of the noise, the ends of records accounted for."""
@@ -260,7 +272,7 @@ class Evidence:
         profile, places = self.profile, np.asarray(self.places, float)
         padded = np.r_[-np.inf, profile, -np.inf]
         tops = np.flatnonzero((profile >= padded[:-2]) & (profile >= padded[2:]))
-        refined = self.workers.map(self._refined, places[tops[np.argsort(-profile[tops])][:MOST_PEAKS]])
+        refined = self.workers.map(self._refined, places[tops[np.argsort(-profile[tops])][: EVIDENCE.most_peaks]])
         return tuple(at for at, _ in sorted(refined, key=lambda top: -top[1]))
 
     def _refined(self, at: float) -> tuple[float, float]:
@@ -268,9 +280,9 @@ class Evidence:
         spacing, residuals = self.places[1] - self.places[0], list(self.residuals)
         found = minimize_scalar(
             lambda x: -log_likelihood(self.filter_at(x, *self.size), residuals),
-            bounds=(at - BESIDE * spacing, at + BESIDE * spacing),
+            bounds=(at - EVIDENCE.beside * spacing, at + EVIDENCE.beside * spacing),
             method="bounded",
-            options={"xatol": RESOLVED * spacing},
+            options={"xatol": EVIDENCE.resolved * spacing},
         )
         return float(found.x), -float(found.fun)
 

@@ -24,13 +24,21 @@ from workbench.gap.prediction.unmodelled_force import SampledModel
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import reading_of
 
-TOP = 0.9  # of half the sample rate: above, what is folded down is no longer small
-MOST_LINES = 8192  # of a record: of a longer one every so many, which costs precision alone
-WIDTH = 75  # lines over which the spectrum of the force is taken to be flat
-CHANCE = 2.0  # deviations by which noise may pass for a force in them
-COUNTING = 0.02  # weight below which a line is left out
-SCREENED = 300  # lines, the strongest, where many places are compared
-ROUNDS = 4  # of the spectrum of the force, each weighted by the one before
+
+@dataclass(frozen=True)
+class LinesSettings:
+    """Constants of the lines of a record that a force stands out in."""
+
+    top: float = 0.9  # of half the sample rate: above, what is folded down is no longer small
+    most_lines: int = 8192  # of a record: of a longer one every so many, which costs precision alone
+    width: int = 75  # lines over which the spectrum of the force is taken to be flat
+    chance: float = 2.0  # deviations by which noise may pass for a force in them
+    counting: float = 0.02  # weight below which a line is left out
+    screened: int = 300  # lines, the strongest, where many places are compared
+    rounds: int = 4  # of the spectrum of the force, each weighted by the one before
+
+
+LINES = LinesSettings()
 UNDAMPED = 1e-9j  # of the stiffness: what keeps a mode without damping finite on a line of its own
 
 
@@ -222,7 +230,7 @@ class Lines:
 
     def weighted(self, weights: np.ndarray) -> "Lines":
         """The lines by other weights (n_lines,), without those that count for nothing."""
-        kept = weights > COUNTING
+        kept = weights > LINES.counting
         return Lines(self.receptances.on(kept), self.left[kept], weights[kept])
 
     def misfit(self, shape: np.ndarray) -> float:
@@ -237,11 +245,11 @@ class Lines:
         """Share (n_lines,) of a force there in what is read along it: the weight of each line."""
         u, a, power = self._along(shape)
         share, sure = np.ones_like(power), np.ones_like(power)
-        for _ in range(ROUNDS):
+        for _ in range(LINES.rounds):
             root = np.sqrt(share)
             end, _ = self._end(u * root[:, None], a * root)
             read = (np.abs(a - u @ end) ** 2 - 1.0) / power
-            chance = CHANCE * np.sqrt(_smooth((sure / power) ** 2))
+            chance = LINES.chance * np.sqrt(_smooth((sure / power) ** 2))
             spectrum = np.maximum(_smooth(sure * read) - chance, 0.0) / _smooth(sure)
             share = spectrum * power / (1.0 + spectrum * power)
             # a force far above the noise has all of a line, but for rounding
@@ -267,7 +275,7 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
 
     The ends of the record are left out, and lines where little is read.
     """
-    strong = np.argsort(-lines.weights * np.sum(np.abs(lines.left) ** 2, axis=1))[:SCREENED]
+    strong = np.argsort(-lines.weights * np.sum(np.abs(lines.left) ** 2, axis=1))[: LINES.screened]
     power = lines.power
     lines = Lines(lines.receptances.on(strong), lines.left[strong], lines.weights[strong])
     to_force = np.moveaxis(np.array([lines.receptances.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
@@ -279,7 +287,7 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
 
 
 def _smooth(values: np.ndarray) -> np.ndarray:
-    width = min(WIDTH, values.size)
+    width = min(LINES.width, values.size)
     return np.convolve(np.pad(values, (width // 2, width - 1 - width // 2), mode="edge"), np.ones(width), mode="valid")
 
 
@@ -298,8 +306,8 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
-            top = max(int(0.5 * TOP * n), 2)
-            taken = np.arange(1, top, 1 + top // MOST_LINES)
+            top = max(int(0.5 * LINES.top * n), 2)
+            taken = np.arange(1, top, 1 + top // LINES.most_lines)
             made[n] = taken, receptances_of(rig, model, 2.0 * np.pi * taken / (n * sample_time), n, sample_time)
         taken, receptances = made[n]
         left = np.fft.rfft(residual, axis=1)[:, taken].T / noise

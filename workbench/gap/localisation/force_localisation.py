@@ -13,18 +13,29 @@ from workbench.gap.localisation.force_lines import Lines, lines_of, screened
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle
 from workbench.threads import one_blas_thread
 
-VALLEYS = 3  # of the misfit that are gone into
-ROUNDS = 3  # in each: where the force is, which lines it stands out in
-BESIDE, RESOLVED = 0.95, 1e-3  # of the spacing of places
-PAIRS_SHOWN = 12  # of named points
-TWO_SIGMA = 4.0  # rise of the misfit
-NOISE, ALL_BUT = 0.1, 1e-5  # left by what may be one force: of the noise, and of the gap
-CHANCE = 3.0  # deviations of a sum of squares
-EDGE = 1e-4  # of the length: a place stays so far inside
-NEAR = 0.02  # of a rectangle's size: the first simplex about a peak
-SIMPLEX = {"fatol": 1e-2, "maxfev": 60}  # of the misfit, in squared deviations; evaluations
-CURVED_OVER = 0.1  # of that simplex: half of the stretch over which the misfit's curvature is taken
-BISECTIONS = 6  # of the distance at which the misfit has risen
+
+@dataclass(frozen=True)
+class LocalisationSettings:
+    """Constants of the localisation of one force."""
+
+    valleys: int = 3  # of the misfit that are gone into
+    rounds: int = 3  # in each: where the force is, which lines it stands out in
+    beside: float = 0.95  # of the spacing of places: how far about a valley it is refined
+    resolved: float = 1e-3  # of the spacing of places: to how much
+    pairs_shown: int = 12  # of named points
+    two_sigma: float = 4.0  # rise of the misfit
+    noise: float = 0.1  # of the noise, left by what may be one force
+    all_but: float = 1e-5  # of the gap, likewise
+    chance: float = 3.0  # deviations of a sum of squares
+    edge: float = 1e-4  # of the length: a place stays so far inside
+    near: float = 0.02  # of a rectangle's size: the first simplex about a peak
+    tolerance: float = 1e-2  # of the misfit, in squared deviations
+    evaluations: int = 60  # of the simplex
+    curved_over: float = 0.1  # of that simplex: half of the stretch over which the misfit's curvature is taken
+    bisections: int = 6  # of the distance at which the misfit has risen
+
+
+LOCALISATION = LocalisationSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,14 +100,14 @@ def locate_force(evidence: Evidence) -> ForceLocation:
 def _shown(places: Sequence[Any], profile: np.ndarray) -> list[Any]:
     """All named points, and the likeliest pairs of them."""
     ranked = [places[i] for i in np.argsort(-profile, kind="stable") if isinstance(places[i], Between)]
-    return [*(where for where in places if not isinstance(where, Between)), *ranked[:PAIRS_SHOWN]]
+    return [*(where for where in places if not isinstance(where, Between)), *ranked[: LOCALISATION.pairs_shown]]
 
 
 def _valleys(places: np.ndarray, misfit: np.ndarray) -> np.ndarray:
     """The places of the deepest valleys."""
     padded = np.r_[np.inf, misfit, np.inf]
     bottoms = np.flatnonzero((misfit <= padded[:-2]) & (misfit <= padded[2:]))
-    return places[bottoms[np.argsort(misfit[bottoms])][:VALLEYS]]
+    return places[bottoms[np.argsort(misfit[bottoms])][: LOCALISATION.valleys]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +139,11 @@ class _Search:
         """Share of the gap's power that a force there accounts for, and whether it is all of it."""
         values = 2 * sum(each.left.size for each in self.lines)
         gap = sum(each.power for each in self.lines) - values
-        if self.freedom == 0 or gap < CHANCE * np.sqrt(2.0 * values):
+        if self.freedom == 0 or gap < LOCALISATION.chance * np.sqrt(2.0 * values):
             return 0.0, None
-        left, chance = self.left(at), CHANCE * np.sqrt(2.0 / self.freedom)
+        left, chance = self.left(at), LOCALISATION.chance * np.sqrt(2.0 / self.freedom)
         share = float(np.clip(1.0 - left * self.freedom / gap, 0.0, 1.0))
-        return share, bool(left < NOISE + chance or share > 1.0 - ALL_BUT)
+        return share, bool(left < LOCALISATION.noise + chance or share > 1.0 - LOCALISATION.all_but)
 
     def along(self, lines: list[Lines], places: Sequence[Any]) -> np.ndarray:
         """The misfit at each of the places."""
@@ -151,15 +162,20 @@ class _Search:
         extent = np.array(rectangle.length)
 
         def misfit(xy: np.ndarray) -> float:
-            inside = np.clip(xy, EDGE * extent, (1.0 - EDGE) * extent)
+            inside = np.clip(xy, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
             return self.misfit(informative, (float(inside[0]), float(inside[1])))
 
-        reach = NEAR * rectangle.size
+        reach = LOCALISATION.near * rectangle.size
         simplex = np.array(top) + reach * np.array([(0.0, 0.0), (1.0, 0.0), (0.0, 1.0)])
-        options = {"initial_simplex": simplex, "xatol": RESOLVED * reach, **SIMPLEX}
+        options = {
+            "initial_simplex": simplex,
+            "xatol": LOCALISATION.resolved * reach,
+            "fatol": LOCALISATION.tolerance,
+            "maxfev": LOCALISATION.evaluations,
+        }
         found = minimize(misfit, top, method="Nelder-Mead", options=options)
-        at = np.clip(found.x, EDGE * extent, (1.0 - EDGE) * extent)
-        step = CURVED_OVER * reach
+        at = np.clip(found.x, LOCALISATION.edge * extent, (1.0 - LOCALISATION.edge) * extent)
+        step = LOCALISATION.curved_over * reach
         rises = [misfit(at + h) + misfit(at - h) - 2.0 * found.fun for h in step * np.array([(1, 0), (0, 1)])]
         flattest = max(min(rises), 1e-12)  # of |r|², twice the logarithm of a likelihood ratio
         return (float(at[0]), float(at[1])), float(min(step * np.sqrt(2.0 / flattest), rectangle.size))
@@ -168,17 +184,17 @@ class _Search:
         """The bottom of a valley."""
         at, informative = float(top), self.informative(top)
         spacing = self.evidence.places[1] - self.evidence.places[0]
-        for _ in range(ROUNDS):
+        for _ in range(LOCALISATION.rounds):
             found = minimize_scalar(
                 lambda x, lines: self.misfit(lines, x),
-                bounds=self._inside(at - BESIDE * spacing, at + BESIDE * spacing),
+                bounds=self._inside(at - LOCALISATION.beside * spacing, at + LOCALISATION.beside * spacing),
                 args=(informative,),
                 method="bounded",
-                options={"xatol": RESOLVED * spacing},
+                options={"xatol": LOCALISATION.resolved * spacing},
             )
             moved, at = abs(found.x - at), float(found.x)
             informative = self.informative(at)
-            if moved < RESOLVED * spacing:
+            if moved < LOCALISATION.resolved * spacing:
                 break
         return at
 
@@ -189,7 +205,7 @@ class _Search:
     def deviation(self, lines: list[Lines], at: float) -> float:
         """Half of one standard deviation either way, from where the misfit is two higher."""
         lowest = self.misfit(lines, at)
-        return sum(self._rises(lines, at, side, lowest + TWO_SIGMA) for side in (-1.0, 1.0)) / 4.0
+        return sum(self._rises(lines, at, side, lowest + LOCALISATION.two_sigma) for side in (-1.0, 1.0)) / 4.0
 
     def _rises(self, lines: list[Lines], at: float, side: float, level: float) -> float:
         """How far on one side the misfit comes to a level."""
@@ -199,7 +215,7 @@ class _Search:
             if self.misfit(lines, at + side * outside) > level:
                 break
             inside, outside = outside, 2.0 * outside
-        for _ in range(BISECTIONS):
+        for _ in range(LOCALISATION.bisections):
             middle = 0.5 * (inside + outside)
             beyond = not 0 < at + side * middle < length or self.misfit(lines, at + side * middle) > level
             inside, outside = (inside, middle) if beyond else (middle, outside)
@@ -207,5 +223,5 @@ class _Search:
 
     def _inside(self, low: float, high: float) -> tuple[float, float]:
         length = self.evidence.domain.size
-        edge = EDGE * length
+        edge = LOCALISATION.edge * length
         return max(low, edge), min(high, length - edge)

@@ -16,15 +16,24 @@ from workbench.rig.linear import held_response, modal_motion, modal_poles, strai
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import participation_of
 
-MODE_SHARE = 0.05
-ONE_SENSOR = 0.97  # of the gap
-OCTAVES = 8
-CLEAR = 0.1  # of the noise: a gap that is larger by less is none
-# A gap of lightly damped modes outlives any segment of a record, so that coherence by averaged spectra would miss most
-# of it; a change of a mode's frequency, damping or gain lies nearly in the span of resonators close to the mode.
-SPREAD = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
-MOST_MODES = 6
-RIDGES = np.logspace(-9, -1, 9)
+
+@dataclass(frozen=True)
+class WhereSettings:
+    """Constants of what is said of where a gap is."""
+
+    mode_share: float = 0.05  # of the gap, from which on a mode is named
+    one_sensor: float = 0.97  # of the gap, from which on it is that of one sensor
+    octaves: int = 8  # below half the sample rate
+    clear: float = 0.1  # of the noise: a gap that is larger by less is none
+    # of the frequency of a mode: resonators about it. A gap of lightly damped modes outlives any segment of a record,
+    # so that coherence by averaged spectra would miss most of it; a change of a mode's frequency, damping or gain lies
+    # nearly in the span of resonators close to the mode
+    spread: tuple[float, ...] = (0.85, 0.93, 0.97, 0.99, 1.0, 1.01, 1.03, 1.07, 1.15)
+    most_modes: int = 6  # that have resonators
+
+
+WHERE = WhereSettings()
+RIDGES = np.logspace(-9, -1, 9)  # of the strongest direction, of which the one that predicts held-out samples is taken
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +84,7 @@ class Where:
     @property
     def beyond_noise(self) -> float:
         """The largest gap of a record that is clearly above its noise, less that noise, as a share of the signal."""
-        clear = self.record_gaps > (1.0 + CLEAR) * self.record_floors
+        clear = self.record_gaps > (1.0 + WHERE.clear) * self.record_floors
         power = np.where(clear, self.record_gaps**2 - self.record_floors**2, 0.0)
         return float(np.sqrt(power.max()))
 
@@ -99,12 +108,12 @@ def locate(evidence: Evidence, effects: Sequence[Effect], place: ForceLocation) 
     frequencies = evidence.rig.modes.frequencies_hz
     between = np.sqrt(np.maximum(frequencies[1:] * frequencies[:-1], 0.0))
     mode_shares = _shares_between(np.r_[0.0, between, np.inf], evidence, scaled)
-    octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - OCTAVES, 1)]
+    octaves = np.r_[0.0, 0.5 / data.counted[0].sample_time * 2.0 ** np.arange(1 - WHERE.octaves, 1)]
     levels = np.array([np.sqrt(np.mean(record.inputs**2)) for record in data.counted])
     gaps = np.array([np.sqrt((s**2).mean()) for s in scaled])
     return Where(
         path=_path(evidence, excess, effects),
-        modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > MODE_SHARE)),
+        modes=tuple(int(r) + 1 for r in np.flatnonzero(mode_shares > WHERE.mode_share)),
         amplitude_dependent=_amplitude_dependent(effects, excess, data),
         mode_shares=mode_shares,
         band_edges_hz=octaves,
@@ -158,7 +167,7 @@ def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> 
 
 def of_one_sensor(excess: np.ndarray) -> bool:
     """Whether one sensor alone disagrees, by the power above the noise in each (n_outputs,)."""
-    return bool(excess.max() > ONE_SENSOR * excess.sum())
+    return bool(excess.max() > WHERE.one_sensor * excess.sum())
 
 
 def _joined(evidence: Evidence) -> np.ndarray:
@@ -185,7 +194,7 @@ def linear_share(rig: Rig, data: FitData, residuals: Sequence[np.ndarray], share
         residuals: (n_outputs, n_samples) a record, measured less predicted.
         shares: (n_modes,) of the gap around each mode; the few largest are looked at.
     """
-    chosen = [int(r) for r in np.argsort(-shares)[:MOST_MODES] if shares[r] > 0]
+    chosen = [int(r) for r in np.argsort(-shares)[: WHERE.most_modes] if shares[r] > 0]
     sizes = np.sqrt(np.mean([record.outputs.var(axis=1) for record in data.counted], axis=0))[:, None]
     pieces = []
     for record, residual in zip(data.counted, residuals, strict=True):
@@ -218,9 +227,9 @@ def _replies(rig: Rig, chosen: Sequence[int], record: Record) -> np.ndarray:
         return record.inputs
     slowest = 2.0 * np.pi / (record.n_samples * record.sample_time)
     alone, acting = np.eye(len(rig.actuators)), participation_of(rig)
-    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), SPREAD]
+    omega = np.maximum(rig.modes.omega[chosen], slowest)[:, None] * np.r_[np.ones(len(alone)), WHERE.spread]
     damping = np.maximum(np.diag(rig.modes.damping)[chosen, None], 1e-3 * omega)
-    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(SPREAD))])
+    driven = np.array([row for r in chosen for row in (*alone, *[acting[r]] * len(WHERE.spread))])
     resonators = modal_poles(omega.ravel(), np.diag(damping.ravel()))
     response_to = held_response if record.input_hold == "zero" else straight_response
     response, _ = response_to(resonators, record.inputs, driven, record.sample_time)

@@ -1,7 +1,7 @@
 """Noise of the logged inputs: what it leaves, how loud it is, and the filter that makes it white."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +13,20 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.simulate import predict
 
-MOST_LOGGED = 0.02  # of the rms of an input: what a logger adds at most
-LEAST_LOGGED = 1e-3  # likewise: no record distinguishes less from none
-SHARES = tuple(MOST_LOGGED * 0.5**k for k in range(5))  # that are tried; between them the likeliest is interpolated
-DRAWS = 12  # of that noise, of which the loudest is what chance may leave
-QUIETEST = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
+
+@dataclass(frozen=True)
+class LoggedSettings:
+    """Constants of the search for noise of the logged inputs."""
+
+    draws: int = 12  # of that noise, of which the loudest is what chance may leave
+    quietest: float = 1e-12  # of the loudest force: none at all would leave the filter nothing to estimate
+    most: float = 0.02  # of the rms of an input: what a logger adds at most
+
+
+LOGGED = LoggedSettings()
+LEAST_LOGGED = 1e-3  # of the rms of an input: no record distinguishes less from none
+# That are tried; between them the likeliest is interpolated.
+SHARES = tuple(LOGGED.most * 0.5**k for k in range(5))
 
 
 def logging_noise_power(rig: Rig, data: FitData) -> np.ndarray:
@@ -51,7 +60,7 @@ def loudest_logging_noise(rig: Rig, data: FitData) -> np.ndarray:
         mean_square: Floats = (response**2).mean(axis=1) / data.noise**2
         return mean_square
 
-    draws = np.array([[power(record) for record in data.counted] for _ in range(DRAWS)])
+    draws = np.array([[power(record) for record in data.counted] for _ in range(LOGGED.draws)])
     loudest = draws.mean(axis=2).argmax(axis=0)
     return np.array([draws[draw, i] for i, draw in enumerate(loudest)])
 
@@ -78,7 +87,7 @@ def logging_noise(by_channel: np.ndarray, sensor_noise: np.ndarray, per_unit: np
     if rows.any():  # the record with the weakest inputs shows the noise of the sensors itself
         beyond, per = by_channel[rows] - by_channel[~rows], per_unit[rows] - per_unit[~rows]
     share = np.median(np.maximum(beyond, 0.0) / np.maximum(per, 1e-300))
-    return float(min(np.sqrt(share), MOST_LOGGED))
+    return float(min(np.sqrt(share), LOGGED.most))
 
 
 def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilter]:
@@ -98,7 +107,7 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
 
 def _variances(record: Record, share: float) -> Floats:
     power: Floats = share**2 * (record.inputs**2).mean(axis=1)
-    return np.maximum(power, max(QUIETEST * power.max(), 1e-300))
+    return np.maximum(power, max(LOGGED.quietest * power.max(), 1e-300))
 
 
 class LikeliestShare(NamedTuple):

@@ -1,17 +1,28 @@
 """The noise of each sensor, found from what a fitted model leaves of several records."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from workbench.arrays import Floats
 
-LINES = 20  # of the periodogram in a band, so that its mean scatters by a quarter
-REACH, QUIET = 5, 0.25  # bands to either side, and their quantile: modes leave a quarter of them free of peaks
-LOWER = 0.67  # deviations by which that quantile lies below the mean
-ALIKE, SAME = 1.3, 1.1  # times the power of the quietest record; what differs from it by chance alone
-LOUD = 0.5  # of the mean square: peaks that hold less are not worth leaving out
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """Constants of the estimate of a sensor's noise."""
+
+    lines: int = 20  # of the periodogram in a band, so that its mean scatters by a quarter
+    reach: int = 5  # bands to either side
+    quiet: float = 0.25  # quantile of them: modes leave a quarter of them free of peaks
+    lower: float = 0.67  # deviations by which that quantile lies below the mean
+    alike: float = 1.3  # times the power of the quietest record: noise as strong in two records
+    same: float = 1.1  # likewise: what differs from it by chance alone
+    loud: float = 0.5  # of the mean square: peaks that hold less are not worth leaving out
+
+
+NOISE = NoiseSettings()
 
 
 def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
@@ -27,10 +38,10 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     whole = np.sort([(residual**2).mean(axis=1) for residual in residuals], axis=0)
     under = np.min([_under_peaks(residual) for residual in residuals], axis=0)
     # what is as strong in two records of unequal level is noise, of whatever colour
-    alike = whole[1] < ALIKE * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
-    same = whole < SAME * whole[0]
+    alike = whole[1] < NOISE.alike * whole[0] if len(residuals) > 1 else np.zeros(under.size, bool)
+    same = whole < NOISE.same * whole[0]
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
-    power: Floats = np.where(alike | (under > LOUD * whole[0]), noise, under)
+    power: Floats = np.where(alike | (under > NOISE.loud * whole[0]), noise, under)
     return np.sqrt(power)
 
 
@@ -39,10 +50,10 @@ def _under_peaks(residual: Floats) -> Floats:
     n_outputs, n_samples = residual.shape
     window = np.hanning(n_samples)
     spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
-    bands = max(spectrum.shape[1] // LINES, 1)
+    bands = max(spectrum.shape[1] // NOISE.lines, 1)
     means = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
-    reach = min(REACH, (bands - 1) // 2)
+    reach = min(NOISE.reach, (bands - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
-    floor = np.quantile(around, QUIET, axis=2) * (1.0 + LOWER / np.sqrt(LINES))
+    floor = np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines))
     under: Floats = np.minimum(means, floor).mean(axis=1)
     return under

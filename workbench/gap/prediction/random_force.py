@@ -20,16 +20,30 @@ from workbench.gap.prediction.unmodelled_force import (
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints, Where, same_place
 
-COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))  # memory, stages
-SIZES = (3e-3, 3e-2, 3e-1)  # of a typical force
-LONGEST_MEMORY = 0.9995  # a sample: beyond, the force is a drift
-FIRST_STEPS = {"place": 0.03, "log rms": 0.5, "logit of memory": 0.7}  # of the simplex; a place in shares of the extent
-SIMPLEX = {"xatol": 1e-4, "fatol": 0.1, "maxfev": 160}  # shares and logarithms; twice a log-likelihood; evaluations
-CURVED_OVER = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
-# What one force of the same strength in every record shows:
-LEVEL_SPREAD = 0.15  # of its rms between records, relative, at most
-WHITENED = 0.08  # mean square of each whitened residual, off one by at most
-FOLLOWS = 0.1  # share of it that inputs and motion account for, at most
+
+@dataclass(frozen=True)
+class RandomForceSettings:
+    """Constants of the fit of a random force."""
+
+    sizes: tuple[float, ...] = (3e-3, 3e-2, 3e-1)  # of a typical force
+    longest_memory: float = 0.9995  # a sample: beyond, the force is a drift
+    first_place: float = 0.03  # of the extent: first step of the simplex along each coordinate of the place
+    first_log_rms: float = 0.5  # likewise, along the logarithm of its rms
+    first_logit: float = 0.7  # likewise, along the logit of its memory
+    tolerance: float = 1e-4  # shares and logarithms
+    loss_tolerance: float = 0.1  # twice a log-likelihood
+    evaluations: int = 160
+    curved_over: float = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
+    # what may be one random force of the surroundings: by how much its level spreads between records, relative; how far
+    # the mean square of what is left may be from one; what share of it inputs and motion may account for
+    level_spread: float = 0.15
+    whitened: float = 0.08
+    follows: float = 0.1
+
+
+RANDOM_FORCE = RandomForceSettings()
+# Memory and stages, the likeliest of which a fit starts from.
+COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))
 TONAL = 0.7  # share of it that its mean and one sinusoid account for, at most
 
 
@@ -73,13 +87,15 @@ class RandomForceFit:
         """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
         no constant or single tone, which could be predicted.
         """
-        return self.holds_within(WHITENED)
+        return self.holds_within(RANDOM_FORCE.whitened)
 
     def holds_within(self, whitened: float) -> bool:
         """The same, where the whitened residual of each record may be so far from unit power."""
         spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
         white = np.abs(self.chi2_by_record - 1.0).max() < whitened
-        return bool(spread < LEVEL_SPREAD and white and self.follows < FOLLOWS and self.tonal < TONAL)
+        return bool(
+            spread < RANDOM_FORCE.level_spread and white and self.follows < RANDOM_FORCE.follows and self.tonal < TONAL
+        )
 
 
 def fit_random_force(
@@ -107,7 +123,7 @@ def fit_random_force(
 
     def loss(point: np.ndarray, start: Where, stages: int, records: list[np.ndarray]) -> float:
         memory = 1.0 / (1.0 + np.exp(-point[d + 1]))
-        if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > LONGEST_MEMORY:
+        if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
             return 1e300
         value = -2.0 * log_likelihood(filter_at(placed_at(point, start), point[d], memory, stages), records)
         return value if np.isfinite(value) else 1e300
@@ -116,13 +132,18 @@ def fit_random_force(
         (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], where, stages)
         for where in places
         for within in [_fractions(where, extent)]
-        for share in SIZES
+        for share in RANDOM_FORCE.sizes
         for memory, stages in COLOURS
     ]
     start, beside, stages = min(grid, key=lambda each: loss(each[0], each[1], each[2], quick))
-    place, log_size, logit_of_memory = FIRST_STEPS.values()
+    place, log_size, logit_of_memory = RANDOM_FORCE.first_place, RANDOM_FORCE.first_log_rms, RANDOM_FORCE.first_logit
     simplex = start + np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
-    options = {"initial_simplex": simplex, **SIMPLEX}
+    options = {
+        "initial_simplex": simplex,
+        "xatol": RANDOM_FORCE.tolerance,
+        "fatol": RANDOM_FORCE.loss_tolerance,
+        "maxfev": RANDOM_FORCE.evaluations,
+    }
     found = minimize(loss, start, args=(beside, stages, residuals), method="Nelder-Mead", options=options)
     at, log_rms, logit = placed_at(found.x, beside), found.x[d], found.x[d + 1]
     memory = float(1.0 / (1.0 + np.exp(-logit)))
@@ -134,7 +155,8 @@ def fit_random_force(
         at=at,
         rms=float(np.exp(log_rms)),
         at_std=tuple(
-            _deviation(lambda p: loss(p, beside, stages, residuals), found.x, i, CURVED_OVER) * float(extent[i])
+            _deviation(lambda p: loss(p, beside, stages, residuals), found.x, i, RANDOM_FORCE.curved_over)
+            * float(extent[i])
             for i in range(d)
         ),
         memory=memory,

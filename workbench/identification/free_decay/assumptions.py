@@ -18,12 +18,19 @@ from workbench.structure.damping import ProportionalDamping
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
 
-STRETCHES = 4
-# Amplitude that a mode must have in a stretch, and cycles, for its frequency there to mean something.
-LEAST_EVIDENCE, LEAST_CYCLES = 100.0, 3.0
-# Relative standard error of a frequency up to which a segment counts.
-LEAST_SURE = 0.01
-SURE = 1e-3
+
+@dataclass(frozen=True)
+class AssumptionsSettings:
+    """Constants of the test for dependence on amplitude."""
+
+    segments: int = 4  # of a record, each twice as long as the one before
+    least_evidence: float = 100.0  # χ² of a mode in a segment, for its frequency there to mean something
+    least_cycles: float = 3.0  # likewise
+    least_sure: float = 0.01  # relative standard error of a frequency up to which a segment counts
+    chance: float = 1e-3  # that a linear structure is said to depend on amplitude
+
+
+ASSUMPTIONS = AssumptionsSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,12 +61,12 @@ class AmplitudeDependence:
     @property
     def depends(self) -> np.ndarray:
         """Modes (n_modes,) that depend on amplitude: chance under one in a thousand over all that was compared."""
-        return np.asarray(np.any(self.probability < SURE / self.probability.size, axis=0))
+        return np.asarray(np.any(self.probability < ASSUMPTIONS.chance / self.probability.size, axis=0))
 
 
 @one_blas_thread
 def amplitude_dependence(
-    records: Record | Sequence[Record], refined: Refined, *, stretches: int = STRETCHES
+    records: Record | Sequence[Record], refined: Refined, *, stretches: int = ASSUMPTIONS.segments
 ) -> AmplitudeDependence:
     """Frequency and damping of each mode of free decays, stretch by stretch.
 
@@ -98,7 +105,7 @@ def _segments(
         # Mean over the stretch of the squared envelope.
         mean = begun**2 * _mean_of_decay(2.0 * decay * span)
         evidence = (0.5 * (last - first) * mean / noise[:, None] ** 2).sum(axis=0)
-        there = np.flatnonzero(evidence > LEAST_EVIDENCE)
+        there = np.flatnonzero(evidence > ASSUMPTIONS.least_evidence)
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
         try:
@@ -108,8 +115,8 @@ def _segments(
             continue
         if not found.converged:
             continue
-        sure = found.omega_std < LEAST_SURE * found.modes.omega
-        sure &= found.modes.frequencies_hz * span > LEAST_CYCLES
+        sure = found.omega_std < ASSUMPTIONS.least_sure * found.modes.omega
+        sure &= found.modes.frequencies_hz * span > ASSUMPTIONS.least_cycles
         there = there[sure]
         values = (found.modes.omega, found.omega_std, found.modes.zeta, found.zeta_std)
         figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))

@@ -9,6 +9,7 @@ eight parameters with A, as many as two linear modes have, so that the likelier 
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -17,13 +18,22 @@ from scipy.optimize import least_squares
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 
+
+@dataclass(frozen=True)
+class BackboneSettings:
+    """Constants of the fit of a backbone."""
+
+    steps: int = 150  # of the envelope in time
+    faded: float = 7.0  # nepers from which on the backbone stays as it is
+    died: float = 60.0  # nepers to which the envelope is followed
+    most_tries: int = 40  # evaluations of the fit
+    slightly: float = 1e-5  # of the decay rate: step of differences
+    largest: float = 1e100  # beyond this a motion diverges
+    beyond: float = 10.0  # times the record: what its residual is then taken for
+
+
+BACKBONE = BackboneSettings()
 POWERS = ((0.0, 1.0, 2.0), (0.0, 0.5, 1.0), (0.0, -1.0, 1.0))
-# Of the envelope in time; nepers from which on the backbone stays as it is, and to which it is followed.
-STEPS, FADED, DIED = 150, 7.0, 60.0
-MOST_TRIES = 40
-SLIGHTLY = 1e-5
-# Beyond this a motion diverges; its residual is then taken for so many times the record.
-LARGEST, BEYOND = 1e100, 10.0
 
 
 def left_by_backbone(
@@ -63,23 +73,23 @@ class _Backbone:
         each = amplitudes * np.exp(np.outer(self.time, pair))
         z, slope = each.sum(axis=1), (each * pair).sum(axis=1)
         size = np.abs(z) / max(abs(z[0]), 1e-3 * np.abs(z).max())
-        by_power = np.maximum(size, np.exp(-FADED))[:, None] ** self.powers
+        by_power = np.maximum(size, np.exp(-BACKBONE.faded))[:, None] ** self.powers
         alike = np.linalg.lstsq(z[:, None] * by_power, slope, rcond=None)[0]
         left, slopes = (lambda p, k=k: self._fitted(p)[k] for k in (0, 1))
         for start in (alike, np.array([pair[np.argmax(np.abs(amplitudes))], 0.0, 0.0])):
             at = np.r_[start.real, start.imag]
-            yield 2.0 * float(least_squares(left, at, slopes, x_scale="jac", max_nfev=MOST_TRIES).cost)
+            yield 2.0 * float(least_squares(left, at, slopes, x_scale="jac", max_nfev=BACKBONE.most_tries).cost)
 
     def _fitted(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is left (n,) and its slopes by Re λ and Im λ (n, 6), A projected out (Kaufman 1975)."""
         real, turn = unknowns[:3], 1j * unknowns[3:]
-        step = SLIGHTLY * max(abs(real[0]), 1e-3 / self.time[-1])
+        step = BACKBONE.slightly * max(abs(real[0]), 1e-3 / self.time[-1])
         held, *moved = self._held(np.vstack([real, real + step * np.eye(3)]))
         with np.errstate(over="ignore", invalid="ignore"):
             motion = np.exp(held @ (real + turn))
             by_real = [(np.exp(h @ (r + turn)) - motion) / step for h, r in zip(moved, real + step * np.eye(3))]
-        if not (np.abs(by_real) < LARGEST).all():
-            return BEYOND * np.abs(self.y), np.zeros((self.y.size, 6))
+        if not (np.abs(by_real) < BACKBONE.largest).all():
+            return BACKBONE.beyond * np.abs(self.y), np.zeros((self.y.size, 6))
         q, r = np.linalg.qr(self._apart(np.column_stack([motion.real, motion.imag])))
         seen = q.T @ self.y
         a, b = np.linalg.lstsq(r, seen, rcond=1e-12)[0]
@@ -92,18 +102,18 @@ class _Backbone:
 
     def _held(self, real: np.ndarray) -> list[np.ndarray]:
         """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
-        t = np.linspace(0.0, self.time[-1], STEPS + 1)
-        h, u, rates = t[1], np.zeros((STEPS + 1, len(real))), np.zeros((STEPS + 1, len(real)))
+        t = np.linspace(0.0, self.time[-1], BACKBONE.steps + 1)
+        h, u, rates = t[1], np.zeros((BACKBONE.steps + 1, len(real))), np.zeros((BACKBONE.steps + 1, len(real)))
 
         def rate(u: np.ndarray) -> np.ndarray:
-            return np.asarray(-(real * np.exp(-np.outer(np.clip(u, -1.0, FADED), self.powers))).sum(axis=1))
+            return np.asarray(-(real * np.exp(-np.outer(np.clip(u, -1.0, BACKBONE.faded), self.powers))).sum(axis=1))
 
-        for k in range(STEPS):
+        for k in range(BACKBONE.steps):
             rates[k] = a = rate(u[k])
             b = rate(u[k] + 0.5 * h * a)
             c = rate(u[k] + 0.5 * h * b)
-            u[k + 1] = np.clip(u[k] + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(u[k] + h * c)), -1.0, DIED)
+            u[k + 1] = np.clip(u[k] + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(u[k] + h * c)), -1.0, BACKBONE.died)
         rates[-1] = rate(u[-1])
-        powers = np.exp(-np.clip(u, -1.0, FADED)[:, :, None] * self.powers)
-        slopes = -self.powers * powers * np.where(u < FADED, rates, 0.0)[:, :, None]
+        powers = np.exp(-np.clip(u, -1.0, BACKBONE.faded)[:, :, None] * self.powers)
+        slopes = -self.powers * powers * np.where(u < BACKBONE.faded, rates, 0.0)[:, :, None]
         return list(CubicHermiteSpline(t, powers, slopes).antiderivative()(self.time).swapaxes(0, 1))

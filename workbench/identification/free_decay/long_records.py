@@ -15,43 +15,45 @@ strong ones shows in the next round; the search ends when no peak is higher than
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refinement import (
-    MOST_STEPS,
-    as_refined,
-    in_coloured_noise,
-    noise_level,
-    search,
-    unshaped,
-)
+from workbench.identification.free_decay.refinement import as_refined, in_coloured_noise, noise_level, search, unshaped
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import Projection
-from workbench.identification.signal.searches import FALSE_ALARM, MOST_DAMPED, Budget, spurious_modes
+from workbench.identification.signal.searches import FALSE_ALARM, FIT, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 
-# Rates of decay searched: the slowest in nepers over the record, and the ratio of each to the one before.
-SLOWEST, RATIO = 0.7, 4.0
-# Time constants after which a damped exponential is left out.
-LIFE = 8.0
-AT_ONCE = 16  # outputs transformed together
-# Cells on either side from which the noise about a peak is taken, and its quantiles: the residual about a mode that
-# depends on amplitude is not smooth.
-BESIDE, SHARES = 64, (0.5, 0.9)
-LEAKED = 2.0  # a peak must be so many times the leakage of stronger ones
-# Least share of a candidate outside the modes so far; share of energy from which two modes overlap; regularisation.
-LEAST_INDEPENDENT, OVERLAPS, RIDGE = 0.05, 0.5, 1e-10
-# Least-squares steps after peaks entered, and rounds at most.
-STEPS, MOST_ROUNDS = 6, 60
-# A peak rejected so often is noise: once may be for poles that had not converged. Rounds that leave no more modes than
-# before: where noise is not white, or modes depend on amplitude, they would not end.
-MOST_REJECTIONS, MOST_FRUITLESS = 2, 3
+
+@dataclass(frozen=True)
+class LongSettings:
+    """Constants of the search in long records."""
+
+    slowest: float = 0.7  # nepers over the record: the slowest rate of decay that is searched
+    ratio: float = 4.0  # of each rate to the one before
+    life: float = 8.0  # time constants after which a damped exponential is left out
+    at_once: int = 16  # outputs transformed together
+    beside: int = 64  # cells on either side from which the noise about a peak is taken
+    # its quantiles: the residual about a mode that depends on amplitude is not smooth
+    shares: tuple[float, ...] = (0.5, 0.9)
+    leaked: float = 2.0  # times the leakage of stronger peaks that a peak must be
+    least_independent: float = 0.05  # share of a candidate outside the modes so far
+    overlaps: float = 0.5  # share of energy from which two modes overlap
+    ridge: float = 1e-10  # of the energy of each mode, lest modes that overlap be singular
+    steps: int = 6  # of least squares after peaks entered
+    most_rounds: int = 60
+    most_rejections: int = 2  # of a peak: one rejected so often is noise, once may be for poles not converged
+    # rounds that leave no more modes than before: where noise is not white, or modes depend on amplitude, they would
+    # not end
+    most_fruitless: int = 3
+
+
+LONG = LongSettings()
 
 
 def identify_long(
@@ -66,16 +68,16 @@ def identify_long(
         budget: of time; none unless given.
     """
     search_for, fruitless = _Search(records, false_alarm, budget or Budget()), 0
-    for _ in range(MOST_ROUNDS):
+    for _ in range(LONG.most_rounds):
         before = search_for.poles.size
-        ended = fruitless >= MOST_FRUITLESS or search_for.budget.spent("search for further modes")
+        ended = fruitless >= LONG.most_fruitless or search_for.budget.spent("search for further modes")
         peaks = np.zeros(0) if ended else search_for.peaks()[: max(most_modes - before, 0)]
         if peaks.size:
             search_for.take_in(peaks)
             search_for.prune()
             fruitless = 0 if search_for.poles.size > before else fruitless + 1
         else:
-            search_for.settle(search_for.poles, MOST_STEPS)
+            search_for.settle(search_for.poles, FIT.most_steps)
             if not search_for.prune(thoroughly=not search_for.budget.spent("check of each mode")):
                 break
     return search_for.report() if search_for.poles.size else None
@@ -89,10 +91,10 @@ class _Search:
         self.dt, self.longest = records[0].sample_time, max(r.n_samples for r in records)
         self.span = self.longest * self.dt
         self.bin_width = 2.0 * np.pi / self.span
-        count = 1 + int(np.log(max(0.1 * np.pi * self.longest / SLOWEST, 1.0)) / np.log(RATIO))
-        self.rates = SLOWEST / self.span * RATIO ** np.arange(count)
+        count = 1 + int(np.log(max(0.1 * np.pi * self.longest / LONG.slowest, 1.0)) / np.log(LONG.ratio))
+        self.rates = LONG.slowest / self.span * LONG.ratio ** np.arange(count)
         self.signals = 2 * sum(r.n_outputs for r in records)
-        self.white = chi2.ppf(SHARES, self.signals)
+        self.white = chi2.ppf(LONG.shares, self.signals)
         cells = sum(self._size(rate)[1] // 2 for rate in self.rates)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, self.signals))
         # A mode is two amplitudes a signal and its pole, chosen among all cells.
@@ -108,7 +110,7 @@ class _Search:
 
     def take_in(self, peaks: np.ndarray) -> None:
         self.origins = np.append(self.origins, peaks)
-        self.settle(np.append(self.poles, peaks), STEPS)
+        self.settle(np.append(self.poles, peaks), LONG.steps)
 
     def settle(self, poles: np.ndarray, most_steps: int) -> None:
         """All poles fitted together, outputs weighted by the residual before."""
@@ -138,7 +140,7 @@ class _Search:
         taken, heights = np.zeros(0, complex), np.zeros(0)
         for r in np.argsort(-height):
             leaked = np.sqrt(heights * self._overlap(taken, poles[r])).sum() ** 2
-            if height[r] > LEAKED * leaked and height[r] > self.enter * self._noise_ratio(poles[r]):
+            if height[r] > LONG.leaked * leaked and height[r] > self.enter * self._noise_ratio(poles[r]):
                 taken, heights = np.append(taken, poles[r]), np.append(heights, height[r])
         return taken
 
@@ -151,13 +153,13 @@ class _Search:
         out = spurious_modes(self.poles, self._shapes, evidence, self.bin_width) | (evidence < limit)
         if thoroughly:
             for r in map(int, np.flatnonzero(~out)):
-                near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > OVERLAPS)
+                near = np.flatnonzero(self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
                 if near.size > 1 and self._evidence_beside(r, near) < limit[r]:
                     evidence[r] = self._gain(r, near)
                     out[r] = evidence[r] < limit[r]
         for r in map(int, np.flatnonzero(out)):
             # Of two that overlap the weaker goes first: the other may then stand.
-            weaker = out & (evidence < evidence[r]) & (self._overlap(self.poles, self.poles[r]) > OVERLAPS)
+            weaker = out & (evidence < evidence[r]) & (self._overlap(self.poles, self.poles[r]) > LONG.overlaps)
             out[r] = not weaker.any()
         if out.any():
             self.rejected += [(complex(pole), e) for pole, e in zip(self.origins[out], evidence[out], strict=True)]
@@ -199,8 +201,8 @@ class _Search:
 
     def _size(self, rate: float) -> tuple[int, int]:
         """Samples that one of this rate lasts, and the length of a transform that resolves its frequency."""
-        n = min(self.longest, int(np.ceil(LIFE / (rate * self.dt))))
-        return n, next_fast_len(n if rate * n * self.dt > 0.5 * LIFE else 2 * n, real=True)
+        n = min(self.longest, int(np.ceil(LONG.life / (rate * self.dt))))
+        return n, next_fast_len(n if rate * n * self.dt > 0.5 * LONG.life else 2 * n, real=True)
 
     def _strengths(self, rate: float) -> np.ndarray:
         """χ² of one rate at every frequency of its transform, as if no mode were near."""
@@ -210,8 +212,8 @@ class _Search:
             n = min(lives, len(fit.residual))
             decay = np.exp(-rate * self.dt * np.arange(n))
             scale = np.sqrt(2.0 / np.sum(decay**2)) * weights
-            for first in range(0, weights.size, AT_ONCE):
-                some = slice(first, first + AT_ONCE)
+            for first in range(0, weights.size, LONG.at_once):
+                some = slice(first, first + LONG.at_once)
                 left = (fit.residual[:n, some] * scale[some]).T.astype(np.float32) * decay.astype(np.float32)
                 spectrum = rfft(left, size, axis=1, workers=os.cpu_count())
                 found += (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
@@ -220,40 +222,42 @@ class _Search:
     def _noise_ratio(self, pole: complex) -> float:
         """Noise about a pole over white noise, where it is larger, as the last search saw it; 1 if white."""
         step = np.pi / (self.fine.size * self.dt)
-        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), BESIDE)
+        at, half = round(pole.imag / step), max(int(abs(pole.real) / step), LONG.beside)
         beside = self.fine[max(at - half, 0) : at + half + 1]
-        return max(1.0, float((np.quantile(beside, SHARES) / self.white).max()))
+        return max(1.0, float((np.quantile(beside, LONG.shares) / self.white).max()))
 
     def _peaks(self, rate: float, strengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Strengths and poles of one rate's local maxima that stand out of white noise."""
         step = 2.0 * np.pi / (self._size(rate)[1] * self.dt)
         omega = step * np.arange(strengths.size)
-        inside = (omega > max(rate / MOST_DAMPED, 1.5 * self.bin_width)) & (omega < np.pi / self.dt - self.bin_width)
+        inside = (omega > max(rate / SELECTION.most_damped, 1.5 * self.bin_width)) & (
+            omega < np.pi / self.dt - self.bin_width
+        )
         highest = np.r_[False, (strengths[1:-1] > strengths[:-2]) & (strengths[1:-1] >= strengths[2:]), False]
-        at = np.flatnonzero(inside & highest & (strengths > LEAST_INDEPENDENT * self.enter))
+        at = np.flatnonzero(inside & highest & (strengths > LONG.least_independent * self.enter))
         poles = -rate + 1j * omega[at]
         rejected = np.zeros(at.size, int)
         for pole, _ in self.rejected:
             rejected += np.abs(poles.imag - pole.imag) < 2.0 * max(self.bin_width, 0.5 * abs(pole.real))
-        at, poles = at[rejected < MOST_REJECTIONS], poles[rejected < MOST_REJECTIONS]
+        at, poles = at[rejected < LONG.most_rejections], poles[rejected < LONG.most_rejections]
         apart = self._independent(poles)
-        full = strengths[at] / np.maximum(apart, LEAST_INDEPENDENT)
-        good = (apart > LEAST_INDEPENDENT) & (full > self.enter)
+        full = strengths[at] / np.maximum(apart, LONG.least_independent)
+        good = (apart > LONG.least_independent) & (full > self.enter)
         return full[good], poles[good]
 
     def _independent(self, poles: np.ndarray) -> np.ndarray:
         """Shares of candidates, sorted by frequency, that lie outside the modes so far."""
         apart = np.ones(poles.size)
         reach = 3.0 * (2.0 * self.bin_width + np.abs(self.poles.real))
-        for first in range(0, poles.size, BESIDE):
-            some = slice(first, first + BESIDE)
+        for first in range(0, poles.size, LONG.beside):
+            some = slice(first, first + LONG.beside)
             w = poles[some]
             wide = reach + 3.0 * np.abs(w[0].real)
             near = self.poles[(self.poles.imag > w[0].imag - wide) & (self.poles.imag < w[-1].imag + wide)]
             if near.size:
                 both = self._products(near, w)
                 gram = self._products(near, near)
-                factor = cho_factor(gram + RIDGE * np.diag(np.diag(gram)))
+                factor = cho_factor(gram + LONG.ridge * np.diag(np.diag(gram)))
                 shared = (both.conj() * cho_solve(factor, both)).sum(axis=0).real
                 apart[some] = 1.0 - shared / np.diag(self._products(w[:1], w[:1])).real
         return apart
@@ -283,8 +287,8 @@ class _Search:
             own = (a @ np.exp(np.outer(self.poles[near], self.dt * np.arange(record.n_samples)))).real
             seen.append(replace(record, outputs=left.T + own, output_channels=channels))
         alone = np.ones((len(seen), directions.shape[1]))
-        _, with_it, *_ = search(seen, self.poles[near], alone, False, 12)
-        _, without, *_ = search(seen, self.poles[near[near != r]], alone, False, 12)
+        _, with_it, *_ = search(seen, self.poles[near], alone, False, SELECTION.few_steps)
+        _, without, *_ = search(seen, self.poles[near[near != r]], alone, False, SELECTION.few_steps)
         return float(sum((a.residual**2).sum() - (b.residual**2).sum() for a, b in zip(without, with_it, strict=True)))
 
 

@@ -20,15 +20,15 @@ from scipy.stats import chi2
 from workbench.arrays import Complexes
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
-from workbench.identification.free_decay.refinement import MOST_STEPS, in_coloured_noise, refine, search, unshaped
+from workbench.identification.free_decay.refinement import in_coloured_noise, refine, search, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import differ, project, variances, whitened
 from workbench.identification.signal.searches import (
     FALSE_ALARM,
-    MOST_DAMPED,
-    SEARCH,
+    FIT,
     SECONDS,
+    SELECTION,
     Budget,
     Progress,
     Stepwise,
@@ -38,27 +38,24 @@ from workbench.records.record import Record
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
 
-# Values in all from which modes are taken in many at a time.
-LONG = 100_000
-MOST_MODES = 40
-# Times that noise which is not white is learnt from the residual, and the modes from it in turn.
-WHITENED = 2
-# Nepers over a record above which a pole grows: it may be noise that is not white.
-MOST_GROWTH = 0.5
-# Steps of a fit that only decides whether a mode enters or leaves.
-FEW_STEPS = 12
-# Candidates below the limit one after the other, and candidates that split a mode, after which the search ends.
-MOST_WEAK, MOST_SPLITS = 2, 6
-# Share of a candidate that must lie outside the modes so far for it to be distinguished from them.
-LEAST_INDEPENDENT = 1e-7
-# Bandwidths that a mode selected in whitened records may move when refined in the records as measured.
-LOST = 5.0
-# Squares of a residual that is round-off, over those of the record.
-ROUND_OFF = 1e-26
-# Bins on either side from which the noise about a pole is taken.
-BESIDE = 50
-# Times the limit, and bandwidths to the next mode, below which a mode is tried again.
-WEAK, CLOSE = 4.0, 2.0
+
+@dataclass(frozen=True)
+class OrderSettings:
+    """Constants of the selection of modes of a free decay, beside those of every selection (`searches.SELECTION`)."""
+
+    long: int = 100_000  # values in all from which modes are taken in many at a time
+    most_modes: int = 40  # unless the call says more: fits of more at once take minutes
+    whitened: int = 2  # times that coloured noise is learnt from the residual, and the modes from it in turn
+    # candidates below the limit one after the other, and candidates that split a mode, after which the search ends
+    most_weak: int = 2
+    most_splits: int = 6
+    least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
+    # bandwidths that a mode selected in whitened records may move when refined in the records as measured
+    lost: float = 5.0
+    round_off: float = 1e-26  # squares of a residual that is round-off, over those of the record
+
+
+ORDER = OrderSettings()
 
 
 @one_blas_thread
@@ -101,14 +98,14 @@ def identify_within(
     fit_in = (shortest.n_samples - 4) // 3
     if fit_in < 1:
         raise ValueError(f"record {shortest.name!r} has {shortest.n_samples} samples; a mode needs 7: measure longer")
-    if sum(r.outputs.size for r in records) > LONG:
-        most = min(most_modes or 10 * MOST_MODES, fit_in)
+    if sum(r.outputs.size for r in records) > ORDER.long:
+        most = min(most_modes or 10 * ORDER.most_modes, fit_in)
         found = identify_long(records, most_modes=most, false_alarm=false_alarm, budget=budget)
         return found if found is not None else _refuse(records)
-    most = min(most_modes or MOST_MODES, fit_in)
-    search_time = budget.share(SEARCH)
+    most = min(most_modes or ORDER.most_modes, fit_in)
+    search_time = budget.share(SELECTION.search_share)
     problem, model = _selected(records, most, false_alarm, search_time)
-    for _ in range(WHITENED):
+    for _ in range(ORDER.whitened):
         white = None if search_time.spent("whitening of the noise") else whitened(records, problem.oscillating(model))
         if white is None:
             break
@@ -125,7 +122,7 @@ def _selected(
     measured: Sequence[Record] | None = None,
 ) -> tuple["_FreeDecay", "_Model"]:
     problem = _FreeDecay(records, false_alarm, measured or records, budget)
-    selection = Stepwise(problem, most_modes, MOST_WEAK, MOST_SPLITS, forgets=False, budget=budget)
+    selection = Stepwise(problem, most_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
     model = selection.select(problem.nothing)
     problem.rejected = selection.rejected
     return problem, model
@@ -163,7 +160,7 @@ class _FreeDecay:
         self.records, self.measured, self.budget = records, measured, budget
         self.grids = [_Grid(record, longest) for record in records]
         # Residuals of round-off say nothing of one sensor beside another.
-        self.round_off = ROUND_OFF * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
+        self.round_off = ORDER.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
         cells = self.grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
@@ -192,7 +189,7 @@ class _FreeDecay:
         return candidate
 
     def extended(self, model: _Model, candidate: complex) -> _Model:
-        return self._fitted(np.append(model.poles, candidate), model.weights, FEW_STEPS)
+        return self._fitted(np.append(model.poles, candidate), model.weights, SELECTION.few_steps)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
         """Noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
@@ -221,14 +218,14 @@ class _FreeDecay:
             return
         for r, (pole, strength) in enumerate(zip(model.poles, evidence, strict=True)):
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
-            if strength < WEAK * self.threshold(model, pole) or near < CLOSE * abs(pole.real):
+            if strength < SELECTION.weak * self.threshold(model, pole) or near < SELECTION.close * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
 
     def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and hardly grow; others may be noise that is not white."""
         poles: Complexes = model.poles
         span = max(record.n_samples * record.sample_time for record in self.records)
-        return poles[(poles.real * span < MOST_GROWTH) & (np.abs(poles) * span > 2.0 * np.pi)]
+        return poles[(poles.real * span < SELECTION.most_growth) & (np.abs(poles) * span > 2.0 * np.pi)]
 
     def evidence(self, model: _Model) -> np.ndarray:
         """χ² of each mode's amplitudes, poles held, (n_modes,)."""
@@ -263,9 +260,9 @@ class _FreeDecay:
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
         """Which modes are no more where they were selected: what else is in a record than modes has drawn them off."""
         away = np.abs(np.subtract.outer(poles, refined)).min(axis=1)
-        return np.asarray(away > LOST * (np.abs(poles.real) + self.grids[0].bin_width))
+        return np.asarray(away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
 
-    def _fitted(self, poles: np.ndarray, weights: np.ndarray, most_steps: int = MOST_STEPS) -> _Model:
+    def _fitted(self, poles: np.ndarray, weights: np.ndarray, most_steps: int = FIT.most_steps) -> _Model:
         """Poles after a search, sensors then weighted by the noise found in each record."""
         if poles.size == 0:
             residuals = [grid.nothing for grid in self.grids]
@@ -276,7 +273,7 @@ class _FreeDecay:
         return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(_squares(residuals), self.round_off), n)), residuals)
 
     def _without(self, model: _Model, r: int) -> _Model:
-        return self._fitted(np.delete(model.poles, r), model.weights, FEW_STEPS)
+        return self._fitted(np.delete(model.poles, r), model.weights, SELECTION.few_steps)
 
     def _spurious(self, poles: np.ndarray, model: _Model) -> np.ndarray:
         """Which of some poles are spurious, in the noise that a model leaves."""
@@ -303,10 +300,10 @@ class _FreeDecay:
         In the record as measured: a filter that whitens the residual of one mode removes most of its evidence.
         """
         [record] = self.measured
-        poles, [fit], *_ = search([record], poles, np.ones((1, 1)), True, FEW_STEPS, budget=self.budget)
+        poles, [fit], *_ = search([record], poles, np.ones((1, 1)), True, SELECTION.few_steps, budget=self.budget)
         both, pair, others = float(fit.squares.sum()), poles[[r, s]], np.delete(poles, [r, s])
         one = left_by_backbone(record, pair, others, offset=True, enough=both)
-        floor = ROUND_OFF * float((record.outputs**2).sum()) + 1e-300
+        floor = ORDER.round_off * float((record.outputs**2).sum()) + 1e-300
         return record.n_samples * float(np.log((one + floor) / (both + floor)))
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
@@ -314,7 +311,7 @@ class _FreeDecay:
         grid = self.grids[0]
         left = grid.power(model.residuals[0] * model.weights[0]).mean(axis=1)
         at = round((pole.imag - grid.lowest) / grid.bin_width)
-        beside = left[max(at - BESIDE, 0) : at + BESIDE + 1]
+        beside = left[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
 
     def _exact(self, model: _Model) -> bool:
@@ -338,7 +335,7 @@ class _Grid:
         self.columns = np.flatnonzero(inside)
         self.rates = rates
         self.poles = -rates[:, None] + 1j * omega[inside]
-        self.allowed = rates[:, None] < MOST_DAMPED * omega[inside]
+        self.allowed = rates[:, None] < SELECTION.most_damped * omega[inside]
         self.n_cells = int(self.allowed.sum())
         self.turns = np.exp(self.poles * dt)
         self._sums: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
@@ -379,7 +376,7 @@ class _Grid:
                 p[at] -= dp
                 q[at] -= dq
             det = p**2 - np.abs(q) ** 2
-            good = self.allowed[k] & (det > LEAST_INDEPENDENT * whole**2) & (p > 0)
+            good = self.allowed[k] & (det > ORDER.least_independent * whole**2) & (p > 0)
             top = 2.0 * p * own - 2.0 * (q * double.conj()).real
             found[k] = np.where(good, top / np.where(good, det, 1.0), 0.0)
         return found

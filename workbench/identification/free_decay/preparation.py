@@ -20,19 +20,34 @@ from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
 
-# Samples that predict the one before; samples of an update; memory, and that of the error level, in orders.
-ORDER, BLOCK, MEMORY, LEVEL_MEMORY = 32, 4, 4, 2
-MOST_SIGNALS, MOST_SAMPLES = 8, 40_000
-MOST_SENSORS = 256  # whose combinations are sought, evenly among all: of more they take minutes
+
+@dataclass(frozen=True)
+class StartSettings:
+    """Constants of the search for the start of a decay."""
+
+    order: int = 32  # samples that predict the one before
+    block: int = 4  # samples of an update
+    memory: int = 4  # orders: of the rule
+    level_memory: int = 2  # orders: of the level of its errors
+    most_signals: int = 8  # combinations of outputs that the rule is learnt from
+    most_samples: int = 40_000  # of them, at one rate: of longer records the rate is lower
+    most_sensors: int = 256  # whose combinations are sought, evenly among all: of more they take minutes
+    coarser: int = 4  # from one rate to the next
+    # squared prediction error over its level that is a break: alone, or where the energy of the motion also rises so
+    # many times, or within so many samples of another break, for a force that dies away
+    alone: float = 100.0
+    rising: float = 25.0
+    rise: float = 4.0
+    beside: float = 16.0
+    near: int = 8
+    least_left: float = 0.01  # of the record's energy, that must follow a break for the decay to begin there
+
+
+START = StartSettings()
+HIGHEST_DEGREE = 8  # of a drift: more oscillates as modes do
 # Fewer means are too few to learn the rule and to test it.
-SHORTEST = (4 + LEVEL_MEMORY) * ORDER
-COARSER = 4
-UPPER = np.triu(np.ones((ORDER + 1, ORDER + 1)))
-# Squared prediction error over its level: alone, where the energy of the motion also rises so many times, and within so
-# many samples of another break, for a force that dies away.
-BREAK, BREAK_RISING, RISE, BREAK_BESIDE, NEAR = 100.0, 25.0, 4.0, 16.0, 8
-# Share of the record's energy that must follow a break for the decay to begin there.
-LEAST_LEFT = 0.01
+SHORTEST = (4 + START.level_memory) * START.order
+UPPER = np.triu(np.ones((START.order + 1, START.order + 1)))
 
 
 def decay_start(record: Record) -> float:
@@ -51,11 +66,11 @@ def decay_start(record: Record) -> float:
     if not signals.any():
         return float(record.start_time)
     left = np.cumsum((signals[:, ::-1] ** 2).sum(axis=0))[::-1]
-    matters = left >= LEAST_LEFT * left[0]
+    matters = left >= START.least_left * left[0]
     starts = np.zeros(1, int)
     step = 1
-    while n > MOST_SAMPLES * step:
-        step *= COARSER
+    while n > START.most_samples * step:
+        step *= START.coarser
     while n // step >= SHORTEST:
         window = blackman(6 * step, sym=False) if step > 1 else np.ones(1)
         window /= window.sum()
@@ -68,14 +83,14 @@ def decay_start(record: Record) -> float:
         # A break known already from more samples is seen by every window that holds it.
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
-        step *= COARSER
+        step *= START.coarser
     return float(record.time[min(starts.max(), n - 1)])
 
 
 def _scaled(record: Record) -> tuple[np.ndarray, float]:
     """Strongest combinations of the outputs about where they end, (n_signals, n_samples), and the variance that
     rounding to the sensors' steps leaves in them."""
-    outputs = record.outputs[:: -(-record.n_outputs // MOST_SENSORS)]
+    outputs = record.outputs[:: -(-record.n_outputs // START.most_sensors)]
     end = np.median(outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
     about = outputs - end
     # Differences weigh sensors by how they move, not by how they drift.
@@ -85,57 +100,55 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
         return np.zeros((1, record.n_samples)), 0.0
     scaled = about[moving] / size[moving, None]
     steps = [np.diff(np.unique(row)).min(initial=np.inf) for row in scaled]
-    if len(scaled) > MOST_SIGNALS:
+    if len(scaled) > START.most_signals:
         _, directions = np.linalg.eigh(scaled @ scaled.T)
-        scaled = directions[:, -MOST_SIGNALS:].T @ scaled
+        scaled = directions[:, -START.most_signals :].T @ scaled
     return scaled, float(np.mean(np.square(steps)) / 12.0)
 
 
 def _breaks(y: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared prediction error over its level (n_samples,), and which samples break the rule."""
     m, n = y.shape
-    forget, forget_level = np.exp(-BLOCK / (MEMORY * ORDER)), np.exp(-BLOCK / (LEVEL_MEMORY * ORDER))
+    order, block = START.order, START.block
+    forget, forget_level = (np.exp(-block / (k * order)) for k in (START.memory, START.level_memory))
     energy = np.r_[np.cumsum((y**2).sum(axis=0)[::-1])[::-1], 0.0]
-    ridge = np.sqrt(max(rounding, 1e-24 * energy[0] / n)) * np.eye(ORDER, ORDER + 1)
-    factor = np.zeros((0, ORDER + 1))
+    ridge = np.sqrt(max(rounding, 1e-24 * energy[0] / n)) * np.eye(order, order + 1)
+    factor = np.zeros((0, order + 1))
     ratio, level, weight = np.zeros(n), 0.0, 0.0
-    for t in range(n - ORDER, BLOCK - 1, -BLOCK):
-        at = np.arange(t - BLOCK, t)
-        after = y[:, at[:, None] + np.arange(1, ORDER + 1)].reshape(-1, ORDER)
+    for t in range(n - order, block - 1, -block):
+        at = np.arange(t - block, t)
+        after = y[:, at[:, None] + np.arange(1, order + 1)].reshape(-1, order)
         here = y[:, at].reshape(-1)
-        if n - t >= 3 * ORDER:
+        if n - t >= 3 * order:
             # Rounding enters as a ridge, and as the least level.
             r = _triangular(np.vstack([factor, ridge]))
-            c = dtrtrs(r[:ORDER, :ORDER], r[:ORDER, ORDER])[0]
-            error = ((here - after @ c).reshape(m, BLOCK) ** 2).mean(axis=0)
-            if n - t >= (3 + LEVEL_MEMORY) * ORDER:
+            c = dtrtrs(r[:order, :order], r[:order, order])[0]
+            error = ((here - after @ c).reshape(m, block) ** 2).mean(axis=0)
+            if n - t >= (3 + START.level_memory) * order:
                 ratio[at] = error / max(level / weight, rounding * (1.0 + c @ c), 1e-300)
             level, weight = forget_level * level + error.mean(), forget_level * weight + 1.0
         rows = np.vstack([np.sqrt(forget) * factor, np.column_stack([after, here])])
         factor = _triangular(rows)
     after = np.arange(1, n + 1)
-    width = np.minimum(after, np.minimum(ORDER, n - after))
-    rises = energy[after] - energy[after + width] > RISE * (energy[after - width] - energy[after])
-    return ratio, (ratio > BREAK) | ((ratio > BREAK_RISING) & rises)
+    width = np.minimum(after, np.minimum(order, n - after))
+    rises = energy[after] - energy[after + width] > START.rise * (energy[after - width] - energy[after])
+    return ratio, (ratio > START.alone) | ((ratio > START.rising) & rises)
 
 
 def _triangular(rows: np.ndarray) -> np.ndarray:
-    """R of an orthogonal factorisation, (at most ORDER + 1, ORDER + 1); straight from LAPACK, for it is called so
+    """R of an orthogonal factorisation, (at most order + 1, order + 1); straight from LAPACK, for it is called so
     often."""
-    factored = dgeqrf(rows)[0][: ORDER + 1]
+    factored = dgeqrf(rows)[0][: START.order + 1]
     return np.asarray(factored * UPPER[: len(factored)])
 
 
 def _dying_away(ratio: np.ndarray, broken: np.ndarray) -> np.ndarray:
     """Breaks and the lesser ones that follow them closely."""
-    broken, last = broken.copy(), -NEAR - 1
-    for t in np.flatnonzero(ratio > BREAK_BESIDE).tolist():
-        if broken[t] or t - last <= NEAR:
+    broken, last = broken.copy(), -START.near - 1
+    for t in np.flatnonzero(ratio > START.beside).tolist():
+        if broken[t] or t - last <= START.near:
             broken[t], last = True, t
     return broken
-
-
-HIGHEST_DEGREE = 8
 
 
 @dataclass(frozen=True, eq=False)

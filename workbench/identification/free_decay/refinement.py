@@ -18,18 +18,21 @@ import numpy as np
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.modal_estimates import Refined, normalised_shapes, time_derivatives
 from workbench.identification.signal.projection import Projection, noise_near, project, variances
-from workbench.identification.signal.searches import Budget, minimise
+from workbench.identification.signal.searches import FIT, Budget, minimise
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
-MOST_STEPS = 60
-# A step is negligible once it moves the estimate by less than a thousandth of its standard error, squared.
-NEGLIGIBLE = 1e-6
-# Of the residual, relative to the record.
-ROUND_OFF = 1e-13
-# Growth e^20 over a record, and decay e^-1 within one sample: no pole is searched beyond.
-MOST_GROWTH, FASTEST_DECAY = 20.0, 1.0
+
+@dataclass(frozen=True)
+class RefinementSettings:
+    """Constants of the fit of free decays, beside those of every fit of modes (`searches.FIT`)."""
+
+    round_off: float = 1e-13  # of the residual, relative to the record
+    fastest_decay: float = 1.0  # nepers within a sample: no pole is searched beyond
+
+
+REFINEMENT = RefinementSettings()
 
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
@@ -301,7 +304,7 @@ def search(
     poles: np.ndarray,
     weights: np.ndarray,
     offset: bool,
-    most_steps: int = MOST_STEPS,
+    most_steps: int = FIT.most_steps,
     *,
     hold: bool = False,
     budget: Budget | None = None,
@@ -359,7 +362,9 @@ class _Poles:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(NEGLIGIBLE * cost / self.free, ROUND_OFF**2 * self.signal, 1e-4 * self.round_off)
+        return decrease <= max(
+            FIT.negligible * cost / self.free, REFINEMENT.round_off**2 * self.signal, 1e-4 * self.round_off
+        )
 
 
 def _folded(poles: np.ndarray, sample_time: float) -> np.ndarray:
@@ -372,7 +377,7 @@ def _inadmissible(poles: np.ndarray, records: Sequence[Record]) -> np.ndarray:
     """Which poles do not oscillate, pass the Nyquist frequency, grow too much over a record, or decay at once."""
     dt, longest = records[0].sample_time, max(r.n_samples * r.sample_time for r in records)
     turn = poles.imag * dt
-    growing, gone = poles.real * longest >= MOST_GROWTH, -poles.real * dt > FASTEST_DECAY
+    growing, gone = poles.real * longest >= FIT.most_growth, -poles.real * dt > REFINEMENT.fastest_decay
     return np.asarray((turn <= 0) | (turn >= np.pi) | growing | gone)
 
 

@@ -8,6 +8,7 @@ direct term, leave nothing to tell the fraction by; it is then the one that make
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -20,14 +21,23 @@ from workbench.identification.input_output.model_order import evidence_of
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 
-# Lags of the ARX model at most, and rows for each of its coefficients at least; rows of one part of its sums.
-MOST_LAGS, ROWS_EACH, PART = 60, 8, 4096
-# Of each output, taken for noise in any case: -100 dB; of its ratio to an input, taken for round-off.
-FLOOR, ROUND_OFF = 1e-5, 1e-8
-# Share of its peak from which on an input moves.
-MOVES = 0.01
-# Fractions of a sample tried; weight of real modes beside what the columns say, χ² of a mode from which it has half.
-TRIED, REAL_MODES, KNOWN = np.linspace(0.0, 1.0, 401), 1.0, 100.0
+
+@dataclass(frozen=True)
+class DelaysSettings:
+    """Constants of the search for delays."""
+
+    most_lags: int = 60  # of the ARX model
+    rows_each: int = 8  # rows for each of its coefficients, at least
+    part: int = 4096  # rows of one part of its sums
+    floor: float = 1e-5  # of each output, taken for noise in any case: -100 dB
+    round_off: float = 1e-8  # of the ratio of an output to an input
+    moves: float = 0.01  # of its peak, from which on an input moves
+    real_modes: float = 1.0  # weight of real modes beside what the columns say
+    known: float = 100.0  # χ² of a mode from which it has half of that weight
+
+
+DELAYS = DelaysSettings()
+TRIED = np.linspace(0.0, 1.0, 401)  # fractions of a sample
 
 
 def first_lags(records: Sequence[Record]) -> np.ndarray:
@@ -40,14 +50,14 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
     rows = sum(record.n_samples for record in records)
     moved = n_moving(records)  # impulses are too short to show lags
     shortest = min(record.n_samples for record in records)
-    lags = min(MOST_LAGS, rows // (ROWS_EACH * (m + q)), moved // ROWS_EACH, shortest // 4)
+    lags = min(DELAYS.most_lags, rows // (DELAYS.rows_each * (m + q)), moved // DELAYS.rows_each, shortest // 4)
     if lags < 3:
         return np.zeros(q, int)
     gram, moment, squares = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros((2, 2))
     for record in records:
         y = record.outputs - record.outputs.mean(axis=1, keepdims=True)
-        for first in range(lags, record.n_samples, PART):
-            at = np.arange(first, min(first + PART, record.n_samples))
+        for first in range(lags, record.n_samples, DELAYS.part):
+            at = np.arange(first, min(first + DELAYS.part, record.n_samples))
             past = [y[:, at - k] for k in range(1, lags + 1)] + [record.inputs[:, at - k] for k in range(lags + 1)]
             x, now = np.vstack(past), y[:, at]
             if gram.shape == (2, 2):
@@ -55,11 +65,11 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
             gram += x @ x.T
             moment += x @ now.T
             squares += now @ now.T
-    gram[np.diag_indices_from(gram)] += FLOOR**2 * np.diag(gram) + 1e-300
+    gram[np.diag_indices_from(gram)] += DELAYS.floor**2 * np.diag(gram) + 1e-300
     scale = 1.0 / np.sqrt(np.diag(gram))
     factor = cho_factor(gram * np.outer(scale, scale))
     found = scale[:, None] * cho_solve(factor, scale[:, None] * moment)
-    left = squares - found.T @ moment + FLOOR**2 * np.diag(np.diag(squares))
+    left = squares - found.T @ moment + DELAYS.floor**2 * np.diag(np.diag(squares))
     spread = np.diag(cho_solve(factor, np.eye(len(gram)))) * scale**2
     b, free = found[lags * m :], max(rows - lags * len(records) - len(gram), 1)
     evidence = np.einsum("kj,kj->k", b, np.linalg.solve(left / free, b.T).T) / spread[lags * m :]
@@ -70,7 +80,7 @@ def first_lags(records: Sequence[Record]) -> np.ndarray:
 def n_moving(records: Sequence[Record]) -> int:
     """Samples at which the input that rests longest moves."""
     sizes = np.abs(np.hstack([record.inputs for record in records]))
-    return int((sizes > MOVES * sizes.max(axis=1, keepdims=True)).sum(axis=1).min())
+    return int((sizes > DELAYS.moves * sizes.max(axis=1, keepdims=True)).sum(axis=1).min())
 
 
 def act_later(data: KnownInputs, fit: Fit) -> np.ndarray:
@@ -90,7 +100,7 @@ def _columns(data: KnownInputs, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
     n, shape = 2 * fit.poles.size, (2, data.n_inputs, -1)
     noise = fixed_std(fit, *data.noise_ratios(fit))[: 2 * data.n_inputs]
     outputs, inputs = np.sqrt((data.values**2).mean(axis=0)), np.sqrt((data.fixed**2).mean(axis=0))
-    least = ROUND_OFF * outputs / np.maximum(inputs[: 2 * data.n_inputs, None], 1e-300)
+    least = DELAYS.round_off * outputs / np.maximum(inputs[: 2 * data.n_inputs, None], 1e-300)
     return fit.coefficients[n : n + 2 * data.n_inputs].reshape(shape), np.maximum(noise, least).reshape(shape)
 
 
@@ -109,7 +119,7 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
     phase = np.angle(1j * fit.participation[:, :q] / turn[:, None])
     evidence = np.array([evidence_of(fit, r) for r in range(n)])
     size = np.abs(fit.participation[:, :q]) ** 2
-    known = (evidence / (evidence + KNOWN))[:, None] * size / size.sum(axis=1, keepdims=True)
+    known = (evidence / (evidence + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
     cost = np.zeros((TRIED.size, q))
     for k, f in enumerate(TRIED):
         now, before = np.array([_columns_left(pole, data.dt, f, data.straight) for pole in fit.poles]).T
@@ -123,7 +133,7 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
         else:
             cost[k] = ((left / noise) ** 2).sum(axis=(0, 1))
         turned = 2.0 * (phase + fit.poles.imag[:, None] * f * data.dt)
-        cost[k] -= REAL_MODES * (known * np.cos(turned)).sum(axis=0)
+        cost[k] -= DELAYS.real_modes * (known * np.cos(turned)).sum(axis=0)
     return np.asarray(TRIED[np.argmin(cost, axis=0)])
 
 

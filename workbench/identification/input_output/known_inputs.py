@@ -17,6 +17,7 @@ exact. Noise that is not white is weighted line by line of the cosine transform 
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import factorial
 from typing import Any
 
@@ -29,14 +30,21 @@ from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.identification.signal.projection import noise_along, noise_near, variances
-from workbench.identification.signal.searches import MOST_DAMPED
+from workbench.identification.signal.searches import SELECTION
 from workbench.records.record import Record
 
+
+@dataclass(frozen=True)
+class InputsSettings:
+    """Constants of records with known inputs."""
+
+    peaks_a_rate: int = 12  # candidates of each rate of decay
+
+
+INPUTS = InputsSettings()
 # φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
 TERMS = 40
 SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
-BESIDE = 50
-PEAKS_A_RATE = 12
 
 
 class KnownInputs:
@@ -338,7 +346,7 @@ class KnownInputs:
         found, strength = [], []
         for rate in self.rates:
             decay = np.exp(-rate * self.dt * lags)
-            lowest = omega > max(0.5 * self.resolution, rate / MOST_DAMPED)
+            lowest = omega > max(0.5 * self.resolution, rate / SELECTION.most_damped)
             score = np.zeros(omega.size)
             # The response's own power: the spectrum of the input seen through the pole.
             for r, power in zip(crossed, own):
@@ -348,17 +356,17 @@ class KnownInputs:
                 score += (agreed / np.maximum(whole / (1.0 - np.exp(-2.0 * rate * self.dt)), least)).sum(axis=0)
             score[~lowest] = 0.0
             peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
-            best = peaks[np.argsort(score[peaks])[-PEAKS_A_RATE:]]
+            best = peaks[np.argsort(score[peaks])[-INPUTS.peaks_a_rate :]]
             found.append(-rate + 1j * omega[best])
             strength.append(score[best])
         order = np.argsort(np.concatenate(strength))[::-1]
-        return np.concatenate(found)[order[: 3 * PEAKS_A_RATE]]
+        return np.concatenate(found)[order[: 3 * INPUTS.peaks_a_rate]]
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)
         power = (np.abs(np.fft.rfft(self._samples(residual[longest]), axis=0)[1:]) ** 2).mean(axis=1)
         at = round(pole.imag / self.resolution) - 1
-        beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
+        beside = power[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(beside) / power.mean())) if beside.size else 1.0
 
 

@@ -17,17 +17,19 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from workbench.identification.signal.searches import Budget, minimise
+from workbench.identification.signal.searches import FIT, Budget, minimise
 
-MOST_STEPS = 60
-# A step is negligible once it moves the estimate by less than a thousandth of its standard error, squared.
-NEGLIGIBLE = 1e-6
-# Of a sum of squares, relative to that of the measurement.
-ROUND_OFF = 1e-26
-# Nepers over a record: no pole is searched that grows faster.
-MOST_GROWTH = 20.0
-# Participation factor over that held at one: factors that run apart without end are no mode's, and overflow.
-MOST_UNLIKE = 1e20
+
+@dataclass(frozen=True)
+class ModalFitSettings:
+    """Constants of the fit of modes, beside those of every fit of modes (`searches.FIT`)."""
+
+    round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
+    # participation factor over that held at one: factors that run apart without end are no mode's, and overflow
+    most_unlike: float = 1e20
+
+
+MODAL_FIT = ModalFitSettings()
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -202,9 +204,9 @@ def search(
     poles: np.ndarray,
     participation: np.ndarray,
     noise: np.ndarray,
-    most_steps: int = MOST_STEPS,
+    most_steps: int = FIT.most_steps,
     budget: Budget | None = None,
-    negligible: float = NEGLIGIBLE,
+    negligible: float = FIT.negligible,
 ) -> Fit:
     """Least squares over poles and participation, outputs in units of `noise`, until a step promises little χ²."""
     strength = np.abs(participation) * [np.linalg.norm(np.vstack(data.responses(pole)), axis=0) for pole in poles]
@@ -234,10 +236,10 @@ class _OutputError:
         change = (whole[: whole.size // 2] + 1j * whole[whole.size // 2 :]).reshape(n, p + 1)
         poles, participation = state.poles + change[:, 0], state.participation + change[:, 1:]
         highest, fastest = self.data.highest, self.data.highest / np.pi
-        growing = poles.real > MOST_GROWTH * self.data.resolution / (2.0 * np.pi)
+        growing = poles.real > FIT.most_growth * self.data.resolution / (2.0 * np.pi)
         if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest) | growing).any():
             return None, step
-        if not (np.abs(participation) < MOST_UNLIKE).all():
+        if not (np.abs(participation) < MODAL_FIT.most_unlike).all():
             return None, step
         try:
             return projected(self.data, poles, participation), step
@@ -245,15 +247,15 @@ class _OutputError:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(self.least * cost / self.data.values.size, ROUND_OFF * self.signal)
+        return decrease <= max(self.least * cost / self.data.values.size, MODAL_FIT.round_off * self.signal)
 
 
 def settled(
     data: Measurement,
     fit: Fit,
-    most_steps: int = MOST_STEPS,
+    most_steps: int = FIT.most_steps,
     budget: Budget | None = None,
-    negligible: float = NEGLIGIBLE,
+    negligible: float = FIT.negligible,
 ) -> Fit:
     """Searched, weighted by the noise found, and searched again."""
     if fit.poles.size == 0:

@@ -16,25 +16,24 @@ from workbench.identification.input_output.modal_fit import (
     search,
     settled,
 )
-from workbench.identification.signal.searches import FALSE_ALARM, MOST_DAMPED, SAME_SHAPE, Budget, Stepwise
+from workbench.identification.signal.searches import FALSE_ALARM, SELECTION, Budget, Stepwise
 from workbench.structure.modes import mac
 
-# Candidates below the limit one after the other from which on only noise is left.
-MOST_WEAK = 3
-# Steps of a fit that only decides whether a mode enters, or leaves.
-STEPS_IN, STEPS_OUT = 20, 12
-# χ² that a further step of such a fit must promise: the limit is some dozens.
-DECIDED = 0.1
-# A candidate is tried from this share of the limit on: fitted with the others it may gain more.
-ENTER = 0.5
-# Times the limit, and bandwidths to the next mode, below which a mode is tried again.
-WEAK, CLOSE = 4.0, 2.0
-# Times the limit from which on a mode close to another is one of its own, all that the others may take over counted.
-DISTINCT = 10.0
-# Share of each output that is noise in any case where poles of a start are weighed: -100 dB.
-FLOOR = 1e-5
-# Relative, added to the squares of columns that may be sums of one another.
-COLLINEAR = 1e-10
+
+@dataclass(frozen=True)
+class OrderSettings:
+    """Constants of the selection of modes of a measurement, beside those of every selection (`searches.SELECTION`)."""
+
+    most_weak: int = 3  # candidates below the threshold, one after the other, after which only noise is left
+    steps: int = 20  # of the fit by which a mode enters
+    decided: float = 0.1  # χ² that a step promises, each output, below which such a fit has decided
+    enter: float = 0.5  # of the threshold, by which a candidate, its participation not yet fitted, is tried
+    distinct: float = 10.0  # times the threshold, from which on two modes close to one another are two
+    floor: float = 1e-5  # of each output, taken for noise in any case: -100 dB
+    collinear: float = 1e-10  # of the energy of each column, lest poles that are one be singular
+
+
+ORDER = OrderSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +72,7 @@ def select_modes(
     """
     budget = Budget() if budget is None else budget
     problem = _Modes(data, false_alarm, budget)
-    selection = Stepwise(problem, most_modes, MOST_WEAK, None, forgets=True, budget=budget)
+    selection = Stepwise(problem, most_modes, ORDER.most_weak, None, forgets=True, budget=budget)
     fit = projected(data, np.zeros(0, complex), np.zeros((0, problem.excitations), complex))
     if start is not None and start.poles.size:
         try:
@@ -93,7 +92,7 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     All residues are fitted at once, of any rank, and the pole that explains least is left out until none explains as
     little as noise would.
     """
-    inside = (poles.imag > 0) & (poles.imag < data.highest) & (-poles.real < MOST_DAMPED * np.abs(poles))
+    inside = (poles.imag > 0) & (poles.imag < data.highest) & (-poles.real < SELECTION.most_damped * np.abs(poles))
     poles = poles[inside & (poles.real < data.resolution / (2.0 * np.pi))]
     size = 2 * data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
     x = np.hstack([*(np.hstack(data.responses(pole)) for pole in poles), data.fixed])
@@ -105,11 +104,11 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     for weights, y in zip(weights_of(data), together, strict=True):
         weighted = weights * x / scale
         gram = weighted.T @ weighted
-        gram[np.diag_indices_from(gram)] *= 1.0 + COLLINEAR
+        gram[np.diag_indices_from(gram)] *= 1.0 + ORDER.collinear
         spreads.append(np.linalg.inv(gram))
         coefficients.append(spreads[-1] @ (weighted.T @ y))
         left = ((y - weighted @ coefficients[-1]) ** 2).sum(axis=0)
-        variances.append(np.maximum(left / max(len(x) - x.shape[1], 1), FLOOR**2 * (y**2).mean(axis=0)))
+        variances.append(np.maximum(left / max(len(x) - x.shape[1], 1), ORDER.floor**2 * (y**2).mean(axis=0)))
     limit = chi2.isf(false_alarm / data.cells, size * data.values.shape[1])
     while poles.size:
         blocks = np.arange(poles.size * size).reshape(poles.size, size)
@@ -170,12 +169,12 @@ class _Modes:
         if not left_over:
             return None
         strength, participation, pole = max(left_over, key=lambda item: item[0])
-        return None if strength < ENTER * self.threshold(model, pole) else (pole, participation)
+        return None if strength < ORDER.enter * self.threshold(model, pole) else (pole, participation)
 
     def extended(self, model: Fit, candidate: tuple[complex, np.ndarray]) -> Fit:
         poles = np.append(model.poles, candidate[0])
         participation = np.vstack([model.participation, candidate[1]])
-        return search(self.data, poles, participation, model.noise, STEPS_IN, self.budget, DECIDED)
+        return search(self.data, poles, participation, model.noise, ORDER.steps, self.budget, ORDER.decided)
 
     def gain(self, smaller: Fit, larger: Fit) -> float:
         """The noise of each output unknown."""
@@ -207,20 +206,24 @@ class _Modes:
             out = weak[np.argsort(evidence[weak])[: (weak.size + 1) // 2]]
             rest = np.delete(np.arange(model.poles.size), out)
             fewer = projected(self.data, model.poles[rest], model.participation[rest])
-            model = settled(self.data, fewer, STEPS_OUT, self.budget, DECIDED)
+            model = settled(self.data, fewer, SELECTION.few_steps, self.budget, ORDER.decided)
         return model if model is whole else self.settled(model)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
         """Those that are spurious, weak, or close to another."""
         spurious, whole_evidence = _spurious(self.data, model), whole_evidence_of(model)
         for r, pole in enumerate(model.poles):
-            near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < CLOSE * abs(pole.real)
+            near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf) < SELECTION.close * abs(pole.real)
             threshold = self.threshold(model, pole)
-            doubtful = near and whole_evidence[r] < DISTINCT * threshold
-            if spurious[r] or doubtful or evidence_of(model, r) < WEAK * threshold:
+            doubtful = near and whole_evidence[r] < ORDER.distinct * threshold
+            if spurious[r] or doubtful or evidence_of(model, r) < SELECTION.weak * threshold:
                 rest = np.delete(np.arange(model.poles.size), r)
                 without = projected(self.data, model.poles[rest], model.participation[rest])
-                yield complex(pole), settled(self.data, without, STEPS_OUT, self.budget, DECIDED), bool(spurious[r])
+                yield (
+                    complex(pole),
+                    settled(self.data, without, SELECTION.few_steps, self.budget, ORDER.decided),
+                    bool(spurious[r]),
+                )
 
     def _near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
         return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
@@ -232,7 +235,7 @@ def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
     tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
     return np.asarray(
-        tries[(tries.imag > 0) & (tries.imag < data.highest) & (-tries.real < MOST_DAMPED * np.abs(tries))]
+        tries[(tries.imag > 0) & (tries.imag < data.highest) & (-tries.real < SELECTION.most_damped * np.abs(tries))]
     )
 
 
@@ -288,8 +291,8 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
     one = shapes.shape[0] * fit.participation.shape[1] == 1
-    split = near & (alike > SAME_SHAPE) & (strength[:, None] < strength) & (not one)
-    return np.asarray(split.any(axis=1) | (-poles.real > MOST_DAMPED * np.abs(poles)))
+    split = near & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not one)
+    return np.asarray(split.any(axis=1) | (-poles.real > SELECTION.most_damped * np.abs(poles)))
 
 
 def evidence_of(fit: Fit, r: int) -> float:

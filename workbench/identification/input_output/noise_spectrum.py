@@ -7,16 +7,23 @@ terms as lower n ln var(e) + p ln n; before, each line gets back its leverage, t
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import dct, idct
 
-from workbench.identification.signal.projection import ORDER, ROUNDING, SAMPLES_EACH, differ, variances, white
+from workbench.identification.signal.projection import PROJECTION, differ, variances, white
 
-# Root mean square of log ratios below which two spectra are the same.
-ALIKE = 0.1
-# Leverage at most: a line that the fit took whole says nothing of its noise.
-MOST_TAKEN = 0.9
+
+@dataclass(frozen=True)
+class NoiseSettings:
+    """Constants of the estimate of a noise spectrum."""
+
+    alike: float = 0.1  # rms of log ratios below which two spectra are the same
+    most_taken: float = 0.9  # leverage at most: a line that the fit took whole says nothing of its noise
+
+
+NOISE = NoiseSettings()
 
 
 def lines_of(samples: np.ndarray) -> np.ndarray:
@@ -51,7 +58,7 @@ def noise_spectrum(
     """
     squares = np.array([(each**2).sum(axis=0) for each in left])
     measured = np.array([(each**2).sum(axis=0) for each in whole])
-    if (squares.sum(axis=0) <= ROUNDING**2 * measured.sum(axis=0)).any():
+    if (squares.sum(axis=0) <= PROJECTION.rounding**2 * measured.sum(axis=0)).any():
         return None
     levels = np.sqrt(variances(squares, free))
     power = [np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in left]
@@ -59,7 +66,7 @@ def noise_spectrum(
     if flat.all() and not differ(squares, free).any():
         return None
     good = [
-        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, MOST_TAKEN)))
+        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, NOISE.most_taken)))
         for each, share in zip(left, taken, strict=True)
     ]
     found = [np.tile(row, (len(each), 1)) for row, each in zip(levels, left, strict=True)]
@@ -76,7 +83,7 @@ def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) 
     """Whether two noise spectra are the same."""
     if one is None or other is None:
         return one is other
-    return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < ALIKE)
+    return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < NOISE.alike)
 
 
 def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:
@@ -86,7 +93,7 @@ def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:
     best = found = np.ones(1)
     loss = sum(float(row @ row) for row in rows) / n
     least = n * np.log(loss)
-    for order in range(1, min(ORDER, n // SAMPLES_EACH) + 1):
+    for order in range(1, min(PROJECTION.order, n // PROJECTION.samples_each) + 1):
         ahead, back = [f[1:] for f in ahead], [b[:-1] for b in back]
         crossed = sum(float(f @ b) for f, b in zip(ahead, back, strict=True))
         k = -2.0 * crossed / sum(float(f @ f + b @ b) for f, b in zip(ahead, back, strict=True))

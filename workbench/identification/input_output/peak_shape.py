@@ -14,6 +14,7 @@ lower. A linear model fits such a mode only by a cluster: three and more modes w
 with complex shapes of no common phase. Only one is then reported.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,12 +24,23 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
 from workbench.identification.input_output.model_order import evidence_of
 from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.input_output.time_variance import INSTEAD, pairs_alike
+from workbench.identification.input_output.time_variance import CHANGING, pairs_alike
 from workbench.identification.signal.searches import Budget
 
-FALSE_ALARM = 1e-6  # chance that noise alone makes such a peak
-MATTERS = 0.2  # of the half-power half-width: a smaller scatter of the pole harms no model
-BESIDE = 4.0  # half-power half-widths about a mode in which its noise is measured
+
+@dataclass(frozen=True)
+class PeaksSettings:
+    """Constants of the search for peaks that are not those of one pole, and for clusters."""
+
+    false_alarm: float = 1e-6  # chance that noise alone makes such a peak
+    matters: float = 0.2  # of the half-power half-width: a smaller scatter of the pole harms no model
+    beside: float = 4.0  # half-power half-widths about a mode in which its noise is measured
+    fewest: int = 3  # modes of a cluster: two modes of one structure may overlap
+    in_phase: float = 0.95  # phase collinearity of shapes that overlap where damping is proportional
+    narrow: float = 3.0  # half-power bands of the strongest: broader ones do not extend the cluster
+
+
+PEAKS = PeaksSettings()
 
 
 class Peaks(NamedTuple):
@@ -76,12 +88,14 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
     uneven, scatter, evidence = np.zeros(n, bool), np.zeros(n), np.zeros(n)
     for r, pole in enumerate(fit.poles):
         both = np.array([r, 2 * n + r])
-        beside = np.abs(lines.omega - pole.imag) < max(BESIDE * abs(pole.real), BESIDE * lines.resolution)
+        beside = np.abs(lines.omega - pole.imag) < max(PEAKS.beside * abs(pole.real), PEAKS.beside * lines.resolution)
         noise_ratio = max(1.0, float(power[beside].mean())) if beside.any() else 1.0
         value = found[both]
         evidence[r] = value @ np.linalg.pinv(covariance[np.ix_(both, both)], hermitian=True) @ value
         scatter[r] = np.sqrt(np.hypot(*value) / size[r])
-        uneven[r] = evidence[r] > noise_ratio * chi2.isf(FALSE_ALARM, 2) and scatter[r] > MATTERS * abs(pole.real)
+        uneven[r] = evidence[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2) and scatter[r] > PEAKS.matters * abs(
+            pole.real
+        )
     return Peaks(uneven, scatter, evidence)
 
 
@@ -101,7 +115,7 @@ def one_for_two(lines: Lines, fit: Fit, budget: Budget) -> tuple[Fit, np.ndarray
         one = settled(lines, projected(lines, fit.poles[left], fit.participation[left]), budget=budget)
         found, at = peaks(lines, one), int(np.searchsorted(left, strong))
         worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / one.noise**2).sum())
-        if found.uneven[at] and found.evidence[at] > INSTEAD * worth:
+        if found.uneven[at] and found.evidence[at] > CHANGING.instead * worth:
             fewer, which = one_for_two(lines, one, budget)
             return fewer, left[which]
     return fit, kept
@@ -113,11 +127,6 @@ def _third(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.n
     above = participation[:, None] / (s - pole) ** 3
     below = participation.conj()[:, None] / (s - pole.conjugate()) ** 3
     return lines.stacked_pair(above, below)
-
-
-# Two modes of one structure may overlap; shapes of more than two do so only where damping makes them complex.
-FEWEST, IN_PHASE = 3, 0.95
-NARROW = 3.0  # half-power bands of the strongest: broader ones do not extend the cluster
 
 
 def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) -> dict[int, list[int]]:
@@ -139,8 +148,8 @@ def parts_of(poles: np.ndarray, collinearity: np.ndarray, strength: np.ndarray) 
             met = [r for r in left if near[r, lead]]
             left = [r for r in left if r not in met]
             cluster += [int(r) for r in met]
-            leads += [r for r in met if width[r] < NARROW * width[first]]
-        if len(cluster) >= FEWEST and collinearity[cluster].min() < IN_PHASE:
+            leads += [r for r in met if width[r] < PEAKS.narrow * width[first]]
+        if len(cluster) >= PEAKS.fewest and collinearity[cluster].min() < PEAKS.in_phase:
             clusters[cluster[0]] = cluster[1:]
     return clusters
 

@@ -1,19 +1,32 @@
 """Lines of measured transfer functions, as a `modal_fit.Measurement`, and their noise."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.ndimage import median_filter
 from scipy.stats import chi2, spearmanr
 
 from workbench.identification.input_output.modal_fit import Fit
 from workbench.identification.input_output.model_order import bases_of, weights_of
-from workbench.identification.signal.searches import MOST_DAMPED
+from workbench.identification.signal.searches import SELECTION
 
-MOST_CANDIDATES, RATES, BESIDE, PEAKS_A_RATE = 600, 6, 25, 10
-# Half-power bandwidths beside a mode, and the chance that noise of one level is taken for louder.
-DETUNED, LOUDER = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0]), 0.01
-# Chance that even noise is taken for uneven; and b |H| / a at the median line, from nothing to all.
-UNEVEN, SHARES = 1e-4, np.geomspace(1e-3, 1e3, 61)
-SMOOTHED = 5  # lines
+
+@dataclass(frozen=True)
+class LinesSettings:
+    """Constants of the search among lines."""
+
+    most_candidates: int = 600  # lines, the strongest, where poles are tried
+    rates: int = 6  # of decay
+    beside: int = 25  # lines on either side from which the noise about a pole is taken
+    peaks_a_rate: int = 10  # candidates of each rate of decay
+    louder: float = 0.01  # chance that noise of one level is taken for louder about a mode
+    uneven: float = 1e-4  # chance that even noise is taken for uneven
+    smoothed: int = 5  # lines of a running median
+
+
+LINES = LinesSettings()
+DETUNED = np.array([-4.0, -3.0, -2.0, 2.0, 3.0, 4.0])  # half-power bandwidths beside a mode
+SHARES = np.geomspace(1e-3, 1e3, 61)  # b |H| / a at the median line, from nothing to all
 
 
 class Lines:
@@ -32,8 +45,8 @@ class Lines:
         # A pole may leave the band: one close beyond it is no constant there. Such poles are residual terms.
         self.highest = 2.0 * float(omega[-1])
         span = omega[-1] - omega[0]
-        self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), RATES)
-        self.cells = RATES * self.lines
+        self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), LINES.rates)
+        self.cells = LINES.rates * self.lines
 
     def _stacked(self, values: np.ndarray) -> np.ndarray:
         rows = values.reshape(values.shape[0], -1).T
@@ -71,18 +84,18 @@ class Lines:
         left = self.unstacked(residual if self.weights is None else residual * self.weights).reshape(-1, self.lines)
         weight = 1.0 if self.weights is None else (np.abs(self.unstacked(self.weights)) ** 2).mean(axis=(0, 1)) / 2.0
         power = (np.abs(left) ** 2).sum(axis=0)
-        at = np.sort(np.argsort(power)[-MOST_CANDIDATES:])
+        at = np.sort(np.argsort(power)[-LINES.most_candidates :])
         found, strength = [], []
         for rate in self.rates:
             x = 1.0 / (1j * (self.omega - self.omega[at, None]) + rate)
             score = (np.abs(left @ x.conj().T) ** 2).sum(axis=0) / (np.abs(x) ** 2 * weight).sum(axis=1)
-            score[rate > MOST_DAMPED * self.omega[at]] = 0.0
-            best = np.argsort(score)[-PEAKS_A_RATE:]
+            score[rate > SELECTION.most_damped * self.omega[at]] = 0.0
+            best = np.argsort(score)[-LINES.peaks_a_rate :]
             found.append(-rate + 1j * self.omega[at[best]])
             strength.append(score[best])
         order = np.argsort(np.concatenate(strength))[::-1]
         beyond = np.r_[0.6 * self.omega[0], 0.9 * self.omega[0], np.array([1.05, 1.2, 1.5]) * self.omega[-1]]
-        return np.asarray(np.r_[np.concatenate(found)[order[: 3 * PEAKS_A_RATE]], (-0.01 + 1j) * beyond])
+        return np.asarray(np.r_[np.concatenate(found)[order[: 3 * LINES.peaks_a_rate]], (-0.01 + 1j) * beyond])
 
     def fitted(self, fit: Fit) -> np.ndarray:
         """The model at the lines, (n_outputs, n_references, n_frequencies)."""
@@ -127,13 +140,13 @@ class Lines:
                 continue
             power = np.mean(noise_ratio, axis=(0, 1)) @ shown / shown.sum()
             degrees = np.size(noise_ratio) / shown.size * shown.sum() ** 2 / (shown**2).sum()
-            found[r] = power if power > chi2.isf(LOUDER, degrees) / degrees else 1.0
+            found[r] = power if power > chi2.isf(LINES.louder, degrees) / degrees else 1.0
         return found
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         power = (np.abs(self.unstacked(residual)) ** 2).mean(axis=(0, 1))
         at = int(np.argmin(np.abs(self.omega - pole.imag)))
-        beside = power[max(at - BESIDE, 0) : at + BESIDE + 1]
+        beside = power[max(at - LINES.beside, 0) : at + LINES.beside + 1]
         # The median of a power of two degrees of freedom and more is at most its mean.
         return max(1.0, float(np.median(beside) / power.mean()))
 
@@ -152,13 +165,13 @@ def noise_with_size(left: np.ndarray, fitted: np.ndarray) -> np.ndarray | None:
     """
     inner = np.arange(1, left.shape[-1] - 1, 3)  # every third: no line counts twice
     rough = np.abs(left[..., inner] - 0.5 * (left[..., inner - 1] + left[..., inner + 1]))
-    seen = median_filter(np.abs(fitted + left), (1, 1, SMOOTHED))
+    seen = median_filter(np.abs(fitted + left), (1, 1, LINES.smoothed))
     size, found, uneven = np.maximum(np.abs(fitted), seen), np.ones(left.shape), False
     for j, (each, of) in enumerate(zip(rough, size[..., inner], strict=True)):
         typical = float(np.median(of))
         if typical <= 0.0 or np.median(each) <= 0.0:
             continue
-        if spearmanr(each.ravel(), of.ravel(), alternative="greater").pvalue > UNEVEN:
+        if spearmanr(each.ravel(), of.ravel(), alternative="greater").pvalue > LINES.uneven:
             continue
         # Least absolute errors of log s: the few lines of a mode not yet found count little.
         logs = [np.log(each) - 0.5 * np.log1p((share * of / typical) ** 2) for share in SHARES]

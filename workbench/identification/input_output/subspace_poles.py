@@ -8,6 +8,7 @@ matrix, Γ = [C; C A; C A² ...], and Γ without its last block times A is Γ wi
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -15,13 +16,21 @@ from scipy.linalg import solve_triangular
 from workbench.identification.input_output.input_delays import n_moving
 from workbench.records.record import Record
 
-# Samples of past and of future: at most; moving samples there must be for each row of the data matrix; below which
-# nothing is tried. Blows excite too few directions of the space.
-HORIZON, ROWS_EACH, LEAST = 140, 5, 6
-# Rows and columns of the data matrix at most: more add time, and the poles are only a start.
-MOST_ROWS, MOST_COLUMNS = 20_000, 1_700
-# Of each row's energy, added lest rows that are sums of others make the factor singular.
-REGULARISED = 1e-12
+
+@dataclass(frozen=True)
+class SubspaceSettings:
+    """Constants of the subspace model that a search starts from."""
+
+    horizon: int = 140  # samples of past and of future, at most
+    rows_each: int = 5  # moving samples there must be for each row of the data matrix
+    least: int = 6  # samples of past below which nothing is tried: blows excite too few directions of the space
+    # rows and columns of the data matrix at most: more add time, and the poles are only a start
+    most_rows: int = 20_000
+    most_columns: int = 1_700
+    regularised: float = 1e-12  # of each row's energy, lest rows that are sums of others be singular
+
+
+SUBSPACE = SubspaceSettings()
 
 
 def subspace_poles(records: Sequence[Record], delays: np.ndarray, order: int) -> np.ndarray:
@@ -35,18 +44,20 @@ def subspace_poles(records: Sequence[Record], delays: np.ndarray, order: int) ->
     m, q = records[0].n_outputs, records[0].n_inputs
     each = 2 * (m + q)
     longest = max(record.n_samples for record in records) - int(delays.max(initial=0))
-    horizon = min(HORIZON, MOST_COLUMNS // each, n_moving(records) // (ROWS_EACH * each), longest // 4)
-    if horizon < LEAST:
+    horizon = min(
+        SUBSPACE.horizon, SUBSPACE.most_columns // each, n_moving(records) // (SUBSPACE.rows_each * each), longest // 4
+    )
+    if horizon < SUBSPACE.least:
         return np.zeros(0, complex)
     gram = np.zeros((each * horizon, each * horizon))
-    left = MOST_ROWS
+    left = SUBSPACE.most_rows
     for record in records:
         data = _data_matrix(record, delays, horizon, left)
         gram += data @ data.T
         left -= data.shape[1]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
     gram *= np.outer(scale, scale)
-    gram[np.diag_indices_from(gram)] += REGULARISED
+    gram[np.diag_indices_from(gram)] += SUBSPACE.regularised
     try:
         factor = np.linalg.cholesky(gram)
         known, future = q * horizon, (m + 2 * q) * horizon

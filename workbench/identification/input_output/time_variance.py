@@ -12,6 +12,7 @@ z' = (λ + α t + κ |z|²) z + l u, its motion is the series of Volterra in α 
 the modes are searched beside these columns up to the third order.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,17 +22,26 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
 from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
 from workbench.identification.input_output.model_order import evidence_of
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
 
-SURE = 5.0  # standard errors that a change must have
-NEAR, ALIKE = 3.0, 0.9  # half-power bandwidths apart, and modal assurance, of modes that may be one
-INSTEAD = 0.5  # of what a second mode explains that a change of the first must explain in its place
-MATTERS = 0.1  # of the half-power bandwidth: a smaller change harms no model
-REACH, FAINT = 0.15, 0.2  # of the frequency, and of the evidence, of a mode that may stand for the change of another
-STEPS = 12  # of a fit that only decides
-COLLINEAR = 1e-4  # singular value over which columns of unit length count
-FADED = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
+
+@dataclass(frozen=True)
+class ChangingSettings:
+    """Constants of the search for modes that change within a record."""
+
+    sure: float = 5.0  # standard errors that a change must have
+    near: float = 3.0  # half-power bandwidths apart, of modes that may be one
+    alike: float = 0.9  # modal assurance of such modes
+    instead: float = 0.5  # of what a second mode explains that a change of the first must explain in its place
+    matters: float = 0.1  # of the half-power bandwidth: a smaller change harms no model
+    reach: float = 0.15  # of the frequency of a mode, within which another may stand for its change
+    faint: float = 0.2  # of its evidence, likewise
+    collinear: float = 1e-4  # singular value over which columns of unit length count
+    faded: float = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
+
+
+CHANGING = ChangingSettings()
 
 
 class Change(NamedTuple):
@@ -70,7 +80,11 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     change, deviation = inverse @ along, np.sqrt(np.diag(inverse))
     omega, span = np.abs(poles), 2.0 * np.pi / data.resolution
     moving, error = np.abs(change[n:]), deviation[n:]
-    sure = (moving > SURE * error) & (moving > MATTERS * np.abs(poles.real)) & (-poles.real * span > FADED)
+    sure = (
+        (moving > CHANGING.sure * error)
+        & (moving > CHANGING.matters * np.abs(poles.real))
+        & (-poles.real * span > CHANGING.faded)
+    )
     return Change(change[n:] / omega, error / omega, sure)
 
 
@@ -91,7 +105,7 @@ def joined(data: KnownInputs, fit: Fit, budget: Budget, change: Change | None = 
         one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), budget=budget)
         of_one, at = changes_in_time(data, one), int(np.searchsorted(kept, strong))
         worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / one.noise**2).sum())
-        if of_one.sure[at] and (of_one.frequency[at] / of_one.deviation[at]) ** 2 > INSTEAD * worth:
+        if of_one.sure[at] and (of_one.frequency[at] / of_one.deviation[at]) ** 2 > CHANGING.instead * worth:
             return joined(data, one, budget, of_one)
     return fit, change
 
@@ -104,23 +118,23 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
     """
     strength = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
     participation = fit.participation[:, : data.n_inputs].T
-    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > ALIKE
+    alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
     beside: list[Floats] = []
     changing: list[complex] = []
     out = np.zeros(fit.poles.size, bool)
     for r in np.argsort(-strength):
-        weak = strength < FAINT * strength[r]
-        near = np.abs(fit.poles.imag - fit.poles.imag[r]) < REACH * np.abs(fit.poles.imag[r])
+        weak = strength < CHANGING.faint * strength[r]
+        near = np.abs(fit.poles.imag - fit.poles.imag[r]) < CHANGING.reach * np.abs(fit.poles.imag[r])
         others = np.flatnonzero(weak & near & alike[r] & ~out)
         if out[r] or not others.size or budget.spent("check of modes that change within the record"):
             continue
         kept = np.delete(np.arange(fit.poles.size), others)
-        one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), STEPS, budget)
+        one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), SELECTION.few_steps, budget)
         at = int(np.searchsorted(kept, r))
         moved = _motion(data, one.poles[at], one.participation[at])
         worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / fit.noise**2).sum())
         phi = columns(data, one.poles, one.participation)[0]
-        if _explained(data, one, phi, moved, fit.noise) > INSTEAD * worth:
+        if _explained(data, one, phi, moved, fit.noise) > CHANGING.instead * worth:
             beside.append(moved)
             changing.append(complex(one.poles[at]))
             out[others] = True
@@ -172,7 +186,7 @@ def _series(z: np.ndarray, pole: complex, dt: float) -> Floats:
 def _independent(rows: Floats) -> Floats:
     """Orthonormal columns that span those of a matrix but for what is collinear."""
     u, s, _ = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(u[:, s > COLLINEAR])
+    return np.asarray(u[:, s > CHANGING.collinear])
 
 
 def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise: Floats) -> float:
@@ -187,9 +201,9 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
 
 def pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     """Modes near each other with shapes alike, the nearest first."""
-    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > ALIKE
+    poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > CHANGING.alike
     apart = np.abs(np.subtract.outer(poles.imag, poles.imag))
-    near = apart < NEAR * np.add.outer(np.abs(poles.real), np.abs(poles.real))
+    near = apart < CHANGING.near * np.add.outer(np.abs(poles.real), np.abs(poles.real))
     both = zip(*np.nonzero(np.triu(alike & near, 1)), strict=True)
     return sorted(((int(r), int(s)) for r, s in both), key=lambda pair: apart[pair])
 
@@ -206,7 +220,7 @@ def change_remarks(
         return ()
     change = changes_in_time(data, fit) if change is None else change
     names = [f"mode {r + 1} ({np.abs(pole) / (2.0 * np.pi):.4g} Hz)" for r, pole in enumerate(fit.poles)]
-    sure = change.sure & (np.abs(change.frequency) < REACH)
+    sure = change.sure & (np.abs(change.frequency) < CHANGING.reach)
     words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure)]
     others = sorted({names[r] for pole in changing if not sure[r := int(np.argmin(np.abs(fit.poles - pole)))]})
     end = "such a mode is the mean of what it was: identify parts of the record, or levels one by one"

@@ -26,24 +26,32 @@ from scipy.stats import t as student
 from workbench.identification.signal.searches import Budget
 from workbench.structure.modes import mac
 
-# Samples of past and of future; least and most of the highest model order.
-PAST, LEAST_ORDER, MOST_ORDER = 40, 8, 40
-# Each slower rate is so many times slower than the last, down to the slowest, while so many samples are left.
-SLOWER, SLOWEST, LEAST_SAMPLES = 4, 16, 10 * PAST
-# Share of the Nyquist frequency up to which the filter of a slower rate leaves the modes alone.
-PASSED = 0.7
-# Share of the variance that is added to that of each output, lest outputs without noise be singular.
-REGULARISED = 1e-9
-# Periods of a mode that the past must hold, unless there is no slower rate.
-LEAST_PERIODS = 1.0
-# Damping ratio above which a pole is no mode; relative distance and MAC of a mode from order to order.
-MOST_DAMPED, NEAR, ALIKE = 0.25, 0.02, 0.7
-# Least share of all orders, and of those from the first on at which it is found.
-PRESENCE, STAYS = 0.4, 0.75
-# Orders that a mode's errors are estimated at, at most, and those of the least errors that it is the mean of.
-MOST_TAKEN, AVERAGED = 10, 3
-# Blocks of a record that are left out in turn, and those that there must be time for.
-BLOCKS, LEAST_BLOCKS = 12, 4
+
+@dataclass(frozen=True)
+class SubspaceSettings:
+    """Constants of canonical variate analysis over orders and rates."""
+
+    past: int = 40  # samples of past and of future
+    least_order: int = 8  # least and most of the highest model order
+    most_order: int = 40
+    slower: int = 4  # times slower each rate is than the one before
+    slowest: int = 16  # times slower the slowest rate is than that of the record
+    least_samples: int = 400  # that must be left at a slower rate: ten times the past
+    passed: float = 0.7  # of the Nyquist frequency, up to which the filter of a slower rate leaves the modes alone
+    regularised: float = 1e-9  # of the variance of each output, lest outputs without noise be singular
+    least_periods: float = 1.0  # of a mode that the past must hold, unless there is no slower rate
+    most_damped: float = 0.25  # damping ratio above which a pole is no mode
+    near: float = 0.02  # relative distance of a mode from order to order
+    alike: float = 0.7  # MAC of a mode from order to order
+    presence: float = 0.4  # least share of all orders
+    stays: float = 0.75  # likewise of those from the first on at which it is found
+    most_taken: int = 10  # orders that a mode's errors are estimated at
+    averaged: int = 3  # of these, those of the least errors, that it is the mean of
+    blocks: int = 12  # of a record that are left out in turn
+    least_blocks: int = 4  # that there must be time for
+
+
+SUBSPACE = SubspaceSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +86,9 @@ class Subspace:
         self.n_outputs, self.n_samples = outputs.shape
         values, slower = outputs - outputs.mean(axis=1, keepdims=True), 1
         self._outputs: dict[int, np.ndarray] = {}
-        while slower == 1 or (values.shape[1] >= LEAST_SAMPLES and slower <= SLOWEST):
+        while slower == 1 or (values.shape[1] >= SUBSPACE.least_samples and slower <= SUBSPACE.slowest):
             self._outputs[slower] = values
-            values, slower = resample_poly(values, 1, SLOWER, axis=1), SLOWER * slower
+            values, slower = resample_poly(values, 1, SUBSPACE.slower, axis=1), SUBSPACE.slower * slower
 
     def stable(self) -> list[StablePole]:
         """Poles that stay over the orders, each once: from the rate at which it is found at most orders."""
@@ -102,23 +110,23 @@ class Subspace:
         if not modes:
             return []
         without: list[list[np.ndarray]] = []
-        for b in range(BLOCKS):
-            if budget is not None and b >= LEAST_BLOCKS and budget.spent("standard errors"):
+        for b in range(SUBSPACE.blocks):
+            if budget is not None and b >= SUBSPACE.least_blocks and budget.spent("standard errors"):
                 break
             without.append(self._without(b, modes))
         n, freedom = len(without), len(without) - 1
-        scale = (student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)) ** 2 * (BLOCKS - 1) / n
+        scale = (student.ppf(0.975, freedom) / student.ppf(0.975, np.inf)) ** 2 * (SUBSPACE.blocks - 1) / n
         found = []
         for r, mode in enumerate(modes):
             each = np.array([one[r] for one in without])
             apart = each - each.mean(axis=0)
             # A low order leaves out a little, a high one fits noise.
             error = scale * (np.abs(apart) ** 2).sum(axis=0) + np.abs(np.array(mode.poles) - mode.pole) ** 2
-            best = np.argsort(error)[:AVERAGED]
+            best = np.argsort(error)[: SUBSPACE.averaged]
             apart = apart[:, best].mean(axis=1)
             both = np.stack([apart.real, apart.imag])
             pole = complex(np.array(mode.poles)[best].mean())
-            block = 2.0 * abs(pole.real) * self.n_samples * self.sample_time / BLOCKS
+            block = 2.0 * abs(pole.real) * self.n_samples * self.sample_time / SUBSPACE.blocks
             variance = scale / (1.0 - (1.0 - np.exp(-block)) / block) * both @ both.T
             found.append(replace(mode, pole=pole, variance=variance))
         return found
@@ -128,9 +136,9 @@ class Subspace:
         found = [np.zeros(0)] * len(modes)
         for slower in {mode.slower for mode in modes}:
             left, dt = self._outputs[slower].copy(), slower * self.sample_time
-            first, last = (left.shape[1] * b // BLOCKS for b in (block, block + 1))
+            first, last = (left.shape[1] * b // SUBSPACE.blocks for b in (block, block + 1))
             left[:, first:last] = 0.0
-            model = Model(_covariances(left, 2 * PAST + 1))
+            model = Model(_covariances(left, 2 * SUBSPACE.past + 1))
             here = [r for r, mode in enumerate(modes) if mode.slower == slower]
             every = {n: model.poles(n)[0] / dt for n in {n for r in here for n in modes[r].orders}}
             for r in here:
@@ -140,21 +148,21 @@ class Subspace:
 
     def _at_one_rate(self, slower: int) -> list[StablePole]:
         dt = slower * self.sample_time
-        top = np.pi * (1.0 if slower == 1 else PASSED) / dt
-        low = 0.0 if slower == max(self._outputs) else 2.0 * np.pi * LEAST_PERIODS / (PAST * dt)
-        model = Model(_covariances(self._outputs[slower], 2 * PAST + 1))
+        top = np.pi * (1.0 if slower == 1 else SUBSPACE.passed) / dt
+        low = 0.0 if slower == max(self._outputs) else 2.0 * np.pi * SUBSPACE.least_periods / (SUBSPACE.past * dt)
+        model = Model(_covariances(self._outputs[slower], 2 * SUBSPACE.past + 1))
         groups: list[list[StablePole]] = []
         orders = range(2, model.highest_order(self._outputs[slower].shape[1]) + 1, 2)
         for order in reversed(orders):
             log_mu, shapes, gains = model.poles(order, evidence=True)
             for pole, shape, gain in zip(log_mu / dt, shapes.T, gains, strict=True):
-                if not (0 < -pole.real < MOST_DAMPED * abs(pole) and low < abs(pole) < top):
+                if not (0 < -pole.real < SUBSPACE.most_damped * abs(pole) and low < abs(pole) < top):
                     continue
                 gain *= self.n_samples / slower
                 alone = (order,), (complex(pole),)
                 mode = StablePole(complex(pole), shape, 0.0, gain, *alone, slower, np.full((2, 2), np.nan))
                 near = [(_apart(mode, group[-1]), group) for group in groups if group[-1].orders[0] != order]
-                near = [pair for pair in near if pair[0] < NEAR]
+                near = [pair for pair in near if pair[0] < SUBSPACE.near]
                 if near:
                     min(near, key=lambda pair: pair[0])[1].append(mode)
                 else:
@@ -169,14 +177,14 @@ def _nearest(poles: np.ndarray, pole: complex) -> complex:
 
 def _stays(group: Sequence[StablePole], orders: range) -> bool:
     possible = sum(order >= group[-1].orders[0] for order in orders)
-    return len(group) >= max(PRESENCE * len(orders), STAYS * possible)
+    return len(group) >= max(SUBSPACE.presence * len(orders), SUBSPACE.stays * possible)
 
 
 def _median(group: Sequence[StablePole], orders: range) -> StablePole:
     """The mode nearest the median of a group."""
     poles = np.array([mode.pole for mode in group])
     nearest = int(np.argmin(np.abs(poles - np.median(poles.real) - 1j * np.median(poles.imag))))
-    taken, share = group[:: 1 + len(group) // MOST_TAKEN], len(group) / len(orders)
+    taken, share = group[:: 1 + len(group) // SUBSPACE.most_taken], len(group) / len(orders)
     each = tuple(mode.orders[0] for mode in taken), tuple(mode.pole for mode in taken)
     return replace(group[nearest], presence=share, orders=each[0], poles=each[1])
 
@@ -187,24 +195,24 @@ class Model:
     def __init__(self, lags: np.ndarray) -> None:
         m = lags.shape[1]
         lags = lags.copy()
-        lags[0] += REGULARISED * np.diag(np.diag(lags[0]))
+        lags[0] += SUBSPACE.regularised * np.diag(np.diag(lags[0]))
         both = np.concatenate([lags[:0:-1].transpose(0, 2, 1), lags])
-        i, j = np.indices((PAST, PAST))
+        i, j = np.indices((SUBSPACE.past, SUBSPACE.past))
         past, future, between = (
-            both[at + len(lags) - 1].transpose(0, 2, 1, 3).reshape(m * PAST, m * PAST)
+            both[at + len(lags) - 1].transpose(0, 2, 1, 3).reshape(m * SUBSPACE.past, m * SUBSPACE.past)
             for at in (j - i, i - j, i + j + 1)
         )
         root, ahead = np.linalg.cholesky(past), np.linalg.cholesky(future)
         half = solve_triangular(ahead, between, lower=True)
         _, self._correlations, canonical = np.linalg.svd(solve_triangular(root, half.T, lower=True).T)
-        state = solve_triangular(root.T, canonical[:MOST_ORDER].T, lower=False).T
+        state = solve_triangular(root.T, canonical[: SUBSPACE.most_order].T, lower=False).T
         self._now, self._c = lags[0], between[:m] @ state.T
         self._a = state @ np.vstack([between[:m], past[:-m]]) @ state.T
 
     def highest_order(self, n_samples: int) -> int:
         """Twice the number of canonical correlations above those of noise (Johnstone 2001), within limits."""
-        noise = 2.0 * np.sqrt(self._c.shape[0] * PAST / n_samples)
-        return int(np.clip(2 * np.sum(self._correlations > noise), LEAST_ORDER, MOST_ORDER))
+        noise = 2.0 * np.sqrt(self._c.shape[0] * SUBSPACE.past / n_samples)
+        return int(np.clip(2 * np.sum(self._correlations > noise), SUBSPACE.least_order, SUBSPACE.most_order))
 
     def poles(self, order: int, evidence: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """ln μ and shapes (n_outputs, n_poles) of the poles above the real axis, and the evidence of each a sample."""
@@ -224,13 +232,15 @@ class Model:
 
 def _apart(one: StablePole, other: StablePole) -> float:
     """Relative distance of two poles, infinite where the shapes differ."""
-    if mac(one.shape[:, None], other.shape[:, None])[0, 0] < ALIKE:
+    if mac(one.shape[:, None], other.shape[:, None])[0, 0] < SUBSPACE.alike:
         return np.inf
     return abs(one.pole - other.pole) / abs(other.pole)
 
 
 def _same(one: StablePole, other: StablePole) -> bool:
-    return _apart(one, other) < 0.25 * NEAR + 0.5 * (abs(one.pole.real) + abs(other.pole.real)) / abs(other.pole)
+    return _apart(one, other) < 0.25 * SUBSPACE.near + 0.5 * (abs(one.pole.real) + abs(other.pole.real)) / abs(
+        other.pole
+    )
 
 
 def _covariances(outputs: np.ndarray, n_lags: int) -> np.ndarray:

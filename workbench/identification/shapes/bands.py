@@ -50,18 +50,26 @@ from workbench.structure.profile import ProfileLike
 from workbench.structure.supports import PointMass
 from workbench.threads import one_blas_thread
 
-DRAWS = 4000
-# Of the largest standard error; below it an end holds the curve and there is nothing to be unsure of.
-HELD = 1e-6
-ORDER, CELLS = 4, 400
-# Chance that noise alone is taken for interpolation error, and that τ² is larger than its limit.
-UNLIKELY = 0.05
-# Splines of higher degree extrapolate further from fewer sensors, and err more where a mode is short for its sensors.
-DEGREES = (5, 3)
-# Share of the variance of each derivative that is independent of the others: K knows their ratio no better.
-OF_ITS_OWN = 0.01
-# Chance that a correct end is refused.
-REFUSED = 1e-4
+
+@dataclass(frozen=True)
+class BandsSettings:
+    """Constants of bands and of the boundary condition check."""
+
+    draws: int = 4000  # of the largest error along the structure: a quantile of 0.95 to a hundredth
+    held: float = 1e-6  # of the largest standard error: below it an end holds the curve
+    order: int = 4  # of the derivative taken as white: a point mass or spring is an impulse in it
+    cells: int = 400  # of the structure, on which Peano's kernel is taken
+    # chance that noise alone is taken for interpolation error, and that τ² is larger than its limit
+    unlikely: float = 0.05
+    # splines of higher degree extrapolate further from fewer sensors, and err more where a mode is short for its
+    # sensors
+    degrees: tuple[int, ...] = (5, 3)
+    # of the variance of each derivative, independent of the others: the kernel knows their ratio no better
+    of_its_own: float = 0.01
+    refused: float = 1e-4  # chance that a correct end is refused
+
+
+BANDS = BandsSettings()
 DERIVATIVES = ("value", "slope", "curvature", "change of curvature")
 
 
@@ -77,13 +85,13 @@ def peano_kernel(
         length: m.
         derivative: of K by x.
     """
-    order = min(ORDER, spline.degree + 1)
-    u = (np.arange(CELLS) + 0.5) * length / CELLS
+    order = min(BANDS.order, spline.degree + 1)
+    u = (np.arange(BANDS.cells) + 0.5) * length / BANDS.cells
     held = [_power(np.array([at]), u, order, d)[0] for at, d in spline.conditions]
     along = spline.matrix(x, derivative) @ _power(positions, u, order)
     if held:
         along = along + spline.of_held(x, derivative) @ np.array(held)
-    return np.asarray((_power(x, u, order, derivative) - along) * np.sqrt(length / CELLS))
+    return np.asarray((_power(x, u, order, derivative) - along) * np.sqrt(length / BANDS.cells))
 
 
 class LeaveOneOut:
@@ -108,7 +116,7 @@ class LeaveOneOut:
         error, noise, _ = self._errors(values, covariance)
         by_noise = np.diag(noise)
         together = np.sum(noise**2 / np.outer(by_noise, by_noise)) / error.size  # χ² of size / together, stretched
-        if (error**2 / by_noise).sum() < together * chi2.isf(UNLIKELY, error.size / together):
+        if (error**2 / by_noise).sum() < together * chi2.isf(BANDS.unlikely, error.size / together):
             return 0.0
         return self.roughest(values, covariance)
 
@@ -123,7 +131,7 @@ class LeaveOneOut:
 
         highest = np.log((np.maximum(error**2, by_noise) / by_rough).max())
         best = minimize_scalar(unlikely, bounds=(highest - 20.0, highest), method="bounded")
-        limit = best.fun + chi2.isf(2.0 * UNLIKELY, 1)
+        limit = best.fun + chi2.isf(2.0 * BANDS.unlikely, 1)
         return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, highest + 20.0)))
 
     def _errors(self, values: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -164,13 +172,13 @@ def check_ends(found: ShapeEstimates, ends: KnownEnds, *, length: float) -> None
         away, std, against = np.zeros((3, values.shape[1], len(conditions)))
         for r, (v, noise) in enumerate(zip(values.T, found.shape_covariance, strict=True)):
             covariance = rows @ noise @ rows.T + leave_one_out.roughest(v, noise) * error @ error.T
-            known = np.linalg.inv(covariance + OF_ITS_OWN * np.diag(np.diag(covariance)))
+            known = np.linalg.inv(covariance + BANDS.of_its_own * np.diag(np.diag(covariance)))
             # Each conditional on the others.
             std[r] = 1.0 / np.sqrt(np.diag(known))
             away[r] = known @ rows @ v * std[r] ** 2
             against[r] = rows @ v * (known @ rows @ v)
         chance = float(chi2.sf(against.sum(), against.size))
-        if chance < REFUSED:
+        if chance < BANDS.refused:
             r, k = divmod(int(np.argmax(np.abs(away / std))), len(conditions))
             rest = ", given the rest" if len(conditions) > 1 else ""
             zero = " and ".join(DERIVATIVES[d] for d in conditions)
@@ -190,7 +198,7 @@ def _extrapolated(
     few."""
     where: dict[str, Any] = {"length": length, "ends": others}
     x = np.array([at])
-    for degree in DEGREES:
+    for degree in BANDS.degrees:
         try:
             spline = interpolating_spline(positions, degree=degree, **where)
             leave_one_out = LeaveOneOut(positions, degree=degree, **where)
@@ -319,8 +327,8 @@ def eigenfunction_bands(
                 interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])
             std[:, r] = np.linalg.norm(root, axis=1)
-            unsure = std[:, r] > HELD * std[:, r].max()
+            unsure = std[:, r] > BANDS.held * std[:, r].max()
             if unsure.any():
-                drawn = (root[unsure] / std[unsure, r, None]) @ rng.standard_normal((root.shape[1], DRAWS))
+                drawn = (root[unsure] / std[unsure, r, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))
                 width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
     return Bands(frozen(x), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)

@@ -17,7 +17,7 @@ from scipy.linalg import null_space
 from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
-from workbench.identification.shapes.bands import DRAWS, HELD, Bands
+from workbench.identification.shapes.bands import BANDS, Bands
 from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
@@ -25,13 +25,20 @@ from workbench.structure.profile import FieldLike, as_field
 from workbench.structure.supports import SIDES
 from workbench.threads import one_blas_thread
 
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Constants of splines over a rectangle."""
+
+    per_edge: int = 11  # points where an edge is held
+    quadrature: int = 49  # modes that the points of integration over the rectangle would serve
+    same_place: float = 1e-6  # of the diagonal: sensors nearer stand at one place
+
+
+SURFACE = SurfaceSettings()
 POWER = 3.5  # of |p|², the kernel |p|⁷
 CUBIC = tuple((i, j) for i in range(4) for j in range(4 - i))  # powers of x and y that cost no energy
-PER_EDGE = 11  # points where an edge is held
 HELD_BY = {"simply supported": (0,), "clamped": (0, 1), "free": (), "guided": (1,)}
-QUADRATURE = 49  # modes that the points of integration over the rectangle would serve
-UNLIKELY = 0.05  # that τ² is larger than its limit, or that noise alone is taken for an interpolation error
-SAME_PLACE = 1e-6  # of the diagonal: sensors nearer stand at one place
 
 Functional = tuple[np.ndarray, tuple[int, int]]
 
@@ -94,7 +101,7 @@ class SurfaceSpline:
                     f"edges are given by side, {', '.join(SIDES)}, as {', '.join(HELD_BY)}; got {side} {edge!r}"
                 )
         gaps = np.linalg.norm(self.places[:, None] - self.places, axis=2) + np.eye(len(self.places)) * self.domain.size
-        if gaps.min() < SAME_PLACE * self.domain.size:
+        if gaps.min() < SURFACE.same_place * self.domain.size:
             i, j = np.unravel_index(int(gaps.argmin()), gaps.shape)
             raise ValueError(f"sensors {i + 1} and {j + 1} stand at one place, {self.places[i]} m; keep one of them")
         if np.linalg.matrix_rank(self._polynomials) < len(CUBIC):
@@ -111,7 +118,10 @@ class SurfaceSpline:
         assert isinstance(self.edges, Mapping)
         for side, edge in self.edges.items():
             i = SIDES.index(side)
-            along, across = (np.arange(PER_EDGE) + 0.5) / PER_EDGE, np.full(PER_EDGE, float(i % 2))
+            along, across = (
+                (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge,
+                np.full(SURFACE.per_edge, float(i % 2)),
+            )
             points = np.column_stack([across, along] if i < 2 else [along, across]) * (a, b)
             for order in HELD_BY[edge]:
                 found.append((points, ((order, 0) if i < 2 else (0, order))))
@@ -182,7 +192,7 @@ class SurfaceSpline:
         usual = float(np.trace(by_rough)) / len(left)
         span = np.log(scale / usual) + np.array([-40.0, 25.0])
         best = minimize_scalar(unlikely, bounds=tuple(span), method="bounded")
-        limit = best.fun + chi2.isf(2.0 * UNLIKELY, 1)
+        limit = best.fun + chi2.isf(2.0 * BANDS.unlikely, 1)
         if unlikely(span[0]) < limit:
             return 0.0
         return float(np.exp(brentq(lambda strength: unlikely(strength) - limit, best.x, span[1])))
@@ -270,9 +280,9 @@ def surface_bands(
         interpolation[:, r] = np.linalg.norm(missed, axis=1)
         both = np.hstack([noise, missed])
         std[:, r] = np.linalg.norm(both, axis=1)
-        unsure = std[:, r] > HELD * std[:, r].max()
+        unsure = std[:, r] > BANDS.held * std[:, r].max()
         if unsure.any():
-            drawn = (both[unsure] / std[unsure, r, None]) @ rng.standard_normal((both.shape[1], DRAWS))
+            drawn = (both[unsure] / std[unsure, r, None]) @ rng.standard_normal((both.shape[1], BANDS.draws))
             width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
     return Bands(frozen(at), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)
 
@@ -296,7 +306,7 @@ def _scaled(
 
 def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.ndarray, np.ndarray]:
     """Points of integration (n, 2), m, and the mass that each stands for."""
-    x, weights = domain.quadrature(QUADRATURE)
+    x, weights = domain.quadrature(SURFACE.quadrature)
     density = as_field(1.0 / float(np.prod(domain.length)) if mass_per_area is None else mass_per_area)
     return x, weights * density(x[:, 0], x[:, 1])
 

@@ -7,18 +7,26 @@ import numpy as np
 
 from workbench.records.record import Record
 
-# Values a sensor that moves takes at least.
-FEWEST_VALUES = 4
-# Samples piled up at the end of a range: so many, and so many times those of the next value. An oscillation that turns
-# back of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before.
-LEAST_PILED, PILED = 8, 6.0
-FEWEST_CHANGES = 16
-SLOWEST = 64
-# Relative to the innovation of a signal, what its past does not predict.
-COPIED = 1e-2
-PREDICTOR_ORDER, LONGEST = 16, 20_000
-NOISE_FREE = 1e-9
-BLOCK = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
+
+@dataclass(frozen=True)
+class DataSettings:
+    """Constants of the checks of a record."""
+
+    fewest_values: int = 4  # that a sensor which moves takes
+    # samples piled up at the end of a range: so many, and so many times those of the next value. An oscillation that
+    # turns back of itself has at most 1 / (√2 - 1) = 2.4 times as many in its last step as in the one before
+    least_piled: int = 8
+    piled: float = 6.0
+    fewest_changes: int = 16  # of an output, from which a rate at which it was held can be read
+    slowest: int = 64  # samples between changes: what changes less often rests
+    copied: float = 1e-2  # of the innovation, what its past does not predict: signals that differ by less are one
+    predictor_order: int = 16  # samples that predict the next
+    longest: int = 20_000  # samples in which copies are looked for
+    noise_free: float = 1e-9  # innovation over the signal: below, sensors of one mode are alike without being copies
+    block: int = 256  # outputs compared with all others at once: all pairs of 10,000 would take 800 MB
+
+
+DATA = DataSettings()
 
 
 @dataclass(frozen=True)
@@ -83,8 +91,8 @@ def check_same_sensors(records: Sequence[Record]) -> None:
 def _dead(record: Record) -> Iterator[DataFault]:
     for name, row in zip(record.output_names, record.outputs, strict=True):
         # most signals move within their first samples, which saves the rest
-        few = np.unique(row[:64]).size < FEWEST_VALUES and np.unique(row).size
-        if few and few < FEWEST_VALUES <= record.n_samples:
+        few = np.unique(row[:64]).size < DATA.fewest_values and np.unique(row).size
+        if few and few < DATA.fewest_values <= record.n_samples:
             what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
             yield DataFault("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
         elif few is False and record.n_samples > 2 and _straight(row):
@@ -98,7 +106,7 @@ def _straight(row: np.ndarray) -> bool:
 def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     if len(alive) < 2:
         return
-    part = record.outputs[alive, :LONGEST]
+    part = record.outputs[alive, : DATA.longest]
     about = part - part.mean(axis=1, keepdims=True)
     size = np.sqrt((about**2).mean(axis=1))
     # A part that is at rest has no copy.
@@ -106,15 +114,15 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
     scaled = about[moving] / size[moving, None]
     names = [record.output_channels[j].name for j, moves in zip(alive, moving, strict=True) if moves]
     copies: set[int] = set()
-    for first in range(0, len(scaled), BLOCK):
-        alike = scaled[first : first + BLOCK] @ scaled[first:].T / part.shape[1]
+    for first in range(0, len(scaled), DATA.block):
+        alike = scaled[first : first + DATA.block] @ scaled[first:].T / part.shape[1]
         for i, j in (first + np.argwhere(np.triu(np.abs(alike) > 1.0 - 1e-6, 1))).tolist():
             if i in copies or j in copies:
                 continue
             noise = _innovation_std(scaled[i])
             apart = np.sqrt(((scaled[i] - np.sign(alike[i - first, j - first]) * scaled[j]) ** 2).mean())
             # Without noise, sensors of a single mode are the same but for scale.
-            if noise > NOISE_FREE and apart < COPIED * noise:
+            if noise > DATA.noise_free and apart < DATA.copied * noise:
                 copies.add(j)
                 yield DataFault(
                     "copied",
@@ -126,7 +134,7 @@ def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
 
 def _innovation_std(row: np.ndarray) -> float:
     """Standard deviation of the innovation, what the samples before do not predict."""
-    k = min(PREDICTOR_ORDER, row.size // 4)
+    k = min(DATA.predictor_order, row.size // 4)
     if k == 0:
         return 0.0
     before = np.lib.stride_tricks.sliding_window_view(row, k)[:-1]
@@ -138,7 +146,11 @@ def _clipped(record: Record, alive: list[int]) -> Iterator[DataFault]:
         row, name = record.outputs[j], record.output_channels[j].name
         ends = {"above": row.max(), "below": row.min()}
         piled = {side: np.flatnonzero(row == end) for side, end in ends.items()}
-        clear = [side for side, at in piled.items() if at.size >= LEAST_PILED and at.size > PILED * _beside(row, at)]
+        clear = [
+            side
+            for side, at in piled.items()
+            if at.size >= DATA.least_piled and at.size > DATA.piled * _beside(row, at)
+        ]
         if clear:
             # Where one end of the range is too near, so may be the other: two equal samples are enough there.
             last = float(record.time[max(at[-1] for at in piled.values() if at.size > 1)])
@@ -164,9 +176,9 @@ def _upsampled(record: Record, alive: list[int]) -> Iterator[DataFault]:
         for order, how in ((1, "held"), (2, "joined by straight lines")):
             moves = np.abs(np.diff(row, order))
             changes = np.flatnonzero(moves > 1e-9 * np.abs(row).max())
-            every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= FEWEST_CHANGES else 1
+            every = int(np.gcd.reduce(np.diff(changes))) if changes.size >= DATA.fewest_changes else 1
             # What rests for long and moves again would have its changes far apart.
-            if 1 < every <= SLOWEST and changes.size > 0.5 * (np.ptp(changes) // every):
+            if 1 < every <= DATA.slowest and changes.size > 0.5 * (np.ptp(changes) // every):
                 yield DataFault(
                     "upsampled",
                     (name,),

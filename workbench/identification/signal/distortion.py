@@ -14,11 +14,19 @@ import numpy as np
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import frozen
 
-EXCITED = 0.05  # of the largest line of the inputs: the least that counts as excited
-SETTLING = 1  # periods at the start that a structure takes to settle
-ALIKE = 0.9  # correlation of the inputs with themselves a period later; that of other lags is far less
-APART = 0.5  # correlation that comes in between: below it the inputs are no slow drift
-LEAST = 8  # samples of a period
+
+@dataclass(frozen=True)
+class PeriodicSettings:
+    """Constants of the search for a period and its lines."""
+
+    excited: float = 0.05  # of the largest line of the inputs: the least that counts as excited
+    settling: int = 1  # periods at the start that a structure takes to settle
+    alike: float = 0.9  # correlation of the inputs with themselves a period later; that of other lags is far less
+    apart: float = 0.5  # correlation that comes in between: below it the inputs are no slow drift
+    least: int = 8  # samples of a period
+
+
+PERIODIC = PeriodicSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +85,12 @@ def distortion_of(record: Record) -> Distortion:
     period = period_of(record.inputs)
     if period is None:
         raise ValueError(f"record {record.name!r}: its inputs do not repeat, so no line is free of them")
-    n_periods = record.n_samples // period - SETTLING
+    n_periods = record.n_samples // period - PERIODIC.settling
     if n_periods < 2:
-        raise ValueError(f"record {record.name!r} has {n_periods + SETTLING} periods; noise needs three or more")
-    whole = slice(SETTLING * period, (SETTLING + n_periods) * period)
+        raise ValueError(
+            f"record {record.name!r} has {n_periods + PERIODIC.settling} periods; noise needs three or more"
+        )
+    whole = slice(PERIODIC.settling * period, (PERIODIC.settling + n_periods) * period)
 
     def lines_of(signals: np.ndarray) -> np.ndarray:
         """(n_signals, n_periods, n_lines), by rms."""
@@ -94,7 +104,7 @@ def distortion_of(record: Record) -> Distortion:
     return Distortion(
         name=record.name,
         frequencies_hz=frozen(np.arange(1, size.size + 1) / (period * record.sample_time)),
-        excited=frozen(size > EXCITED * size.max(), bool),
+        excited=frozen(size > PERIODIC.excited * size.max(), bool),
         amplitudes=frozen(np.abs(mean)),
         noise=frozen(np.sqrt(scatter / n_periods)),
         channels=record.output_channels,
@@ -117,7 +127,7 @@ def period_of(inputs: np.ndarray) -> int | None:
     u = np.asarray(inputs, float)
     n = u.shape[1]
     most = n // 2
-    if most < 2 * LEAST or not np.any(u):
+    if most < 2 * PERIODIC.least or not np.any(u):
         return None
     spectrum = np.fft.rfft(u, 2 * n, axis=1)
     product = np.fft.irfft((np.abs(spectrum) ** 2).sum(axis=0))[: most + 1]
@@ -125,13 +135,13 @@ def period_of(inputs: np.ndarray) -> int | None:
     lags = np.arange(most + 1)
     scale = np.sqrt(sums[n - lags] * (sums[n] - sums[lags]))
     alike = product / np.where(scale > 0, scale, np.inf)
-    apart = np.flatnonzero(alike[:most] < APART)
+    apart = np.flatnonzero(alike[:most] < PERIODIC.apart)
     if apart.size == 0:
         return None
-    start = max(int(apart[0]), LEAST)
+    start = max(int(apart[0]), PERIODIC.least)
     beside = np.r_[alike, -np.inf]
     peaks = start + np.flatnonzero(
-        (beside[start:-1] > ALIKE)
+        (beside[start:-1] > PERIODIC.alike)
         & (beside[start:-1] >= beside[start - 1 : -2])
         & (beside[start:-1] >= beside[start + 1 :])
     )

@@ -13,8 +13,7 @@ from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
 
-# Standard errors below zero from which on a damping ratio is negative.
-SURE = 3.0
+SURE = 3.0  # standard errors below zero from which on a damping ratio is negative
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
 
 

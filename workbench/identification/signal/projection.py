@@ -27,20 +27,24 @@ from scipy.stats import chi2
 
 from workbench.records.record import Record
 
-# Samples by modes up to which Φ is factored at once, and the samples of a part beyond.
-LARGEST_FACTORED, PART = 300_000, 2048
-# e^-41 is below the last digit of 1.
-DIED_AWAY = 41.0
-# Round-off of squares that are found as the difference of sums over the record, as a share of these.
-SUMMED = 1e-14
-# Chance that records of one noise are each given their own, which costs little.
-SPLIT = 0.05
-# Chance that white noise is taken for coloured, and the least number of bins over which a spectrum is averaged.
-FALSE_ALARM, LEAST_BINS = 1e-3, 6
-# Order of the autoregressive model, and samples for each of its coefficients.
-ORDER, SAMPLES_EACH = 12, 40
-# Residual of records without noise, relative.
-ROUNDING = 1e-9
+
+@dataclass(frozen=True)
+class ProjectionSettings:
+    """Constants of projections and of what is said of their noise."""
+
+    largest_factored: int = 300_000  # samples by modes up to which Φ is factored at once: 5 MB
+    part: int = 2048  # samples of a part of a longer record
+    died_away: float = 41.0  # nepers: e^-41 is below the last digit of 1
+    summed: float = 1e-14  # round-off of squares that are a difference of sums over the record, as a share of these
+    split: float = 0.05  # chance that records of one noise are each given their own, which costs little
+    false_alarm: float = 1e-3  # chance that white noise is taken for coloured
+    least_bins: int = 6  # over which a spectrum is averaged
+    order: int = 12  # of the autoregressive model of coloured noise
+    samples_each: int = 40  # for each of its coefficients
+    rounding: float = 1e-9  # residual of records without noise, relative
+
+
+PROJECTION = ProjectionSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +85,7 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     Raises:
         numpy.linalg.LinAlgError: two of them cannot be distinguished.
     """
-    if record.n_samples * poles.size > LARGEST_FACTORED:
+    if record.n_samples * poles.size > PROJECTION.largest_factored:
         return _project_by_parts(record, poles, offset)
     # Complex powers cost one exponential a sample and mode; both real columns come from it.
     tau = record.sample_time * np.arange(record.n_samples)
@@ -161,7 +165,7 @@ def _project_by_parts(record: Record, poles: np.ndarray, offset: bool) -> Projec
     squares = np.maximum(power - (coefficients * seen).sum(axis=0), 0.0)
     slopes = t_seen - tilted.T @ coefficients
     gram, spread = doubly - tilted.T @ tilt, solve(np.eye(len(whole)))
-    return Projection(record, poles, squares, SUMMED, coefficients, gram, slopes, spread, tilt)
+    return Projection(record, poles, squares, PROJECTION.summed, coefficients, gram, slopes, spread, tilt)
 
 
 class _Exponentials:
@@ -172,14 +176,14 @@ class _Exponentials:
         # The slowest to die away first: those alive in a part are then the first few.
         self.order = np.argsort(-poles.real)
         self.slow = poles[self.order]
-        self.lives = DIED_AWAY / np.maximum(-self.slow.real, 1e-300)
-        self.tau = self.dt * np.arange(min(PART, record.n_samples))
+        self.lives = PROJECTION.died_away / np.maximum(-self.slow.real, 1e-300)
+        self.tau = self.dt * np.arange(min(PROJECTION.part, record.n_samples))
         self.begin = np.exp(np.outer(self.tau, self.slow))
 
     def parts(self) -> Iterator[tuple[slice, np.ndarray, np.ndarray, np.ndarray]]:
         """Samples, rows of the exponentials left, their columns of Φ, and the outputs, (n_part, n_outputs)."""
-        for first in range(0, self.record.n_samples, PART):
-            part = slice(first, min(first + PART, self.record.n_samples))
+        for first in range(0, self.record.n_samples, PROJECTION.part):
+            part = slice(first, min(first + PROJECTION.part, self.record.n_samples))
             alive = int(np.searchsorted(-self.lives, -first * self.dt, side="right"))
             rows = np.r_[self.order[:alive], self.order.size + self.order[:alive]]
             exponentials = self.begin[: part.stop - first, :alive] * np.exp(first * self.dt * self.slow[:alive])
@@ -196,10 +200,10 @@ def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = Tru
     """
     left = [project(record, poles, offset).residual.T for record in records]
     powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in left]
-    order = min(ORDER, sum(each.shape[1] for each in left) // SAMPLES_EACH)
+    order = min(PROJECTION.order, sum(each.shape[1] for each in left) // PROJECTION.samples_each)
     squares = sum((each**2).sum(axis=1) for each in left)
     whole = sum((record.outputs**2).sum(axis=1) for record in records)
-    rounding = (squares < ROUNDING**2 * whole).any()
+    rounding = (squares < PROJECTION.rounding**2 * whole).any()
     if order == 0 or rounding or all(white(power, poles.size).all() for power in powers):
         return None
     filters = []
@@ -233,7 +237,7 @@ def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> n
     factors = np.ones((m, poles.size))
     coloured = ~white(power, poles.size)
     for r, pole in enumerate(poles):
-        width = max(abs(pole.real), LEAST_BINS * omega[0])
+        width = max(abs(pole.real), PROJECTION.least_bins * omega[0])
         weight = _bandwidth_weight((omega - pole.imag) / width)
         # Each mode took the noise of one bin.
         left = max(weight.sum() - _bandwidth_weight((poles.imag - pole.imag) / width).sum(), 1.0)
@@ -255,7 +259,7 @@ def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.n
     whole = weight.sum(axis=0)
     along = (weight / np.where(whole > 0, whole, 1.0)).T @ power
     # A constant is disturbed by noise about zero frequency.
-    along[whole <= 1e-20 * len(signals)] = power[: 2 * LEAST_BINS].mean(axis=0)
+    along[whole <= 1e-20 * len(signals)] = power[: 2 * PROJECTION.least_bins].mean(axis=0)
     return np.where(white(power, n_modes), 1.0, along)
 
 
@@ -271,7 +275,7 @@ def white(power: np.ndarray, n_modes: int) -> np.ndarray:
     summed = np.cumsum(power, axis=0) / np.where(whole > 0, whole, 1.0)
     apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
     # The bins that the modes took are not coloured noise.
-    return np.asarray(apart < np.sqrt(0.5 * np.log(2.0 * m / FALSE_ALARM) / bins) + (n_modes + 1) / bins)
+    return np.asarray(apart < np.sqrt(0.5 * np.log(2.0 * m / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins)
 
 
 def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
@@ -295,7 +299,7 @@ def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
     whole = free.sum(axis=0)
     apart = whole * np.log(squares.sum(axis=0) / whole) - (free * np.log(squares / free)).sum(axis=0)
     return np.asarray(
-        apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1))) > chi2.isf(SPLIT, n - 1)
+        apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1))) > chi2.isf(PROJECTION.split, n - 1)
     )
 
 

@@ -25,8 +25,39 @@ from workbench.structure.modes import mac
 
 State = TypeVar("State")
 SECONDS = 30.0  # of processor time
-# Share of the time in which modes are searched; the rest is for refinement, standard errors and remarks.
-SEARCH = 0.6
+# Chance that a record of nothing but noise yields a mode.
+FALSE_ALARM = 1e-3
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Constants of every fit of modes."""
+
+    most_steps: int = 60
+    # of χ², each value: a step is negligible once it moves the estimate by less than a thousandth of its standard error
+    negligible: float = 1e-6
+    most_growth: float = 20.0  # nepers over a record: no pole is searched that grows faster
+
+
+@dataclass(frozen=True)
+class SelectionSettings:
+    """Constants of every selection of modes."""
+
+    search_share: float = 0.6  # of the time, in which modes are searched; the rest is for refinement and errors
+    most_damped: float = 0.3  # damping ratio above which a pole is no mode
+    most_growth: float = 0.5  # nepers over a record above which a pole grows: it may be noise that is not white
+    same_shape: float = 0.95  # MAC from which on two overlapping poles are one mode, split
+    most_rounds: int = 4  # where noise is not white, or modes depend on amplitude, they may enter and leave for ever
+    few_steps: int = 12  # of a fit that only decides whether a mode enters or leaves
+    weak: float = 4.0  # times the limit, below which a mode may be noise and is tried again
+    close: float = 2.0  # bandwidths to the next mode, likewise
+    noise_bins: int = 50  # on either side, from which the noise about a pole is taken
+
+
+FIT = FitSettings()
+SELECTION = SelectionSettings()
+# Chance that shapes of three signals agree so far, (1 - MAC)^(n_signals - 1); fewer must agree better to say as much.
+BY_CHANCE = (1.0 - SELECTION.same_shape) ** 2
 
 # (the search under way, the share of the time that is spent)
 Progress = Callable[[str, float], None]
@@ -79,7 +110,7 @@ class Budget:
 
 
 @dataclass(frozen=True)
-class Damping:
+class DampingSettings:
     """How the damping μ, a share of the diagonal of N, follows what the steps achieve.
 
     The result does not depend on these numbers, only the number of steps does; they are Marquardt's habit.
@@ -91,6 +122,7 @@ class Damping:
         least: below which N is not regularised any further.
         most: from which on no step is tried: s has shrunk to a gradient step of 1e-8 standard errors.
         stuck: from which on the search ends after a step.
+        indefinite: least, where N is not positive definite as it stands.
     """
 
     first: float = 1e-3
@@ -99,11 +131,10 @@ class Damping:
     least: float = 1e-12
     most: float = 1e8
     stuck: float = 1e6
+    indefinite: float = 1e-9
 
 
-DAMPING = Damping()
-# From here on, where N is not positive definite as it stands.
-INDEFINITE = 1e-9
+DAMPING = DampingSettings()
 
 
 class LeastSquares(Protocol[State]):
@@ -169,7 +200,7 @@ def minimise(
             try:
                 step = scale * cho_solve(cho_factor(scaled + damping * one), scale * right)
             except np.linalg.LinAlgError:
-                damping = max(DAMPING.raised * damping, INDEFINITE)
+                damping = max(DAMPING.raised * damping, DAMPING.indefinite)
                 continue
             trial, step = problem.moved(state, step)
             small = problem.negligible(float(step @ right), cost)
@@ -187,17 +218,6 @@ def minimise(
             return Minimum(state, cost, False, taken)
     return Minimum(state, cost, False, most_steps)
 
-
-# Chance that a record of nothing but noise yields a mode.
-FALSE_ALARM = 1e-3
-# Damping ratio above which a pole is no mode.
-MOST_DAMPED = 0.3
-# MAC from which on two overlapping poles are one mode, split.
-SAME_SHAPE = 0.95
-# Chance that shapes of three signals agree so far, (1 - MAC)^(n_signals - 1); fewer must agree better to say as much.
-BY_CHANCE = (1.0 - SAME_SHAPE) ** 2
-# Where noise is not white, or modes depend on amplitude, modes may enter and leave for ever.
-MOST_ROUNDS = 4
 
 Model = TypeVar("Model")
 Candidate = TypeVar("Candidate")
@@ -265,7 +285,7 @@ class Stepwise(Generic[Model, Candidate]):
 
     def select(self, model: Model) -> Model:
         """The modes of a measurement, from those of a model on."""
-        for _ in range(MOST_ROUNDS):
+        for _ in range(SELECTION.most_rounds):
             before = self.problem.n_modes(model)
             grown = self.forward(model)
             most = self.problem.n_modes(grown)
@@ -347,11 +367,11 @@ def spurious_modes(
     """
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + bin_width
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
-    damped = -poles.real > MOST_DAMPED * np.abs(poles)
+    damped = -poles.real > SELECTION.most_damped * np.abs(poles)
     # An overdamped one has every band; it is split itself.
     # One signal has no shape, and a mode that depends on amplitude looks like two there.
     others = len(shapes) - 1
-    alike = max(SAME_SHAPE, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SAME_SHAPE
+    alike = max(SELECTION.same_shape, 1.0 - BY_CHANCE ** (1.0 / others)) if others else SELECTION.same_shape
     split = near & (mac(shapes, shapes) > alike) & (strength[:, None] < strength) & ~damped
     if distinct is not None and others == 0:
         for r, s in np.argwhere(split):

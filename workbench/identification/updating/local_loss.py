@@ -28,13 +28,24 @@ from workbench.identification.updating.structure_task import FittedStructure, Ta
 from workbench.structure.member import Bar, Beam
 from workbench.threads import one_blas_thread
 
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Constants of the search for a local loss."""
+
+    places: int = 60  # along the structure, where one is looked for
+    typical_width: float = 0.1  # of the length: so many independent places noise has to imitate a loss at
+    # of the length: a search finds a loss from half and from twice its width, not from any
+    widths: tuple[float, ...] = (0.05, 0.1, 0.2, 0.4)
+    most_starts: int = 2  # of each width
+    most_looks: int = 4  # after the first
+    first_terms: int = 3  # of mass and stiffness, that the first look is taken with
+    fewer_terms: int = 2  # by which terms are fewer in the next look: many imitate a loss so well
+    draws: int = 20_000  # of a loss as likely as the one found, for intervals
+
+
+LOSS = LossSettings()
 FALSE_ALARM = 0.01
-N_PLACES = 60
-TYPICAL_WIDTH = 0.1  # of the length
-WIDTHS = (0.05, 0.1, 0.2, 0.4)  # of the length: a search finds a loss from half and from twice its width, not from any
-MOST_STARTS, MOST_LOOKS = 2, 4  # of each width; after the first
-FIRST_TERMS, FEWER_TERMS = 3, 2
-N_DRAWS = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +85,7 @@ class LocatedDamage:
         likely, length = self.lossy.parameters[-3:], self.lossy.structure.length
         share, centre, width = (
             np.random.default_rng(0)
-            .multivariate_normal(likely, self.lossy.covariance[-3:, -3:], N_DRAWS, method="eigh")
+            .multivariate_normal(likely, self.lossy.covariance[-3:, -3:], LOSS.draws, method="eigh")
             .T
         )
         begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
@@ -108,10 +119,10 @@ def locate_damage(
     terms = sorted(mass_terms), sorted(stiffness_terms)
     if not (terms[0] and terms[1]):
         raise ValueError("no number of terms was given for mass or stiffness; give at least one, 0 to keep the nominal")
-    first = _from_anywhere(Problem.of(task, *(basis(few[:FIRST_TERMS][-1]) for few in terms)), None)
+    first = _from_anywhere(Problem.of(task, *(basis(few[: LOSS.first_terms][-1]) for few in terms)), None)
     lossy = choose(task, basis, *terms, _near_the_last, near=first, exhaust=False)
     fewer = 0
-    for _ in range(MOST_LOOKS):
+    for _ in range(LOSS.most_looks):
         if lossy.explains or fewer >= max(lossy.n_terms):
             break
         at_least = (max(n - fewer, few[0]) for n, few in zip(lossy.n_terms, terms, strict=True))
@@ -119,9 +130,9 @@ def locate_damage(
         if again.criterion < lossy.criterion - 1.0:
             lossy, fewer = choose(task, basis, *terms, partial(_near_either, again), near=again), 0
         else:
-            fewer += FEWER_TERMS  # many terms imitate a loss so well that few starts lead to it
+            fewer += LOSS.fewer_terms  # many terms imitate a loss so well that few starts lead to it
     # three parameters, sought over as many places as stand apart
-    limit = float(chi2_distribution.isf(false_alarm * TYPICAL_WIDTH, 3))
+    limit = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
     smooth = _smooth(task, basis, terms, lossy, limit)
     evidence = smooth.criterion - lossy.criterion + _price(task)
     # modes that not even a loss explains err by more than their standard errors, and count for less
@@ -200,9 +211,9 @@ def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
     length = problem.task.nominal.length
     places, all_gains = scan(problem, whole)
     likely = []
-    for width, gain in zip(WIDTHS, all_gains, strict=True):
+    for width, gain in zip(LOSS.widths, all_gains, strict=True):
         peaks = np.flatnonzero(np.r_[True, gain[1:] >= gain[:-1]] & np.r_[gain[:-1] >= gain[1:], True] & (gain > 0.0))
-        best = sorted(peaks, key=lambda i: -gain[i])[:MOST_STARTS]
+        best = sorted(peaks, key=lambda i: -gain[i])[: LOSS.most_starts]
         likely += [LocalLoss(0.1, float(places[i]), width * length) for i in best]
     return likely
 
@@ -212,28 +223,28 @@ def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndar
     first order, (n_widths, n_places)."""
     task, series = problem.task, problem.series
     length = task.nominal.length
-    places = (np.arange(N_PLACES) + 0.5) / N_PLACES * length
+    places = (np.arange(LOSS.places) + 0.5) / LOSS.places * length
     d, e = np.split(smooth.parameters, [smooth.n_terms[0]])
 
     def with_losses(x: np.ndarray) -> np.ndarray:
         own = series.stiffness.functions(x)
-        near = np.maximum(1.0 - np.abs(x[:, None] - places) * N_PLACES / length, 0.0)
+        near = np.maximum(1.0 - np.abs(x[:, None] - places) * LOSS.places / length, 0.0)
         return np.hstack([own, -(1.0 + own @ e)[:, None] * near])
 
     breaks = tuple(np.linspace(0.0, length, 11))
-    wider = Basis(with_losses, e.size + N_PLACES, (*series.stiffness.breaks, *breaks))
+    wider = Basis(with_losses, e.size + LOSS.places, (*series.stiffness.breaks, *breaks))
     particular, free = problem.stiffness_held
-    held = np.r_[particular, np.zeros(N_PLACES)], block_diag(free, np.eye(N_PLACES))
+    held = np.r_[particular, np.zeros(LOSS.places)], block_diag(free, np.eye(LOSS.places))
     trial = replace(
         problem, series=SeriesStructure(task.nominal, series.mass, wider, series.positions), stiffness_held=held
     )
-    missed, slopes = trial.misses(np.r_[problem.free_of(d, e), np.zeros(N_PLACES)])
+    missed, slopes = trial.misses(np.r_[problem.free_of(d, e), np.zeros(LOSS.places)])
     # what the smooth series cannot make good
-    own = np.linalg.qr(slopes[:, :-N_PLACES])[0]
-    narrow = slopes[:, -N_PLACES:] - own @ (own.T @ slopes[:, -N_PLACES:])
+    own = np.linalg.qr(slopes[:, : -LOSS.places])[0]
+    narrow = slopes[:, -LOSS.places :] - own @ (own.T @ slopes[:, -LOSS.places :])
     apart = np.abs(places[:, None] - places) / length
     gains = []
-    for width in WIDTHS:
+    for width in LOSS.widths:
         losses = narrow @ (apart < 0.5 * width)
         gains.append(np.maximum(-losses.T @ missed, 0.0) ** 2 / np.maximum((losses**2).sum(axis=0), 1e-300))
     return places, np.array(gains)

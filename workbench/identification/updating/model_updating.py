@@ -16,9 +16,18 @@ from workbench.identification.signal.modal_estimates import rounded
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, counted
 
-LEAST_MAC = 0.5  # below it a measured mode is no mode of the model
-STEP = 1e-4  # of the logarithm of a parameter, for central differences
-INDISTINCT = 1e-6  # smallest singular value of the scaled Jacobian over the largest: parameters that do the same
+
+@dataclass(frozen=True)
+class UpdatingSettings:
+    """Constants of model updating."""
+
+    least_mac: float = 0.5  # below it a measured mode is no mode of the model
+    step: float = 1e-4  # of the logarithm of a parameter, for central differences
+    # smallest singular value of the scaled Jacobian over the largest: parameters that do the same
+    indistinct: float = 1e-6
+
+
+UPDATING = UpdatingSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -104,7 +113,7 @@ def update_model(
     def paired(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
         agreement = subspace_mac(measured, modes.phi(places), modes.omega)
         rows, columns = linear_sum_assignment(-agreement)
-        if rows.size < target.size or agreement[rows, columns].min() < LEAST_MAC:
+        if rows.size < target.size or agreement[rows, columns].min() < UPDATING.least_mac:
             lost = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
                 f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
@@ -118,14 +127,14 @@ def update_model(
         return difference
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
-        steps = STEP * np.eye(first.size)
+        steps = UPDATING.step * np.eye(first.size)
         columns = [residuals(logarithms + step) - residuals(logarithms - step) for step in steps]
-        return np.column_stack(columns) / (2.0 * STEP)
+        return np.column_stack(columns) / (2.0 * UPDATING.step)
 
     found = least_squares(residuals, np.zeros(first.size), jac=jacobian, method="lm")
     parameters = first * np.exp(found.x)
     singular = np.linalg.svd(found.jac, compute_uv=False)
-    if singular[-1] <= INDISTINCT * singular[0]:
+    if singular[-1] <= UPDATING.indistinct * singular[0]:
         raise ValueError(
             "the measured frequencies cannot distinguish the parameters: some change them alike; choose fewer"
         )

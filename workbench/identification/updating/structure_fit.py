@@ -17,7 +17,7 @@ from workbench.structure.member import Bar, Beam
 from workbench.threads import one_blas_thread
 
 MOST_TERMS = 8
-SPARE = 2
+SPARE = 2  # terms next in line that bands leave free too
 
 
 @one_blas_thread

@@ -23,15 +23,24 @@ from workbench.arrays import Floats
 from workbench.identification.updating.distributions import KNOWN_TOLERANCE, Basis
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
-from workbench.identification.updating.structure_task import UNLIKELY, FittedStructure, Task, UncertainProfile
+from workbench.identification.updating.structure_task import TASK, FittedStructure, Task, UncertainProfile
 from workbench.structure.member import Beam
 from workbench.structure.modes import frozen, mac
 from workbench.structure.profile import Profile
 
-NARROWEST, WIDEST = 0.02, 0.5  # of the length: a loss narrower is a crack, one wider is no local one
-MOST_LOST = 0.95
-N_DRAWS = 1000
-MOST_STEPS = 25
+
+@dataclass(frozen=True)
+class ProblemSettings:
+    """Constants of the fit of a structure."""
+
+    narrowest: float = 0.02  # of the length: a loss narrower is a crack
+    widest: float = 0.5  # of the length: one wider is no local one
+    most_lost: float = 0.95  # of the stiffness
+    draws: int = 1000  # of structures as likely as the fit, for bands
+    most_steps: int = 25  # of least squares
+
+
+PROBLEM = ProblemSettings()
 FROM_EDGES = np.array([[0.5, 0.5], [-1.0, 1.0]])  # centre and width of where a loss begins and ends
 
 
@@ -83,8 +92,8 @@ class Problem:
         low, high = np.full(z.size, -np.inf), np.full(z.size, np.inf)
         if loss is not None:
             z = np.r_[z, loss.share, loss.centre, loss.width]
-            low = np.r_[low, 0.0, 0.0, NARROWEST * length]
-            high = np.r_[high, MOST_LOST, length, WIDEST * length]
+            low = np.r_[low, 0.0, 0.0, PROBLEM.narrowest * length]
+            high = np.r_[high, PROBLEM.most_lost, length, PROBLEM.widest * length]
             z[-3:] = np.clip(z[-3:], *(0.999 * low[-3:] + 0.001 * high[-3:], 0.001 * low[-3:] + 0.999 * high[-3:]))
         if z.size == 0:
             return self.report(z)
@@ -98,7 +107,7 @@ class Problem:
             return memory[key]
 
         def search(z: np.ndarray) -> OptimizeResult:
-            tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9, "max_nfev": MOST_STEPS}
+            tolerances = {"ftol": 1e-5, "xtol": 1e-9, "gtol": 1e-9, "max_nfev": PROBLEM.most_steps}
             return least_squares(
                 lambda z: at(z)[0], z, lambda z: at(z)[1], bounds=(low, high), x_scale="jac", **tolerances
             )
@@ -175,12 +184,12 @@ class Problem:
         parameters = np.r_[d, e, z[self.n_free :]]
         carry = self.carry(z)
         covariance = carry @ self._covariance(z) @ carry.T
-        if freedom > 0 and chi2 > chi2_distribution.isf(UNLIKELY, freedom):
+        if freedom > 0 and chi2 > chi2_distribution.isf(TASK.unlikely, freedom):
             covariance = covariance * chi2 / freedom
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
-        normal = np.random.default_rng(0).standard_normal((N_DRAWS, parameters.size))
+        normal = np.random.default_rng(0).standard_normal((PROBLEM.draws, parameters.size))
         draws = parameters + size * (normal @ root.T)
         n, m = d.size, d.size + e.size
         mass = _uncertain(task.nominal.mass_per_length, series.mass, d, draws[:, :n])

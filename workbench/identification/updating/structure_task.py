@@ -16,10 +16,17 @@ from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import mac
 from workbench.structure.profile import Profile
 
-# No theory of bars and beams is better than this, however clean the record.
-TRUSTED = 1e-8
-SAME_MODE = 0.6  # least MAC with the mode of the nominal structure that a measured one is taken for
-UNLIKELY = 0.01
+
+@dataclass(frozen=True)
+class TaskSettings:
+    """Constants of what a measurement is trusted to."""
+
+    trusted: float = 1e-8  # relative: no theory of bars and beams is better than this, however clean the record
+    same_mode: float = 0.6  # least MAC with the nominal structure's mode that a measured one is taken for
+    unlikely: float = 0.01  # chance that a structure is said not to explain modes that are its own
+
+
+TASK = TaskSettings()
 
 
 @dataclass(frozen=True)
@@ -85,11 +92,11 @@ class Task:
         # The entry that a shape is measured by has no error of its own.
         reference = np.argmin(measured.shape_std, axis=0)
         shapes = (modes.shapes / modes.shapes[reference, np.arange(n)]).real
-        spread = measured.covariance[:n, :n] + np.diag((TRUSTED * modes.omega) ** 2)
+        spread = measured.covariance[:n, :n] + np.diag((TASK.trusted * modes.omega) ** 2)
         units = []
         for r in range(n):
             others = np.arange(m) != reference[r]
-            units.append(_unit(measured.shape_covariance[r][np.ix_(others, others)] + TRUSTED**2 * np.eye(m - 1)))
+            units.append(_unit(measured.shape_covariance[r][np.ix_(others, others)] + TASK.trusted**2 * np.eye(m - 1)))
         known = [np.array(pairs, float).reshape(-1, 2) for pairs in (known_mass, known_stiffness)]
         for name, pairs in zip(("mass", "stiffness"), known, strict=True):
             outside = (pairs[:, 0] < 0) | (pairs[:, 0] > nominal.length) | ~(pairs[:, 1] > 0)
@@ -132,7 +139,7 @@ def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
     agreement = mac(normalised_shapes(modes.shapes).real, shapes)
     which = linear_sum_assignment(-agreement)[1]
     least = int(np.argmin(agreement[np.arange(modes.n_modes), which]))
-    if agreement[least, which[least]] < SAME_MODE:
+    if agreement[least, which[least]] < TASK.same_mode:
         raise ValueError(
             f"measured mode {least + 1} at {modes.frequencies_hz[least]:.4g} Hz looks like no mode of the nominal"
             f" structure (best MAC {agreement[least].max():.2f}); leave it out, mend the nominal ends, or give numbers"
@@ -209,4 +216,4 @@ class FittedStructure:
     @property
     def explains(self) -> bool:
         """Whether noise alone would miss the measured modes by as much, in one measurement of a hundred or more."""
-        return bool(self.chi2 <= chi2_distribution.isf(UNLIKELY, self.freedom))
+        return bool(self.chi2 <= chi2_distribution.isf(TASK.unlikely, self.freedom))
