@@ -6,7 +6,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import lfilter
 
 from workbench.identification.ambient import correlation_functions, identify_ambient
-from workbench.identification.output_only.subspace import PAST, Model
+from workbench.identification.output_only.subspace import SUBSPACE, Model
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import mac
 
@@ -71,7 +71,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 def test_exact_covariances_give_exact_poles():
     """R(k) = C e^{A kΔt} P C^T with A P + P A^T + B B^T = 0, of the chain's velocities."""
     covariance, step = solve_continuous_lyapunov(A, -np.diag(np.r_[np.zeros(N), np.ones(N)])), expm(A * 0.3)
-    lags = np.array([(np.linalg.matrix_power(step, k) @ covariance)[N:, N:] for k in range(2 * PAST + 1)])
+    lags = np.array([(np.linalg.matrix_power(step, k) @ covariance)[N:, N:] for k in range(2 * SUBSPACE.past + 1)])
     log_mu, shapes, _ = Model(lags).poles(2 * N)
     order = np.argsort(log_mu.imag)
     exact = OMEGA * (-ZETA + 1j * np.sqrt(1.0 - ZETA**2))

@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import toeplitz
 
 from workbench.gap.prediction.logged_inputs import (
-    MOST_LOGGED,
+    LOGGED,
     input_filters,
     likeliest_share,
     logging_noise_power,
@@ -48,7 +48,7 @@ def test_how_loud_it_is(rig, logged):
 def test_none_is_told_from_some(rig, record_of):
     rng = np.random.default_rng(4)
     quiet = FitData((record_of(rig, rng.normal(size=(2, 1000)), rng, name="quiet"),), np.full(4, NOISE))
-    assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * MOST_LOGGED
+    assert likeliest_share(rig, quiet, quiet.differences(rig)).share < 0.1 * LOGGED.most
 
 
 def test_its_power_is_that_of_draws(rig, logged):

@@ -7,7 +7,7 @@ from skfem.helpers import dd, ddot, dot, grad
 from workbench.identification.free_decay.order import identify
 from workbench.identification.signal.synthesis import free_decay
 from workbench.identification.updating.distributions import Basis
-from workbench.identification.updating.local_loss import WIDTHS, locate_damage, scan
+from workbench.identification.updating.local_loss import LOSS, locate_damage, scan
 from workbench.identification.updating.sensitivity import LocalLoss
 from workbench.identification.updating.structure_problem import Problem
 from workbench.identification.updating.structure_task import Task
@@ -88,7 +88,7 @@ def test_the_first_look_points_at_the_place():
     task = Task.of(measured("beam", lost=0.02, centre=0.4), NOMINAL["beam"], known_mass=[(0.5, 1.0)])
     problem = Problem.of(task, Basis.polynomial(2), Basis.polynomial(3))
     places, gains = scan(problem, problem.fit())
-    assert abs(places[np.argmax(gains[WIDTHS.index(0.1)])] - 0.4) < 0.05
+    assert abs(places[np.argmax(gains[LOSS.widths.index(0.1)])] - 0.4) < 0.05
 
 
 @pytest.fixture(scope="module")

@@ -219,7 +219,7 @@ def _likely_losses(problem: Problem, whole: FittedStructure) -> list[LocalLoss]:
 
 
 def scan(problem: Problem, smooth: FittedStructure) -> tuple[np.ndarray, np.ndarray]:
-    """Places along the structure (n_places,) and what a small loss of each of `WIDTHS` there would lower χ² by, to
+    """Places along the structure (n_places,) and what a small loss of each of `LOSS.widths` there would lower χ² by, to
     first order, (n_widths, n_places)."""
     task, series = problem.task, problem.series
     length = task.nominal.length
