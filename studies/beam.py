@@ -11,9 +11,9 @@ from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import Law
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import place, placement_task
+from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
 from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works
 from workbench.draw.motion import response_motion
@@ -72,7 +72,7 @@ def designs(modes) -> dict[str, Law]:
     even = actuators_at(EVEN)
     task = placement_task(modes, N_CONTROLLED, impulse_at=DISTURBED_AT, weight=MODAL_WEIGHT)
     limit = 1.5 * task.placed(EVEN, "even").effort
-    best = place(task, Limits(effort=limit, spacing=0.5))
+    best = place_actuators(task, Limits(effort=limit, spacing=0.5))
     return {
         "IMSC": imsc(modes, N_CONTROLLED, even, weight=MODAL_WEIGHT),
         "coupled LQR": coupled_lqr(modes, N_CONTROLLED, even, weight=FORCE_WEIGHT),
@@ -188,7 +188,7 @@ def report_motion(outcome, truth, modes, laws, x) -> None:
         "through modal filters": close_loop(truth, laws["IMSC"], filter_),
         "exact modal coordinates": close_loop(truth, laws["IMSC"]),
     }
-    responses = {name: respond(loop, state, time) for name, loop in loops.items()}
+    responses = {name: initial_response(loop, state, time) for name, loop in loops.items()}
     energy = {name: r.energy[:N_CONTROLLED].sum(0) for name, r in responses.items()}
     left = energy["through modal filters"][-1] / energy["no control"][-1]
     apart = np.abs(

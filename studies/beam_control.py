@@ -5,7 +5,7 @@ from scipy.integrate import quad
 
 from workbench.design.estimation.modal_filter import hermite_filter
 from workbench.design.laws.imsc import imsc
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import energy_gained, finite_spillover, spillover
 from workbench.draw.design import plot_displacements, plot_work
 from workbench.rig.actuators import Actuator
@@ -65,8 +65,8 @@ def study(outcome, data=None):
         law = imsc(modes, 4, actuators, weight=20.0)
         works[name] = spillover(modes, law, at_rest)
         exact = close_loop(modes, law)
-        responses[name] = respond(exact, struck, time)
-        filtered = respond(close_loop(modes, law, filter_), struck, time)
+        responses[name] = initial_response(exact, struck, time)
+        filtered = initial_response(close_loop(modes, law, filter_), struck, time)
         x = np.linspace(0.0, 10.0, 101)
         size = np.abs(responses[name].displacement(x)).max()
         difference = max(difference, np.abs(filtered.displacement(x) - responses[name].displacement(x)).max() / size)

@@ -11,9 +11,9 @@ from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import riccati_gains
 from workbench.design.laws.pole_assignment import assign
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import nodes_of_mode, place
+from workbench.design.placement.placement import nodes_of_mode, place_actuators
 from workbench.design.placement.task import batch_work, placement_task
 from workbench.draw.design import plot_scaling
 from workbench.rig.actuators import Actuator
@@ -120,7 +120,7 @@ def study(outcome, data=None):
     task = placement_task(many, 8, impulse_at=6.3, weight=20.0)
     nodes = task.placed(nodes_of_mode(many, 8), "")
     start = perf_counter()
-    best = place(task, Limits(effort=1.5 * nodes.effort, spacing=SPACING), starts=10)
+    best = place_actuators(task, Limits(effort=1.5 * nodes.effort, spacing=SPACING), starts=10)
     place_seconds = perf_counter() - start
     rivals = [evolved(task, 1.5 * nodes.effort, seed) for seed in outcome.track(range(4), "differential evolution")]
 
@@ -187,7 +187,7 @@ def simulated(modes, steps, sensors=None):
     """The loop of all modes through four actuators, at even instants; the state as it is, or as sensors tell it."""
     law = placement_task(modes, 4, impulse_at=6.3, weight=20.0).law([2.0, 4.0, 6.0, 8.0])
     through = None if sensors is None else displacement_filter(modes.select(range(4)), sensors, 1.0)
-    return respond(close_loop(modes, law, through), impulse_state(modes, 6.3), np.linspace(0.0, 1000.0, steps))
+    return initial_response(close_loop(modes, law, through), impulse_state(modes, 6.3), np.linspace(0.0, 1000.0, steps))
 
 
 def evolved(task, effort_limit, seed):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task, scan, symbolic_work
 from workbench.design.placement.sensor_placement import place_sensors
 from workbench.draw.design import plot_effort_front
 from workbench.structure.member import Beam
@@ -18,11 +18,11 @@ def study(outcome, data=None):
     nodes = task.placed(nodes_of_mode(modes, 4), "nodes of mode 5")
 
     front = [
-        place(task, Limits(effort=factor * nodes.effort, spacing=SPACING))
+        place_actuators(task, Limits(effort=factor * nodes.effort, spacing=SPACING))
         for factor in outcome.track((1.0001, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0), "effort limits")
     ]
     limits = Limits(effort=1.5 * nodes.effort, spacing=SPACING)
-    best = place(task, limits)
+    best = place_actuators(task, limits)
     on_grid, tried = scan(task, limits, n_places=50)
 
     work, effort, *_ = symbolic_work(task)(best.positions)

@@ -8,7 +8,7 @@ from workbench.design.placement.certificate import certify
 from workbench.design.placement.coupled_placement import place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import nodes_of_mode, place, placement_task
+from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task
 from workbench.design.spillover.spillover import quadratic_cost
 from workbench.draw.design import plot_placement_fronts
 from workbench.rig.actuators import Actuator
@@ -35,7 +35,7 @@ def study(outcome, data=None):
         task = placement_task(modes, 4, impulse_at=at, weight=20.0)
         nodes[name] = task.placed(nodes_of_mode(modes, 4), "nodes of mode 5")
         fronts[name] = [
-            place(task, Limits(effort=factor * nodes[name].effort, spacing=SPACING), starts=6)
+            place_actuators(task, Limits(effort=factor * nodes[name].effort, spacing=SPACING), starts=6)
             for factor in outcome.track(FACTORS, f"front for {name}")
         ]
         outcome.table(
@@ -71,7 +71,7 @@ def study(outcome, data=None):
         task = placement_task(modes, n, impulse_at=6.3, weight=20.0)
         rule = task.placed(nodes_of_mode(modes, n), f"nodes of mode {n + 1}")
         limits = Limits(effort=1.5 * rule.effort, spacing=SPACING, **more)
-        best = place(task, limits)
+        best = place_actuators(task, limits)
         proof = certify(task, limits, placement=best, gap=gap)
         proofs.append(
             {

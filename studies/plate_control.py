@@ -13,7 +13,7 @@ from scipy.linalg import expm
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import Law
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import spillover
 from workbench.draw.beam import plot_two_works
 from workbench.draw.surface import plot_surface_modes, plot_surface_motion
@@ -124,7 +124,7 @@ def study(outcome, data=None):
     time = np.linspace(0.0, 60.0 / truth.omega[0], 1500)
     nothing = Law(np.zeros_like(law.gain), law.controlled, law.actuators, "none")
     loops = {"free": nothing, "controlled": law, "designed on the plate itself": exact}
-    responses = {name: respond(close_loop(truth, each), struck, time) for name, each in loops.items()}
+    responses = {name: initial_response(close_loop(truth, each), struck, time) for name, each in loops.items()}
     outcome.check(
         "stability margin of the plate under the identified law, 1/s", close_loop(truth, law).margin, 0.0, True
     )

@@ -7,7 +7,7 @@ from workbench.design.estimation.modal_filter import displacement_filter
 from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.loop.reidentify import open_loop, updated
 from workbench.design.spillover.robustness import draw_modes, robustness
 from workbench.design.spillover.spillover import distributed_cost, modal_cost
@@ -110,7 +110,7 @@ def robust(outcome):
 def closed_loop_record(truth, law, through, seed):
     """Modal coordinates that the sensors' filter reads in the loop of all modes, after an impulse, noise 1 %."""
     time = 0.1 * np.arange(400)
-    motion = respond(close_loop(truth, law, through), impulse_state(truth, 6.3), time).displacement(SENSORS)
+    motion = initial_response(close_loop(truth, law, through), impulse_state(truth, 6.3), time).displacement(SENSORS)
     noise = 0.01 * motion.std(axis=1, keepdims=True)
     readings = through(motion + noise * np.random.default_rng(seed).standard_normal(motion.shape))
     channels = [Channel(f"q{r + 1}") for r in range(CONTROLLED)]

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import nodes_of_mode, place, placement_task
+from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task
 from workbench.draw.identification import measured_modes, placement_on_shapes, stabilisation_diagram
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
@@ -151,7 +151,7 @@ def place_actuators(outcome, bending) -> None:
     nodes = nodes_of_mode(modes, 3)
     at_nodes = [task.placed(nodes[list(keep)], "nodes of mode 4") for keep in ((0, 1, 2), (0, 1, 3), (0, 2, 3))]
     rule = min(at_nodes, key=lambda placement: placement.residual_work)
-    best = place(task, Limits(effort=1.5 * rule.effort, spacing=0.05, margin=0.02))
+    best = place_actuators(task, Limits(effort=1.5 * rule.effort, spacing=0.05, margin=0.02))
     named = {"evenly spaced": even, "nodes of mode 4": rule, "least W_R": best}
     outcome.table(
         "placements",

@@ -8,8 +8,8 @@ from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, close_with
-from workbench.design.spillover.explain import explain
-from workbench.design.spillover.remedies import remedies, sufficient_sensors
+from workbench.design.spillover.explain import explain_spillover
+from workbench.design.spillover.remedies import spillover_remedies, sufficient_sensors
 from workbench.draw.design import plot_sensor_counts, plot_spillover_paths
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -57,7 +57,7 @@ def study(outcome, data=None):
         return close_with(modes.select(range(CONTROLLED)), controller).margin
 
     one = ACTUATORS[:1]
-    stable, unstable = (explain(modes, observed(one, [place])) for place in (BESIDE, ACROSS))
+    stable, unstable = (explain_spillover(modes, observed(one, [place])) for place in (BESIDE, ACROSS))
     outcome.check("margin on the reduced model, sensor across", reduced(observed(one, [ACROSS])), 0.01, at_least=True)
     outcome.check("margin on the full model, sensor beside the actuator", stable.margin, 0.0, at_least=True)
     outcome.check("margin on the full model, sensor across", unstable.margin, 0.0)
@@ -69,7 +69,7 @@ def study(outcome, data=None):
     )
 
     # two actuators and two sensors: by which path?
-    crossed = explain(modes, observed(ACTUATORS, [3.1, ACROSS]))
+    crossed = explain_spillover(modes, observed(ACTUATORS, [3.1, ACROSS]))
     worst = crossed.shifts[0]
     path = worst.paths[0]
     outcome.check(
@@ -83,10 +83,10 @@ def study(outcome, data=None):
         f" {worst.first_order.real:+.3g}"
     )
 
-    found = remedies(modes, observed, one, [ACROSS])
+    found = spillover_remedies(modes, observed, one, [ACROSS])
     for remedy in found:
         outcome.say(f"settled by: {remedy.change}; margin then {remedy.margin:.2g} 1/s")
-    checked = [explain(modes, remedy.controller).margin for remedy in found]
+    checked = [explain_spillover(modes, remedy.controller).margin for remedy in found]
     outcome.check("every remedy, recomputed on the full plant: least margin", min(checked), 0.0, at_least=True)
     outcome.check("kinds of remedy found", len(found), 4, at_least=True)
 

@@ -14,14 +14,14 @@ from .design.laws.law import Law as Law
 from .design.laws.on_off import on_off as on_off
 from .design.loop.closed_loop import close_loop as close_loop
 from .design.loop.closed_loop import impulse_state as impulse_state
-from .design.loop.closed_loop import respond as respond
+from .design.loop.closed_loop import initial_response as initial_response
 from .design.placement.certificate import certify as certify
 from .design.placement.limits import Limits as Limits
-from .design.placement.placement import place as place
+from .design.placement.placement import place_actuators as place_actuators
 from .design.placement.placement import placement_task as placement_task
 from .design.placement.sensor_placement import place_sensors as place_sensors
-from .design.spillover.explain import explain as explain
-from .design.spillover.remedies import remedies as remedies
+from .design.spillover.explain import explain_spillover as explain_spillover
+from .design.spillover.remedies import spillover_remedies as spillover_remedies
 from .design.spillover.spillover import spillover as spillover
 from .draw.plot import plot as plot
 from .gap.diagnose import diagnose as diagnose
@@ -56,7 +56,7 @@ from .rig.simulate import simulate as simulate
 from .rig.statespace import state_space as state_space
 from .robust.posterior import UncertainRig as UncertainRig
 from .robust.prediction import predict as predict
-from .robust.proof import prove as prove
+from .robust.proof import verify as verify
 from .robust.redesign import redesign as redesign
 from .structure.damping import ModalDamping as ModalDamping
 from .structure.damping import ProportionalDamping as ProportionalDamping

@@ -1,4 +1,4 @@
-"""The controller that `export` and `redesign` are told of: law, modes and estimator, by one set of options."""
+"""The controller that options describe: law, modes and estimator, for `export` and `redesign` alike."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from workbench.structure.domain import Where
 
 ESTIMATORS = ("luenberger", "kalman")
-DAMPING = 0.1  # unless told
+DAMPING = 0.1  # unless given
 
 LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
 Control = Annotated[
@@ -22,7 +22,7 @@ LawWeight = Annotated[
     float | None, typer.Option("--weight", help="Control weight R: force against motion; in place of --damping.")
 ]
 Damping = Annotated[
-    float | None, typer.Option(help=f"Damping ratio that controlled modes should have; {DAMPING:g} unless told.")
+    float | None, typer.Option(help=f"Damping ratio of the controlled modes; {DAMPING:g} unless given.")
 ]
 Disturbance = Annotated[
     float,
@@ -30,7 +30,7 @@ Disturbance = Annotated[
 ]
 
 
-def law_told(
+def law_from(
     rig: "Rig",
     law: str,
     count: int,

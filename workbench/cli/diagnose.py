@@ -32,10 +32,10 @@ def diagnose(
         bool, typer.Option("--free-nominal", help="Re-estimate the nominal frequencies and damping with every effect.")
     ] = False,
     mend: Annotated[
-        bool, typer.Option("--mend", help="Mend faults of wiring and units that are found, and go on.")
+        bool, typer.Option("--mend", help="Correct faults of wiring and units that are found, and go on.")
     ] = False,
     as_wired: Annotated[
-        bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without mending them.")
+        bool, typer.Option("--as-wired", help="Go on in spite of faults of wiring and units, without correcting them.")
     ] = False,
     workers: Annotated[int | None, typer.Option(help="Processes that share the work; one a core unless given.")] = None,
     seconds: Annotated[float, typer.Option(help="Processor time to search for, s.")] = 120.0,
@@ -68,9 +68,11 @@ def diagnose(
     check_kept_apart(found.fit, found.validation)
     faults = wiring(found.rig, found.fit)
     for fault in faults:
-        say(f"  {'mended' if mend and fault.certain else 'wiring'}     {fault.sentence}")
+        say(f"  {'corrected' if mend and fault.certain else 'wiring'}     {fault.sentence}")
     if any(fault.certain for fault in faults) and not (mend or as_wired):
-        raise ValueError("diagnose again with --mend to go on with this mended, or with --as-wired to go on as it is")
+        raise ValueError(
+            "diagnose again with --mend to go on with this corrected, or with --as-wired to go on as it is"
+        )
     if mend:
         rig, fit = mended(faults, found.rig, found.fit)
         found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])

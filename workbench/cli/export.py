@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_told, observed
+from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_from, observed
 from workbench.cli.rig_file import RigPath
 from workbench.cli.terminal import guarded, say, short
 
@@ -43,7 +43,7 @@ def export(
         raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
     found = read_rig(rig / "case.toml" if rig.is_dir() else rig)
     count = max(len([a for a in found.actuators if not a.direct]), 1) if control is None else control
-    chosen = law_told(found, law, count, weight, damping)
+    chosen = law_from(found, law, count, weight, damping)
     unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
     design = hand_over(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms)

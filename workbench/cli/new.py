@@ -18,7 +18,7 @@ class What(StrEnum):
 
 @guarded
 def new(
-    what: Annotated[What, typer.Argument(help="What to begin.")],
+    what: Annotated[What, typer.Argument(help="Which template.")],
     name: Annotated[str, typer.Argument(help="Folder of the case, or name of the study.")],
 ) -> None:
     """Write a commented template: a case folder, or a study in studies/.

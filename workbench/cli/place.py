@@ -62,7 +62,7 @@ def place(
     from workbench.design.placement.certificate import certify
     from workbench.design.placement.limits import Limits
     from workbench.design.placement.placement import nodes_of_mode, placement_task
-    from workbench.design.placement.placement import place as least_work
+    from workbench.design.placement.placement import place_actuators as least_work
     from workbench.design.placement.task import patch_of
     from workbench.study.whole_file import check_target
 

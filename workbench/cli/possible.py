@@ -1,4 +1,4 @@
-"""What `predict`, `check` and `redesign` start from: the rigs that a diagnosis of the case leaves possible."""
+"""What `predict`, `check` and `redesign` start from: the corrected rig with its uncertainty."""
 
 import json
 from collections.abc import Callable
@@ -49,7 +49,7 @@ def predicted(
     workers: int | None,
     report: Callable[[str, float], None],
 ) -> "Prediction":
-    """What a record shows on the rigs that a diagnosis of the case leaves possible, with bands."""
+    """The prediction of a record by the corrected rig, with bands by its uncertainty."""
     from workbench.robust.prediction import predict
 
     possible, noise = possible_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))

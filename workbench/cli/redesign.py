@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_told, observed
+from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_from, observed
 from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig
 from workbench.cli.rig_file import ImpulseAt, impulse_place
 from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
@@ -41,8 +41,10 @@ def redesign(
     more_work: Annotated[
         float, typer.Option(help="Share by which it may do more work; as much as it takes unless given.")
     ] = float("inf"),
-    draws: Annotated[int, typer.Option(min=1, help="Possible rigs on which both controllers are proved.")] = 200,
-    seed: Annotated[int, typer.Option(help="Of the draws and of the noise.")] = 0,
+    draws: Annotated[
+        int, typer.Option(min=1, help="Samples of the uncertain model on which both controllers are verified.")
+    ] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of the samples and of the noise.")] = 0,
     workers: Workers = None,
     to: Annotated[
         Path | None,
@@ -51,7 +53,7 @@ def redesign(
     json_path: JsonPath = None,
     page: PagePath = None,
 ) -> None:
-    """Design the controller anew for what a diagnosis found, and prove both on what remains unknown.
+    """Redesign the controller on the model that a diagnosis corrected, and verify both over its uncertainty.
 
     The options of `workbench export` say which controller is in use; it is designed for the nominal model.
 
@@ -79,7 +81,7 @@ def redesign(
     struck = None if impulse_at is None else impulse_place(rig, impulse_at)
     sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
     test = impulse_test(rig, controlled, sample_time, struck, level=_largest(records), seed=seed)
-    own = law_told(rig, law, count, weight, damping, impulse_at=test.impulse_at, impulse=test.impulse)
+    own = law_from(rig, law, count, weight, damping, impulse_at=test.impulse_at, impulse=test.impulse)
     in_use: Design = own
     if estimator is not None:
         in_use = observed(rig, own, estimator, disturbance=disturbance, sample_time=sample_time)

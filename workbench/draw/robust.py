@@ -26,8 +26,8 @@ def plot_redesign(result: Redesign) -> Figure:
         left.semilogy(time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {proof.share_stable:.0%}")
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
     left.text(time[-1], SETTLED, "settled", fontsize=8, ha="right", va="bottom")
-    left.set(xlabel="time [s]", ylabel="energy of all modes over its peak", ylim=(1e-6, 3.0))
-    left.set_title(f"after the test, {result.proof.n_draws} possible rigs (median, 95 %)")
+    left.set(xlabel="time [s]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
+    left.set_title(f"{result.proof.n_draws} samples of the uncertain model: median and 95 % interval")
     left.legend(fontsize=8)
     rows = np.arange(len(result.controlled))
     for shift, (name, proof, colour) in zip((-0.12, 0.12), both, strict=True):
@@ -37,8 +37,8 @@ def plot_redesign(result: Redesign) -> Figure:
             right.plot([low, high], [y, y], color=colour, linewidth=2)
     right.axvline(0.0, color=GREY, linewidth=0.8)
     right.set_yticks(rows, [f"mode {r + 1}" for r in result.controlled])
-    right.set(xlabel="damping in the loop [%]", ylim=(len(rows) - 0.5, -0.5))
-    right.set_title("damping (95 %)")
+    right.set(xlabel="closed-loop damping ratio [%]", ylim=(len(rows) - 0.5, -0.5))
+    right.set_title("median and 95 % interval")
     right.legend(fontsize=8)
     return figure
 
@@ -55,7 +55,7 @@ def plot_steps(result: Redesign) -> Figure:
         ax.text(
             losses[i],
             i,
-            f"  {100.0 * step.loss:.3g} %" if np.isfinite(step.loss) else "  runs away",
+            f"  {100.0 * step.loss:.3g} %" if np.isfinite(step.loss) else "  diverges",
             va="center",
             fontsize=8,
         )
@@ -89,8 +89,8 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
         if channel.name in rows:
             left.plot(prediction.time, rows[channel.name], color=TEST, linewidth=0.8, label="measured")
             right.loglog(f, np.maximum(amplitudes(rows[channel.name][None])[0, 1:], least), color=TEST, linewidth=0.8)
-    axes[0, 0].set_title("readings")
-    axes[0, 1].set_title("amplitude by frequency")
+    axes[0, 0].set_title("outputs")
+    axes[0, 1].set_title("amplitude spectrum")
     axes[-1, 0].set_xlabel("time [s]")
     axes[-1, 1].set_xlabel("frequency [Hz]")
     axes[0, 0].legend(fontsize=8, ncols=3)

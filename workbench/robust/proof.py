@@ -1,4 +1,4 @@
-"""Proof by draws: what a controller does on each rig that a diagnosis leaves possible."""
+"""Monte Carlo verification: what a controller does on samples of the uncertain rig, with a small-gain bound."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +21,8 @@ LEVEL = 0.95
 
 
 @dataclass(frozen=True, eq=False)
-class Proof:
-    """A controller on many possible rigs.
+class Verification:
+    """A controller on samples of an uncertain rig.
 
     Attributes:
         stable: (n_draws,) whether the loop of small motion is stable and the motion under test stays.
@@ -114,7 +114,7 @@ def _plain(value: float) -> float | None:
 
 
 @one_blas_thread
-def prove(
+def verify(
     possible: UncertainRig | Sequence[Rig],
     controller: DigitalController,
     test: LoopTest,
@@ -123,8 +123,8 @@ def prove(
     draws: int = 200,
     seed: int = 0,
     centre: Rig | None = None,
-) -> Proof:
-    """What a controller does on each of many possible rigs under a test, all nonlinear elements in.
+) -> Verification:
+    """What a controller does on samples of an uncertain rig under a test, all nonlinear elements in.
 
     What the diagnosis leaves unexplained is drawn too: an error of each sensor's gain within ± that share.
 
@@ -158,7 +158,7 @@ def prove(
     )
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
-        return Proof(
+        return Verification(
             stable=np.array(stable),
             damping=np.array([p.damping[:n_modes] for p in poles]),
             peak_force=_finite([np.abs(run.response.forces).max() for run in runs]),

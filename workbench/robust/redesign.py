@@ -21,7 +21,7 @@ from workbench.rig.rig import Rig
 from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
 from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Proof, drawn_with_errors, interval, prove
+from workbench.robust.proof import Verification, drawn_with_errors, interval, verify
 from workbench.robust.relocation import Relocation, relocated
 from workbench.robust.small_motion import loop_poles, modes_in_motion
 from workbench.structure.domain import Where
@@ -94,8 +94,8 @@ class Redesign:
     test: LoopTest
     before: LoopRun
     after: LoopRun
-    present_proof: Proof
-    proof: Proof
+    present_proof: Verification
+    proof: Verification
     weight: float
     more_cost: float = MORE_COST
     more_work: float = np.inf
@@ -147,7 +147,7 @@ class Redesign:
         return self.redesigned if self.pays else self.present
 
     @property
-    def _used(self) -> Proof:
+    def _used(self) -> Verification:
         return self.proof if self.pays else self.present_proof
 
     @property
@@ -186,7 +186,7 @@ class Redesign:
             why = "the new one costs no less and settles no sooner"
         return f"Keep the present controller: {why}."
 
-    def _does(self, proof: Proof, lead: str, *, named: bool = True) -> str:
+    def _does(self, proof: Verification, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
         if self.redesigned.relays is not None:
             middle, low, high = interval(proof.settling)
@@ -355,11 +355,11 @@ def redesign(
         if not corrected.elements or not after.bounded:
             break
         modes = modes_in_motion(corrected, after)
-    report("proof on the draws", 0.4)
+    report("verification on the samples", 0.4)
     rigs = drawn_with_errors(possible, draws, seed)
-    old = prove(rigs, present, test, controlled=anew.law.controlled, centre=corrected)
-    report("proof on the draws", 0.65)
-    new = prove(rigs, redesigned, test, controlled=anew.law.controlled, centre=corrected)
+    old = verify(rigs, present, test, controlled=anew.law.controlled, centre=corrected)
+    report("verification on the samples", 0.65)
+    new = verify(rigs, redesigned, test, controlled=anew.law.controlled, centre=corrected)
     report("where actuators should stand", 0.9)
     moved = relocated(anew, test) if placement else None
     report("done", 1.0)
@@ -554,14 +554,14 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
 def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
     notes = []
     if any(a.hysteresis_share for a in rig.actuators):
-        notes.append("The hysteresis of an actuator is in the proof, but no step makes up for it.")
+        notes.append("The hysteresis of an actuator is in the verification, but no step makes up for it.")
     if possible.rivals:
         share = sum(p for _, p in possible.rivals)
         notes.append(f"{100 * share:.0f} % of the draws are rival sets of effects that the records do not exclude.")
     return tuple(notes)
 
 
-def _settles(proof: Proof) -> str:
+def _settles(proof: Verification) -> str:
     middle = interval(proof.settling)[0]
     return f"settles in {middle:.3g} s" if np.isfinite(middle) else "does not settle within the test"
 

@@ -9,7 +9,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
 from workbench.design.loop.rig_loop import LoopTest
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import place
+from workbench.design.placement.placement import place_actuators
 from workbench.design.placement.task import Placement, placement_task
 from workbench.robust.compensation import Loop
 from workbench.structure.domain import Interval, position
@@ -70,7 +70,7 @@ def relocated(loop: Loop, test: LoopTest) -> Relocation | None:
         )
         present = task.placed(np.array([position(a.at) for a in law.actuators]), "as they stand")
         limits = Limits(effort=present.effort, spacing=SPACING * modes.length)
-        moved = place(task, limits, starts=STARTS)
+        moved = place_actuators(task, limits, starts=STARTS)
     except DesignError:
         return None
     return Relocation(present, moved) if moved.residual_work < present.residual_work else None

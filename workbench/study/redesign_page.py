@@ -13,7 +13,7 @@ from workbench.draw.robust import NEW, OLD, plot_redesign, plot_steps
 from workbench.draw.style import COLOURS, new_figure
 from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
-from workbench.robust.proof import Proof, interval
+from workbench.robust.proof import Verification, interval
 from workbench.robust.redesign import Redesign
 from workbench.structure.domain import NamedPoints, Where
 from workbench.study.outcome import Shown
@@ -105,7 +105,7 @@ def _told(values: np.ndarray) -> str:
     return f"{middle:.3g} ({low:.3g} to {high:.3g})"
 
 
-def _margin(proof: Proof) -> str:
+def _margin(proof: Verification) -> str:
     return "no linear bound" if np.isnan(proof.margin) else f"{100.0 * proof.margin:.3g}"
 
 

@@ -15,7 +15,7 @@ from workbench.design.estimation.surface_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law
-from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import ClosedLoop, Response, close_loop, impulse_state, initial_response
 from workbench.design.placement.task import patch_of
 from workbench.design.spillover.spillover import Spillover, finite_spillover
 from workbench.draw.motion import frame_net
@@ -212,7 +212,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     state = impulse_state(modes, design.impulse_at)
     at_rest = state.copy()
     at_rest[modes.n_modes + design.controlled :] = 0.0  # so that W_r is what control puts there
-    response = respond(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
+    response = initial_response(loop, state, np.linspace(0.0, design.final_time, N_TIMES))
     effort = float(simpson((response.forces**2).sum(axis=0), x=response.time))
     return Tried(law, loop, response, finite_spillover(loop, at_rest, design.final_time), effort)
 

@@ -7,7 +7,7 @@ import pytest
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc, imsc_poles, pole_gains, riccati_gains, riccati_matrices
 from workbench.design.laws.law import DesignError
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
@@ -74,16 +74,19 @@ def test_response_against_python_control():
     loop, state, time = close_loop(modes(), law), impulse_state(modes(), 6.3), np.linspace(0, 40, 81)
     system = control.ss(loop.matrix, np.zeros((18, 1)), np.eye(18), np.zeros((18, 1)))
     peer = control.initial_response(system, time, state).outputs
-    assert np.abs(respond(loop, state, time).modal - peer).max() < 1e-9
+    assert np.abs(initial_response(loop, state, time).modal - peer).max() < 1e-9
 
 
 def test_response_at_uneven_times_is_the_same_response():
     law = imsc(modes(), 4, actuators(2.0, 4.0, 6.0, 8.0), weight=20.0)
     loop, state = close_loop(modes(), law), impulse_state(modes(), 6.3)
-    even, uneven = respond(loop, state, [0.0, 1.0, 2.0, 3.0]), respond(loop, state, [0.0, 0.7, 2.0, 3.0])
+    even, uneven = (
+        initial_response(loop, state, [0.0, 1.0, 2.0, 3.0]),
+        initial_response(loop, state, [0.0, 0.7, 2.0, 3.0]),
+    )
     np.testing.assert_allclose(even.modal[:, 2:], uneven.modal[:, 2:], atol=1e-12)
     many = np.linspace(2.0, 40.0, 317)
-    many, some = respond(loop, state, many), respond(loop, state, many[[0, 3, 90, 316]])
+    many, some = initial_response(loop, state, many), initial_response(loop, state, many[[0, 3, 90, 316]])
     np.testing.assert_allclose(many.modal[:, [0, 3, 90, 316]], some.modal, atol=1e-12)
     assert not many.modal.flags.writeable and state.flags.writeable
 

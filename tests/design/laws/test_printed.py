@@ -5,7 +5,7 @@ import numpy as np
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import impulse_state
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import place, placement_task
+from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.spillover.spillover import spillover
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.structure.member import Beam
@@ -39,7 +39,7 @@ def test_spillover_prints_the_work_in_every_mode():
 
 def test_a_placement_prints_its_places_and_what_they_cost():
     task = placement_task(MODES, 2, impulse_at=6.3, weight=20.0)
-    best = place(task, Limits(effort=1.0, spacing=0.5), starts=1)
+    best = place_actuators(task, Limits(effort=1.0, spacing=0.5), starts=1)
     text = str(best)
     assert f"W_R = {best.residual_work:.4g}" in text and f"{best.positions[0]:.4g}" in text
     assert len(repr(best)) < 120

@@ -9,7 +9,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, FrictionForward, sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.imsc import imsc
-from workbench.design.loop.closed_loop import close_with, impulse_state, respond
+from workbench.design.loop.closed_loop import close_with, impulse_state, initial_response
 from workbench.design.loop.rig_loop import LoopTest, run_loop
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.rig.actuators import Actuator
@@ -102,7 +102,7 @@ def test_a_fast_loop_comes_to_the_exact_continuous_one(rig):
     for refined in (1, 2):
         dt = 0.002 / refined
         run = run_loop(rig, sampled(controller, dt), LoopTest(1000 * refined, dt, impulse_at=0.8))
-        exact = respond(loop, state, run.response.time)
+        exact = initial_response(loop, state, run.response.time)
         work = finite_spillover(loop, state, run.response.time[-1]).by_mode
         motion = np.abs(run.response.modal[:5] - exact.modal[:5]).max() / np.abs(exact.modal[:5]).max()
         errors.append((motion, np.abs(run.work - work).max() / np.abs(work).max()))

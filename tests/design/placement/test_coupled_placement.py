@@ -5,7 +5,7 @@ import pytest
 
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.law import DesignError
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.placement.coupled_placement import place_coupled
 from workbench.design.placement.coupled_scan import scan_coupled
 from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
@@ -27,7 +27,7 @@ def test_figures_are_those_of_the_law(modes):
     found = coupled_costs(modes, 4, places, impulse_at=6.3, weight=10.0)
     np.testing.assert_allclose(found.by_mode, spillover(modes, law, state).residual_work, rtol=1e-7)
     assert found.effort == pytest.approx(effort(modes, law, state), rel=1e-8)
-    forces = respond(close_loop(modes, law), state, np.linspace(0.0, 40.0, 8001)).forces
+    forces = initial_response(close_loop(modes, law), state, np.linspace(0.0, 40.0, 8001)).forces
     assert found.peak_force == pytest.approx(np.abs(forces).max(), rel=1e-2)
 
 

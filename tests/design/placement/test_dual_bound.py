@@ -7,7 +7,7 @@ from workbench.design.placement.cell_bounds import SINGULAR, Intervals
 from workbench.design.placement.certificate import certify
 from workbench.design.placement.dual_bound import dual_bound
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import place, placement_task
+from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.placement.task import batch_costs
 
 
@@ -73,5 +73,5 @@ def test_six_actuators_have_a_bound_above_zero(hinged_modes):
     six = placement_task(modes, 6, impulse_at=6.3, weight=20.0)
     even = six.placed(10.0 * np.arange(1, 7) / 7, "")
     limits = Limits(effort=1.5 * even.effort, spacing=0.5)
-    bound = certify(six, limits, placement=place(six, limits), gap=0.10, most_cells=2_000_000, seconds=7200.0)
+    bound = certify(six, limits, placement=place_actuators(six, limits), gap=0.10, most_cells=2_000_000, seconds=7200.0)
     assert bound.better is None and bound.lower_bound > 0.0

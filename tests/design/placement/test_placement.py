@@ -5,12 +5,12 @@ import pytest
 from scipy.optimize import linprog
 
 from workbench.design.laws.law import DesignError
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.placement.cell_bounds import CellBounds
 from workbench.design.placement.certificate import _Search, certify
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.peak import largest
-from workbench.design.placement.placement import nodes_of_mode, place, placement_task, scan, symbolic_work
+from workbench.design.placement.placement import nodes_of_mode, place_actuators, placement_task, scan, symbolic_work
 from workbench.design.placement.task import batch_costs, batch_work
 from workbench.design.spillover.spillover import effort, finite_spillover, spillover
 from workbench.structure.member import Beam
@@ -64,7 +64,7 @@ def test_nodes_of_mode_five(task):
 
 def test_the_optimum_keeps_its_limits_and_beats_a_full_grid(task):
     limit = 1.5 * even(task).effort
-    best = place(task, Limits(effort=limit, spacing=0.5), starts=4)
+    best = place_actuators(task, Limits(effort=limit, spacing=0.5), starts=4)
     assert best.effort <= limit * (1 + 1e-6) and (np.diff(best.positions) >= 0.5 - 1e-6).all()
     on_grid, tried = scan(task, Limits(effort=limit, spacing=0.5), n_places=30)
     assert tried > 10000 and best.residual_work <= on_grid.residual_work
@@ -72,7 +72,7 @@ def test_the_optimum_keeps_its_limits_and_beats_a_full_grid(task):
 
 
 def test_without_a_limit_the_outer_actuators_run_onto_the_supports(task):
-    free = place(task, Limits(effort=1e9, spacing=0.1), starts=4)
+    free = place_actuators(task, Limits(effort=1e9, spacing=0.1), starts=4)
     assert free.positions[0] < 0.1 and free.positions[-1] > 9.9
     assert free.residual_work == pytest.approx(5.3e-4, rel=0.1)
     assert free.effort > 10 * even(task).effort
@@ -80,9 +80,9 @@ def test_without_a_limit_the_outer_actuators_run_onto_the_supports(task):
 
 def test_limits_that_conflict_are_named(task):
     with pytest.raises(DesignError, match="the structure has 10"):
-        place(task, Limits(effort=1.0, spacing=4.0))
+        place_actuators(task, Limits(effort=1.0, spacing=4.0))
     with pytest.raises(DesignError, match="effort limit"):
-        place(task, Limits(effort=1e-3, spacing=0.5), starts=1)
+        place_actuators(task, Limits(effort=1e-3, spacing=0.5), starts=1)
     with pytest.raises(DesignError, match="no residual mode"):
         placement_task(task.modes, 9, impulse_at=6.3, weight=20.0)
 
@@ -110,7 +110,7 @@ def test_finite_time_and_peak_force_are_those_of_the_motion(task):
     loop = close_loop(task.modes, law)
     found = short.placed(places, "")
     np.testing.assert_allclose(found.by_mode, finite_spillover(loop, state, 25.0).residual_work, rtol=1e-8)
-    forces = respond(loop, state, np.linspace(0.0, 25.0, 20001)).forces
+    forces = initial_response(loop, state, np.linspace(0.0, 25.0, 20001)).forces
     assert np.abs(forces).max() <= found.peak_force <= np.abs(forces).max() * (1 + 1e-5)
     assert found.effort == pytest.approx(np.trapezoid((forces**2).sum(axis=0), dx=25.0 / 20000), rel=1e-5)
 
@@ -164,7 +164,7 @@ def test_the_tail_bound_holds_and_is_not_idle(task, hinged_modes):
 
 def test_limits_on_peak_force_condition_and_stretches_are_kept(task):
     limits = Limits(effort=0.4, peak_force=0.34, condition=6.0, spacing=0.5, forbidden=((2.5, 3.4), (7.0, 9.0)))
-    best = place(task, limits, starts=6)
+    best = place_actuators(task, limits, starts=6)
     assert best.peak_force <= 0.34 * (1 + 1e-5) and best.condition <= 6.0 * (1 + 1e-5)
     assert not any(((low < best.positions) & (best.positions < high)).any() for low, high in limits.forbidden)
     on_grid, _ = scan(task, limits, n_places=28)
@@ -183,13 +183,13 @@ def test_candidates_are_searched_whole(task):
 
 def test_which_limits_conflict_is_said(task):
     with pytest.raises(DesignError, match="condition limit 3"):
-        place(task, Limits(condition=3.9), starts=1)
+        place_actuators(task, Limits(condition=3.9), starts=1)
     with pytest.raises(DesignError, match="peak force limit 0"):
         scan(task, Limits(peak_force=0.01), n_places=20)
     with pytest.raises(DesignError, match="leave no place"):
-        place(task, Limits(forbidden=((-1.0, 11.0),)))
+        place_actuators(task, Limits(forbidden=((-1.0, 11.0),)))
     with pytest.raises(DesignError, match="effort must be positive"):
-        place(task, Limits(effort=-1.0))
+        place_actuators(task, Limits(effort=-1.0))
 
 
 def test_fast_figures_are_the_careful_ones(task):
@@ -271,7 +271,7 @@ def test_cells_are_dropped_that_have_no_room_for_all(task):
 def test_a_search_cut_short_says_its_gap_and_the_cell_that_holds_it(task):
     limits = Limits(effort=1.5 * even(task).effort, spacing=0.5)
     met = []
-    best = place(task, limits, starts=4)
+    best = place_actuators(task, limits, starts=4)
     bound = certify(task, limits, placement=best, gap=0.05, most_cells=4_000, progress=lambda *at: met.append(at))
     assert not bound.complete and bound.lower_bound < 0.95 * best.residual_work
     assert bound.cell.shape == (4, 2) and (bound.cell[:, 0] < bound.cell[:, 1]).all()
@@ -304,7 +304,7 @@ def test_four_actuators_and_ten_modes_are_proven_within_five_per_cent(ends, fact
 def test_every_limit_is_part_of_the_proof(limits, hinged_modes):
     modes = hinged_modes(9)
     two = placement_task(modes, 2, impulse_at=6.3, weight=20.0)
-    best = place(two, limits, starts=8)
+    best = place_actuators(two, limits, starts=8)
     proof = certify(two, limits, placement=best, gap=0.01)
     assert proof.better is None and proof.complete and proof.gap <= 0.01 + 1e-12
     # a grid by itself: no better
@@ -329,7 +329,7 @@ def test_a_proof_needs_a_limit(task):
 
 
 def test_the_law_stands_with_its_places(task):
-    best = place(task, Limits(effort=1.5 * even(task).effort, spacing=0.5), starts=2)
+    best = place_actuators(task, Limits(effort=1.5 * even(task).effort, spacing=0.5), starts=2)
     assert [a.at for a in best.law.actuators] == list(best.positions)
     np.testing.assert_allclose(best.law.gain, task.law(best.positions).gain)
 

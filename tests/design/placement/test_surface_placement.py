@@ -9,7 +9,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.placement import certificate
 from workbench.design.placement.certificate import certify
 from workbench.design.placement.limits import Limits
-from workbench.design.placement.placement import place, placement_task, symbolic_work
+from workbench.design.placement.placement import place_actuators, placement_task, symbolic_work
 from workbench.design.placement.scan import best_of_candidates, scan
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.structure.domain import Between, NamedPoints
@@ -53,7 +53,7 @@ def test_casadi_takes_the_shapes_of_a_plate_and_their_derivatives(task):
 
 def test_a_plate_is_placed_as_well_as_by_a_fine_grid_and_outside_the_zone(task):
     limits = Limits(effort=0.021, spacing=0.1, margin=0.05, forbidden=(ZONE,))
-    best = place(task, limits, starts=3)
+    best = place_actuators(task, limits, starts=3)
     on_grid, _ = scan(task, limits, n_places=12)
     assert best.residual_work <= on_grid.residual_work and best.effort <= 0.021 * (1 + 1e-5)
     low, high = np.array(ZONE)
@@ -71,7 +71,7 @@ def test_patches_are_placed_as_well_as_by_a_fine_grid_and_lie_on_the_plate(task)
     work = float(symbolic_work(patches)(at.ravel())[0])
     assert work == pytest.approx(patches.placed(at, "").residual_work, rel=1e-6)
     limits = Limits(effort=2.0 * patches.placed(at, "").effort, spacing=0.2, forbidden=(ZONE,))
-    best = place(patches, limits, starts=3)
+    best = place_actuators(patches, limits, starts=3)
     on_grid, _ = scan(patches, limits, n_places=12)
     assert best.residual_work <= on_grid.residual_work
     assert (best.positions >= (0.1, 0.08)).all() and (best.positions <= (1.1, 0.82)).all()
@@ -106,7 +106,7 @@ def test_named_points_of_a_beam_are_placed_as_along_its_length():
     assert x[12] == pytest.approx(1.3)
     limits = {"effort": 3.0 * along.placed([1.0, 2.0, 3.0], "").effort, "spacing": 0.3}
     best, _ = scan(along, Limits(candidates=tuple(x), **limits))
-    found = place(named, Limits(**limits))
+    found = place_actuators(named, Limits(**limits))
     assert [float(x[int(name[:-1])]) for name in found.positions] == pytest.approx(list(best.positions))
     assert found.residual_work == pytest.approx(best.residual_work, rel=1e-12)
     assert found.spacing == pytest.approx(best.spacing)
@@ -118,17 +118,17 @@ def test_named_points_of_a_beam_are_placed_as_along_its_length():
 
 def test_what_has_no_room_or_no_place_is_refused(task):
     with pytest.raises(DesignError, match=r"leave no place of 1\.2 m by 0\.9 m"):
-        place(task, Limits(effort=1.0, forbidden=(((-1.0, -1.0), (2.0, 2.0)),)))
+        place_actuators(task, Limits(effort=1.0, forbidden=(((-1.0, -1.0), (2.0, 2.0)),)))
     with pytest.raises(DesignError, match="among candidate places"):
         certify(task, Limits(effort=1.0))
     with pytest.raises(DesignError, match=r"is \(\(x, y\), \(x, y\)\)"):
-        place(task, Limits(forbidden=((0.1, 0.2),)))
+        place_actuators(task, Limits(forbidden=((0.1, 0.2),)))
     _, sampled, _ = on_beam(5)
     points = NamedPoints(sampled.domain.names)
     nowhere = Modes(sampled.omega, sampled.damping, sampled.shapes, points)
     with pytest.raises(DesignError, match="no spacing can be kept"):
-        place(placement_task(nowhere, 2, impulse_at="1y", weight=1.0), Limits(spacing=0.1))
+        place_actuators(placement_task(nowhere, 2, impulse_at="1y", weight=1.0), Limits(spacing=0.1))
     with pytest.raises(DesignError, match="no zones or margins"):
-        place(placement_task(sampled, 2, impulse_at="1y", weight=1.0), Limits(margin=0.1))
+        place_actuators(placement_task(sampled, 2, impulse_at="1y", weight=1.0), Limits(margin=0.1))
     with pytest.raises(DesignError, match="acts between two places"):
         placement_task(sampled, 2, impulse_at="1y", weight=1.0, actuator=Actuator("P", Between("1y", "2y")))

@@ -5,7 +5,7 @@ import pytest
 
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.comparison import compare
 from workbench.rig.actuators import Actuator
 
@@ -23,5 +23,5 @@ def test_crowded_actuators_cost_the_coupled_regulator_less(hinged_modes):
         [8.418221e-3, 1.258416e-1, 4.698541e-2, 6.875917e-3, 3.450264e-2], rel=1e-5
     )
     assert independent.most_excited == 5
-    fine = respond(close_loop(modes, laws[0]), state, np.linspace(0.0, 100.0, 100001))
+    fine = initial_response(close_loop(modes, laws[0]), state, np.linspace(0.0, 100.0, 100001))
     assert independent.peak_force == pytest.approx(np.abs(fine.forces).max(), rel=2e-2)

@@ -9,9 +9,9 @@ from workbench.design.estimation.modal_filter import displacement_filter, hermit
 from workbench.design.estimation.observers import kalman, luenberger
 from workbench.design.laws.coupled import controlled_plant, coupled_lqr
 from workbench.design.laws.law import DesignError, Law
-from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state, respond
-from workbench.design.spillover.explain import explain
-from workbench.design.spillover.remedies import remedies, sufficient_sensors
+from workbench.design.loop.closed_loop import close_loop, close_with, impulse_state, initial_response
+from workbench.design.spillover.explain import explain_spillover
+from workbench.design.spillover.remedies import spillover_remedies, sufficient_sensors
 from workbench.design.spillover.spillover import finite_spillover
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -90,11 +90,11 @@ def test_an_observer_in_the_loop_against_python_control():
     observer = control.ss(a - b @ controller.law.gain - controller.reads @ c, controller.reads, -controller.law.gain, 0)
     loop = control.feedback(plant, observer, sign=1)
     peer = control.initial_response(loop, time, np.r_[state, np.zeros(2 * m)]).states[: 2 * n]
-    mine = respond(close_with(modes, controller), state, time)
+    mine = initial_response(close_with(modes, controller), state, time)
     np.testing.assert_allclose(mine.modal, peer, atol=1e-9)
     # the work counts the same motion
     loss = np.diag(modes.damping)
-    fine = respond(close_with(modes, controller), state, np.linspace(0.0, 30.0, 6001))
+    fine = initial_response(close_with(modes, controller), state, np.linspace(0.0, 30.0, 6001))
     gained = fine.energy[:, -1] - fine.energy[:, 0]
     work = finite_spillover(close_with(modes, controller), state, 30.0).by_mode
     np.testing.assert_allclose(work, gained + np.trapezoid(loss[:, None] * fine.modal[n:] ** 2, fine.time), atol=1e-6)
@@ -103,7 +103,7 @@ def test_an_observer_in_the_loop_against_python_control():
 def test_a_residual_mode_is_named_that_stays_stable_and_destabilises_a_controlled_one():
     modes = beam(5, 0.01)
     controller = observed(modes, 3.3)
-    told = explain(modes, controller)
+    told = explain_spillover(modes, controller)
     assert told.margin < 0 and told.reduced_margin > 0 and told.shifts[0].closed_pole.real < 0
     assert told.destabilising.mode == 3 and close_with(modes.select([0, 1, 2, 4]), controller).margin > 0
     assert close_with(modes.select([0, 1, 2, 3]), controller).margin < 0
@@ -111,7 +111,7 @@ def test_a_residual_mode_is_named_that_stays_stable_and_destabilises_a_controlle
 
 def test_balas_one_sensor_stabilises_here_and_destabilises_there():
     modes = beam()
-    good, bad = explain(modes, observed(modes, 10 / 6)), explain(modes, observed(modes, 50 / 6))
+    good, bad = explain_spillover(modes, observed(modes, 10 / 6)), explain_spillover(modes, observed(modes, 50 / 6))
     assert good.margin > 0 and good.destabilising is None
     assert bad.margin < 0 and bad.destabilising.mode == 3
     assert bad.reduced_margin == pytest.approx(close_with(modes.select(range(3)), observed(modes, 50 / 6)).margin)
@@ -124,7 +124,7 @@ def test_balas_one_sensor_stabilises_here_and_destabilises_there():
 )
 def test_paths_add_up_to_the_movement_of_the_pole(controller):
     modes = beam()
-    explained = explain(modes, controller(modes))
+    explained = explain_spillover(modes, controller(modes))
     assert len(explained.shifts) == 6
     for moved in explained.shifts:
         assert sum(path.shift for path in moved.paths) == pytest.approx(moved.shift, abs=1e-9 * abs(moved.pole))
@@ -137,7 +137,7 @@ def test_first_order_is_the_derivative():
     errors = []
     for share in (1e-2, 1e-3):
         controller = through_filter(modes, ACTUATORS, [2.0, 5.5], share)
-        moved = {m.mode: m for m in explain(modes, controller).shifts}[4]
+        moved = {m.mode: m for m in explain_spillover(modes, controller).shifts}[4]
         errors.append(abs(moved.shift - moved.first_order) / abs(moved.shift))
     assert errors[1] < 0.15 * errors[0] < 0.01
 
@@ -148,11 +148,14 @@ def test_every_remedy_stabilises_the_loop_and_less_does_not():
     def redesign(actuators, sensors, share):
         return observed(modes, sensors, share, actuators)
 
-    found = {r.kind: r for r in remedies(modes, redesign, ACTUATORS, [50 / 6])}
+    found = {r.kind: r for r in spillover_remedies(modes, redesign, ACTUATORS, [50 / 6])}
     assert set(found) == {"gain", "actuator", "sensor", "sensors added"}
-    assert all(explain(modes, r.controller).margin == pytest.approx(r.margin) and r.margin > 0 for r in found.values())
+    assert all(
+        explain_spillover(modes, r.controller).margin == pytest.approx(r.margin) and r.margin > 0
+        for r in found.values()
+    )
     share = 1 - found["gain"].size
-    assert explain(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
+    assert explain_spillover(modes, redesign(ACTUATORS, [50 / 6], min(share * 1.01, 1.0))).margin < 0
     assert found["sensors added"].size == 1
 
 

@@ -9,7 +9,7 @@ from workbench.design.estimation.modal_filter import displacement_filter, hermit
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError
-from workbench.design.loop.closed_loop import close_loop, impulse_state, respond
+from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import effort, energy_gained, finite_spillover, quadratic_cost, spillover
 from workbench.rig.actuators import Actuator
 from workbench.structure.damping import ModalDamping
@@ -61,7 +61,7 @@ def test_work_with_damping_against_quadrature():
     b = damped.phi([2.0, 4.0, 6.0, 8.5]).T
 
     def power(t):
-        x = respond(loop, state, [t]).modal[:, 0]
+        x = initial_response(loop, state, [t]).modal[:, 0]
         return (b @ (loop.feedback @ x)) * x[6:]
 
     work = quad_vec(power, 0.0, 12.0, epsabs=1e-11)[0]
@@ -77,7 +77,7 @@ def test_the_limit_needs_undamped_modes():
 def test_effort_and_cost_against_the_response():
     state, chosen = impulse_state(modes(), 6.3), law()
     time = np.linspace(0.0, 400.0, 40001)
-    response = respond(close_loop(modes(), chosen), state, time)
+    response = initial_response(close_loop(modes(), chosen), state, time)
     power = (response.forces**2).sum(axis=0)
     assert effort(modes(), chosen, state) == pytest.approx(np.trapezoid(power, time), rel=1e-4)
     q, v = response.modal[:4], response.modal[9:13]

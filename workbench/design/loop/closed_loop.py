@@ -134,7 +134,7 @@ def impulse_state(modes: Modes, at: Place, impulse: float = 1.0) -> Floats:
     return np.concatenate([np.zeros(modes.n_modes), impulse * modes.phi(at)[0]])
 
 
-def respond(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
+def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] | np.ndarray) -> Response:
     """Free response from a state at t = 0, exact at every instant: x(t) = e^{At} x0.
 
     A state (2 n_modes,) of the modes alone starts an observer from zero. Through exact modal coordinates every instant

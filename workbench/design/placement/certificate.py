@@ -19,7 +19,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.placement.cell_bounds import CellBounds
 from workbench.design.placement.cell_tree import CellTree
 from workbench.design.placement.limits import Limits, takes_former_limits
-from workbench.design.placement.placement import place
+from workbench.design.placement.placement import place_actuators
 from workbench.design.placement.scan import MOST_TRIED, allowed_places, scan
 from workbench.design.placement.task import Placement, PlacementTask
 from workbench.structure.domain import NamedPoints, Rectangle, listed
@@ -76,7 +76,7 @@ class Certificate:
 
 
 def _listed(places: np.ndarray) -> str:
-    each = [place_text(place) for place in listed(places)]
+    each = [place_text(place_actuators) for place_actuators in listed(places)]
     return "; ".join(each) if places.ndim > 1 else ", ".join(each)
 
 
@@ -118,7 +118,7 @@ def certify(
     if isinstance(domain, NamedPoints) and limits.candidates is None:
         limits = replace(limits, candidates=tuple(listed(allowed_places(task, limits, 0))))
     began = time.monotonic()
-    best = place(task, limits) if placement is None else placement
+    best = place_actuators(task, limits) if placement is None else placement
     if limits.candidates is not None and comb(len(limits.candidates), task.n_controlled) <= MOST_TRIED:
         least, tried = scan(task, limits)
         found = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None

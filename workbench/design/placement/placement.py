@@ -56,7 +56,7 @@ def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
 
 @takes_former_limits
 @one_blas_thread
-def place(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
+def place_actuators(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
     """The law with its actuators where they spill the least W_R under limits, by CasADi and IPOPT from many starts.
 
     Where the limits name candidate places, and at named points, every choice of these is evaluated instead; where they

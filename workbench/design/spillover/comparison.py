@@ -11,8 +11,8 @@ from workbench.design.estimation.surface_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
-from workbench.design.loop.closed_loop import close_loop, respond
-from workbench.design.spillover.explain import Explanation, explain
+from workbench.design.loop.closed_loop import close_loop, initial_response
+from workbench.design.spillover.explain import Explanation, explain_spillover
 from workbench.design.spillover.spillover import Spillover, effort, finite_spillover, quadratic_cost
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -104,7 +104,7 @@ def compare(
                 law=law,
                 cost=quadratic_cost(modes, law, state, weight),
                 effort=effort(modes, law, state),
-                peak_force=float(np.abs(respond(loop, state, time).forces).max()),
+                peak_force=float(np.abs(initial_response(loop, state, time).forces).max()),
                 work=finite_spillover(loop, state, final_time),
                 poles=loop.poles,
             )
@@ -138,7 +138,7 @@ def through_sensors(
                     controller = filtered(law, filter_on(structure, modes, law.controlled, stands))
                 else:
                     controller = luenberger(modes, law, sensors, poles=OBSERVER_POLES * own.omega)
-                tried.append((controller, explain(modes, controller), ""))
+                tried.append((controller, explain_spillover(modes, controller), ""))
             except ValueError as error:
                 tried.append((None, None, f"{law.name}: {error}"))
     return tuple(tried)

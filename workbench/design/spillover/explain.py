@@ -98,7 +98,7 @@ class Explanation:
         return self.loop.margin
 
 
-def explain(modes: Modes, controller: Controller) -> Explanation:
+def explain_spillover(modes: Modes, controller: Controller) -> Explanation:
     """The poles of the full closed loop, and what shifts that of each residual mode, by path.
 
     Args:

@@ -51,7 +51,7 @@ class _Setting:
 
 
 @one_blas_thread
-def remedies(
+def spillover_remedies(
     modes: Modes,
     redesign: Redesign,
     actuators: Sequence[Actuator],
