@@ -61,7 +61,7 @@ def study(outcome, data: Path | None = None) -> None:
         "The ruler's shapes at its ten points, over those of a uniform free-free beam.",
     )
     diagnose_frequencies(outcome, bending, others, beam)
-    place_actuators(outcome, bending)
+    compare_placements(outcome, bending)
 
 
 def report_modes(outcome, bending, others, paired) -> None:
@@ -140,7 +140,7 @@ def _disagreement(rig, kinds, start, bending):
     return differences(found.x), found.x[1:]
 
 
-def place_actuators(outcome, bending) -> None:
+def compare_placements(outcome, bending) -> None:
     ends = KnownEnds.of("beam", length=1.0, left="free", right="free")
     modes = eigenfunctions(bending, length=1.0, mass_per_length=1.0, ends=ends)
     # The design leaves damping out, as in Chapter 5: it only helps.

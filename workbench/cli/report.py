@@ -15,7 +15,7 @@ def report(
     ],
     page: PagePath = None,
 ) -> None:
-    """Write one self-contained page about a study, a case or a result: figures to zoom, animated mode shapes, no network.
+    """Write one self-contained page about a study, a case or a result: figures to zoom, animated shapes, no network.
 
     Example: workbench report verdict.json
     """

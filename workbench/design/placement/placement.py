@@ -23,7 +23,7 @@ from workbench.structure.domain import Interval, NamedPoints, Rectangle, reach
 from workbench.structure.modes import Modes
 from workbench.threads import one_blas_thread
 
-__all__ = ["Limits", "Placement", "PlacementTask", "nodes_of_mode", "place", "placement_task", "scan"]
+__all__ = ["Limits", "Placement", "PlacementTask", "nodes_of_mode", "place_actuators", "placement_task", "scan"]
 
 Solver = Callable[[np.ndarray, Sequence[Box], float], tuple[np.ndarray, str]]
 
