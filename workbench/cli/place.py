@@ -46,7 +46,7 @@ def place(
         float | None, typer.Option(metavar="M", help="Candidates on a grid over a plate, so far apart, m.")
     ] = None,
     proof: Annotated[
-        float | None, typer.Option(help="Prove the optimum global to within this share, such as 0.05.")
+        float | None, typer.Option(help="Prove global optimality to within this share, such as 0.05.")
     ] = None,
     picture: Annotated[
         Path | None, typer.Option("--figure", help="Draw the placement to this file (.png, .svg, .pdf).")

@@ -246,7 +246,7 @@ def _sampling(
     if not (abs(said - step) <= UNIFORM * step and abs(start - time[0]) <= UNIFORM * step):
         raise RecordFileError(
             f"{path}: its description says a start at {start:g} s and steps of {said:g} s, its times {time[0]:g} s and"
-            f" {step:g} s; mend or remove the description"
+            f" {step:g} s; correct or remove the description"
         )
     return replace(sampling, start=start, step=said)
 

@@ -105,7 +105,7 @@ class UncertainRig:
     ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
         """The same, each with the effects that make it."""
         if n < 1:
-            raise ValueError(f"the possible rigs are read from 1 draw or more; got {n}")
+            raise ValueError(f"the uncertainty is sampled by 1 draw or more; got {n}")
         rng = np.random.default_rng(seed)
         sets = [self, *(rival for rival, _ in self.rivals)]
         shares = np.array([p for _, p in self.rivals])

@@ -256,11 +256,11 @@ def _banded(
     notes, away = [], len(possible) - len(truths)
     if away > len(possible) // 10:
         raise ValueError(
-            f"{away} of {len(possible)} rigs that the diagnosis leaves possible run away in this test; predict a weaker"
-            " one, or measure more first"
+            f"{away} of {len(possible)} samples of the uncertain rig diverge in this test; predict a weaker one, or"
+            " measure more first"
         )
     if away:
-        notes.append(f"{away} of {len(possible)} draws run away and are left out.")
+        notes.append(f"{away} of {len(possible)} samples diverge and are left out.")
     if not found.explained:
         notes.append(
             "The diagnosis leaves the gap unexplained:"

@@ -45,9 +45,9 @@ def redesign_page(
     blocks += [
         block(
             plot_redesign(found),
-            "Both controllers after the impulse of the test, on the same possible rigs, drawn from the diagnosis; every"
-            " dead zone, delay, friction and noise is in. The lower curve is the better controller; a wide band says"
-            " that the records leave much open.",
+            "Both controllers after the impulse of the test, on the same samples of the uncertain model; every dead"
+            " zone, delay, friction and noise is in. The lower curve is the better controller; a wide band says"
+            " that the records leave much uncertain.",
         ),
     ]
     if max(s.loss for s in found.steps) > NOTHING:
@@ -147,7 +147,7 @@ def _moving(found: Redesign, old: Response, new: Response, caption: str) -> dict
     both, colours = {"present": limited, "redesigned": new}, {"present": OLD, "redesigned": NEW}
     motion = response_motion(both, actuators=actuators, sensors=sensors, colours=colours)
     grown = np.abs(old.modal[: old.modes.n_modes]).max() > limit
-    cut = f" The present one runs away; its motion is cut off at {RUNS_AWAY:g} times the other's." if grown else ""
+    cut = f" The present one diverges; its motion is cut off at {RUNS_AWAY:g} times the other's." if grown else ""
     return block(motion, f"{caption}: the corrected structure under the present and the redesigned controller.{cut}")
 
 

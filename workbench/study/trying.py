@@ -206,7 +206,7 @@ def try_out(rig: Rig, design: Design) -> Tried:
     fastest = float(loop.poles.real.max())
     if fastest * design.final_time > MOST_GROWTH:
         raise DesignError(
-            f"the loop runs away: a pole at {fastest:+.3g} rad/s, because the sensors mistake residual modes for"
+            f"the loop is unstable: a pole at {fastest:+.3g} rad/s, because the sensors mistake residual modes for"
             " controlled ones; move or add sensors, or raise R"
         )
     state = impulse_state(modes, design.impulse_at)

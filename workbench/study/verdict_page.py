@@ -61,8 +61,8 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         figures += [
             (
                 plot_where(verdict),
-                "Where the gap is. Its squared size above the noise, shared out; and how likely a single"
-                " unknown force at each place would explain it, before any effect is guessed.",
+                "Where the gap is: its power above the noise, by sensor, mode and record; and the likelihood of a"
+                " single unknown force at each place, no law assumed.",
             ),
             (
                 plot_unmodelled_force(verdict),
@@ -70,12 +70,12 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             ),
         ]
         if verdict.attribution.singles:  # none were tried where errors of the model were fitted from the first
-            each = "What each effect alone leaves of the gap: at the noise floor, it explains all of it."
+            each = "Residual with each effect alone: at the noise floor, it explains all of the gap."
             figures.append((plot_rivals(verdict), each))
     distortions = _of_lowest_and_highest(records)
     if distortions:
         seen = (
-            "What the records show before any model: lines that are excited, odd and even ones that are not, and noise."
+            "Spectra before any model: excited lines, odd and even ones that are not excited, and noise."
             + " Only odd lines are excited, so even ones reveal an even law."
             * all(d.parity_resolved for d in distortions)
         )

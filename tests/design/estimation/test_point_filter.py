@@ -91,7 +91,7 @@ def test_sensors_that_make_no_filter_are_refused(points, words):
 
 def test_modes_that_sensors_cannot_tell_apart_are_named():
     # at quarters of the length sin 3 π x and sin 5 π x are alike but for their sign
-    with pytest.raises(ValueError, match=r"P3, P6, P9 cannot tell filtered mode\(s\) 3, 5 from rest or from each"):
+    with pytest.raises(ValueError, match=r"P3, P6, P9 cannot distinguish filtered mode\(s\) 3, 5 from rest or"):
         point_filter(modes(5), ["P3", "P6", "P9"], [0, 2, 4])
     with pytest.raises(ValueError, match=r"filtered mode\(s\) 4 from rest"):
         point_filter(modes(5), ["P3", "P6", "P9"], [0, 3])

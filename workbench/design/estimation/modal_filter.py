@@ -152,8 +152,8 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
     if strength[-1] < BLIND * strength[0]:
         mixed = [str(index[i] + 1) for i in np.flatnonzero(np.abs(right[-1]) > 0.5 * np.abs(right[-1]).max())]
         raise ValueError(
-            f"the sensors at {', '.join(names)} cannot tell filtered mode(s) {', '.join(mixed)} from rest or from each"
-            " other; move or add a sensor"
+            f"the sensors at {', '.join(names)} cannot distinguish filtered mode(s) {', '.join(mixed)} from rest or"
+            " from each other; move or add a sensor"
         )
     slowest = modes.omega[modes.omega > 0].min(initial=np.inf)
     softness = 1.0 / np.maximum(modes.omega, RIGID * slowest if np.isfinite(slowest) else 1.0)

@@ -137,7 +137,8 @@ def sample_design(
     if not before.stable:
         raise DesignError(
             f"{controller.name}: the loop of all {modes.n_modes} modes is unstable before any sampling, a pole at"
-            f" {-before.margin:+.3g} 1/s; explain(modes, controller) names the path, remedies(...) a mend"
+            f" {-before.margin:+.3g} 1/s; explain_spillover(modes, controller) names the path, and"
+            " spillover_remedies a cure"
         )
     fastest = float(modes.frequencies_hz[list(controller.law.controlled)].max())
     if sample_rate_hz <= 2.0 * fastest:

@@ -229,5 +229,5 @@ def change_remarks(
         evenly = f"frequencies change within the record, from its beginning to its end: {'; '.join(words)}; {end}"
         remarks.append(evenly)
     if others:
-        remarks.append(f"modes change within the record, with their amplitude say: {', '.join(others)}; {end}")
+        remarks.append(f"modes change within the record, perhaps with amplitude: {', '.join(others)}; {end}")
     return tuple(remarks)

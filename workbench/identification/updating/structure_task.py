@@ -142,7 +142,7 @@ def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
     if agreement[least, which[least]] < TASK.same_mode:
         raise ValueError(
             f"measured mode {least + 1} at {modes.frequencies_hz[least]:.4g} Hz looks like no mode of the nominal"
-            f" structure (best MAC {agreement[least].max():.2f}); leave it out, mend the nominal ends, or give numbers"
+            f" structure (best MAC {agreement[least].max():.2f}); leave it out, correct the ends, or give numbers"
         )
     return np.asarray(which)
 
