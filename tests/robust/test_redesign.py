@@ -18,7 +18,7 @@ from workbench.gap.effects.effect import Effect
 from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import impulse_test
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Proof
+from workbench.robust.proof import Verification
 from workbench.robust.redesign import redesign
 from workbench.structure.domain import Patch
 
@@ -101,7 +101,7 @@ def told(stable, vibration, work):
     """A proof with these figures of each draw, and nothing else of interest."""
     n = len(stable)
     none = {name: np.ones(n) for name in ("peak_force", "stroke", "settling", "effort")}
-    return Proof(
+    return Verification(
         stable=stable, damping=np.ones((n, 2)), work=np.array(work)[:, None], controlled=(0,), vibration=vibration,
         energy=np.ones((3, 2)), margin=1.0, margin_frequency_hz=1.0, **none,
     )  # fmt: skip

@@ -9,7 +9,6 @@ import numpy as np
 
 from workbench.cases.case import Case
 from workbench.cases.points import write_points
-from workbench.records.record import Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -42,7 +41,8 @@ def write_case(case: Case, folder: str | Path) -> Path:
     blocks = [f"title = {_text(case.name)}", *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         file = f"records/{record.name}.npz"
-        arrays: dict[str, Any] = {"t": record.time, **_arrays(record)}
+        arrays: dict[str, Any] = {"t": record.time, **dict(zip(record.input_names, record.inputs, strict=True))}
+        arrays |= dict(zip(record.output_names, record.outputs, strict=True))
         np.savez_compressed(folder / file, **arrays)
         hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
         blocks.append(
@@ -51,13 +51,6 @@ def write_case(case: Case, folder: str | Path) -> Path:
     path = folder / "case.toml"
     path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     return path
-
-
-def _arrays(record: Record) -> dict[str, np.ndarray]:
-    return {
-        **dict(zip(record.input_names, record.inputs, strict=True)),
-        **dict(zip(record.output_names, record.outputs, strict=True)),
-    }
 
 
 def _rig(rig: Rig, folder: Path) -> list[str]:

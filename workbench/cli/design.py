@@ -62,7 +62,8 @@ def design(
     for row in rows:
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
-        stable = "stable" if row.poles.real.max() < 0 else _undamped(row.poles.real.max())
+        fastest = row.poles.real.max()
+        stable = "stable" if fastest < 0 else "unstable" if fastest > 0 else "undamped poles"
         table.add_row(row.law.name, *(f"{value:.5g}" for value in numbers), most, stable)
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
     for why in refused:
@@ -117,11 +118,6 @@ def design(
             "through_sensors": written,
         },
     )
-
-
-def _undamped(fastest: float) -> str:
-    """The words for a loop whose rightmost pole does not lie left of the axis, 1/s."""
-    return "unstable" if fastest > 0 else "undamped poles"
 
 
 def _limit(explained: "Explanation") -> tuple[str, str]:

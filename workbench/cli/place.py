@@ -88,9 +88,10 @@ def place(
                     "the rig's own actuators cannot control these modes (B is singular), so their effort is no measure"
                     " for --effort: move one off the nodal lines"
                 )
+        least = 0.0 if isinstance(domain, NamedPoints) else LEAST_SPACING * domain.size
         limits = Limits(
             effort=effort * usual.effort,
-            spacing=_spacing(domain) if spacing is None else spacing,
+            spacing=least if spacing is None else spacing,
             peak_force=peak_force,
             condition=condition,
             forbidden=tuple(_zone(domain, text) for text in forbid or ()),
@@ -155,10 +156,6 @@ def _own(rig: "Rig", control: int) -> list[Place]:
             f" describe {control} [[input]] of kind actuator"
         )
     return own
-
-
-def _spacing(domain: Domain) -> float:
-    return 0.0 if isinstance(domain, NamedPoints) else LEAST_SPACING * domain.size
 
 
 def _places(domain: Domain, text: str) -> tuple[Place, ...]:

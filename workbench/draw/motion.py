@@ -172,11 +172,6 @@ def _seen(at: np.ndarray) -> np.ndarray:
     return np.asarray(np.stack([at[..., 0] + 0.4 * at[..., 1], at[..., 2] + 0.45 * at[..., 1]], axis=-1))
 
 
-def _front(at: np.ndarray) -> np.ndarray:
-    """(..., 3) as (..., 2): x to the right, y up."""
-    return at[..., :2]
-
-
 def _net(domain: Domain) -> Net:
     return _plate_net(domain) if isinstance(domain, Rectangle) else frame_net(domain)
 
@@ -211,7 +206,7 @@ def frame_net(domain: Domain) -> Net:
     first = {node: i for i, node in reversed(list(enumerate(domain.nodes)))}
     at = domain.positions[[first[node] for node in names]]
     planar = np.ptp(at[:, 2]) == 0 and "z" not in domain.directions
-    see = _front if planar else _seen
+    see = (lambda at: at[..., :2]) if planar else _seen
 
     def moves(modes: Modes) -> np.ndarray:
         shapes = modes.phi(list(domain.names))

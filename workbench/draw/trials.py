@@ -26,7 +26,7 @@ def plot_confusion(tally: Tally) -> Figure:
     figure, ax = new_figure(width=3.6 + 0.27 * len(columns), height=2.6 + 0.24 * len(rows))
     for (hidden, named), count in counts.items():
         x, y, right = columns.index(named), rows.index(hidden), hidden == named
-        ax.add_patch(_square(x, y, COLOURS[0] if right else COLOURS[1]))
+        ax.add_patch(Rectangle((x - 0.46, y - 0.44), 0.92, 0.88, color=COLOURS[0 if right else 1], linewidth=0))
         ax.text(x, y, str(count), ha="center", va="center", color="white", fontsize=8)
     ax.plot([-0.5, len(rows) - 0.5], [-0.5, len(rows) - 0.5], color=GREY, linewidth=0.6, zorder=0)
     ax.set_xticks(range(len(columns)), [_plain(c) for c in columns], rotation=90, fontsize=8)
@@ -109,7 +109,3 @@ def _order(name: str) -> tuple[int, str]:
 
 def _plain(name: str) -> str:
     return {"none": "nothing", "unknown": "something else"}.get(name, name.replace("_", " "))
-
-
-def _square(x: float, y: float, colour: str) -> Rectangle:
-    return Rectangle((x - 0.46, y - 0.44), 0.92, 0.88, color=colour, linewidth=0)

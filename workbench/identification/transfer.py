@@ -195,7 +195,9 @@ def _selected(
     before: np.ndarray | None = None
     for _ in range(TRANSFER.reweighted):
         guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
-        if guessed is None or (before is not None and _alike(guessed, before)):
+        if guessed is None or (
+            before is not None and np.log(guessed / before).std(axis=(1, 2)).max() < TRANSFER.alike  # but for size
+        ):
             break
         if budget.spent("estimation of the noise"):
             return lines, selected
@@ -205,11 +207,6 @@ def _selected(
             return lines, selected
         lines, selected = weighted, anew
     return (lines, selected) if lines.guessed else (lines, select_modes(lines, **how))
-
-
-def _alike(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether two noise spectra are the same but for their size."""
-    return bool(np.log(one / other).std(axis=(1, 2)).max() < TRANSFER.alike)
 
 
 def _modes_of(

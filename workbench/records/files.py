@@ -114,7 +114,7 @@ def write_record(record: Record, path: str | Path) -> Path:
     if path.suffix.lower() in READ_ONLY:
         written = ", ".join(sorted(set(FORMATS) - set(READ_ONLY)))
         raise RecordFileError(f"{path}: {path.suffix} is read, not written; use one of {written}")
-    signals = {_key(kind, legible(path, channel.name)): row for kind, channel, row in _rows(record)}
+    signals = {f"{kind}:{legible(path, channel.name)}": row for kind, channel, row in _rows(record)}
     header = {
         "name": record.name,
         "sample_time": record.sample_time,
@@ -142,7 +142,3 @@ def _rows(record: Record) -> Iterator[tuple[str, Channel, Floats]]:
         yield "input", channel, row
     for channel, row in zip(record.output_channels, record.outputs, strict=True):
         yield "output", channel, row
-
-
-def _key(kind: str, name: str) -> str:
-    return f"{kind}:{name}"

@@ -55,7 +55,7 @@ def decoded(value: Any) -> Any:
 
 def write_record(path: Path, record: dict[str, Any]) -> None:
     """Put a record in its place at once: a reader, or a run that resumes, sees all of it or nothing."""
-    text = _text(record)
+    text = json.dumps(record, separators=(",", ":"))
     write_whole(path, json.dumps({"sha256": _sum(text), "record": text}))
 
 
@@ -68,10 +68,6 @@ def read_record(path: Path) -> dict[str, Any] | None:
         return record
     except (OSError, ValueError, KeyError, TypeError):
         return None
-
-
-def _text(record: dict[str, Any]) -> str:
-    return json.dumps(record, separators=(",", ":"))
 
 
 def _sum(text: str) -> str:

@@ -151,11 +151,8 @@ def tables_of(content: Mapping[str, Any]) -> list[Table]:
 
 def _table_of(rows: Sequence[Mapping[str, Any]]) -> tuple[tuple[str, ...], list[list[str | bool]]]:
     heads = tuple(dict.fromkeys(head for row in rows for head in row if head != "versions"))
-    return heads, [[_shown(row.get(head)) for head in heads] for row in rows]
-
-
-def _shown(value: object) -> str | bool:
-    return "" if value is None else value if isinstance(value, bool) else _cell(value)
+    shown = [[row.get(head) for head in heads] for row in rows]
+    return heads, [["" if v is None else v if isinstance(v, bool) else _cell(v) for v in row] for row in shown]
 
 
 def to_its_error(value: object, error: object) -> tuple[str | bool, str | bool]:

@@ -135,13 +135,11 @@ def score_dirty(
 
 def _claims(verdict: dict[str, Any], label: dict[str, Any], complete: bool) -> list[tuple[float, bool]]:
     kinds = _words(label["effects"])
-    others = [(o["probability"], _words_of(o["kind"]) == kinds) for o in verdict.get("alternatives", [])]
+    others = [
+        (o["probability"], " + ".join(sorted(one.split("[")[0] for one in o["kind"].split(" + "))) == kinds)
+        for o in verdict.get("alternatives", [])
+    ]
     return [(1.0 - sum(p for p, _ in others), complete), *others]
-
-
-def _words_of(named: str) -> str:
-    """The kinds of a set that is named by the labels of its effects, in words."""
-    return " + ".join(sorted(one.split("[")[0] for one in named.split(" + ")))
 
 
 def reliability(scores: Iterable[dict[str, Any]]) -> list[Reliability]:

@@ -140,10 +140,11 @@ def sample_design(
             f" {-before.margin:+.3g} 1/s; explain_spillover(modes, controller) names the path, and"
             " spillover_remedies a cure"
         )
-    fastest = float(modes.frequencies_hz[list(controller.law.controlled)].max())
+    highest = max(controller.law.controlled, key=lambda r: float(modes.omega[r]))
+    fastest = float(modes.frequencies_hz[highest])
     if sample_rate_hz <= 2.0 * fastest:
         raise DesignError(
-            f"{sample_rate_hz:g} Hz is too slow for mode {_highest(modes, controller) + 1} at {fastest:.4g} Hz, which"
+            f"{sample_rate_hz:g} Hz is too slow for mode {highest + 1} at {fastest:.4g} Hz, which"
             f" needs more than {2 * fastest:.4g} Hz; sample at {_round_up(COMFORTABLE * fastest):g} Hz"
         )
 
@@ -164,10 +165,6 @@ def sample_design(
         found,
         _delay_margin(1.0 / sample_rate_hz, lambda more: _stable(poles(sample_rate_hz, computing_delay + more))),
     )
-
-
-def _highest(modes: Modes, controller: Controller) -> int:
-    return max(controller.law.controlled, key=lambda r: float(modes.omega[r]))
 
 
 def _stable(poles: np.ndarray) -> bool:

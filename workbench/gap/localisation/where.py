@@ -152,7 +152,8 @@ def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> 
     if paths:
         return paths[0]
     power = np.maximum(excess, 0.0).sum(axis=0)
-    if power.sum() <= 0 or evidence.data.by_channel(_joined(evidence)).mean() < 1.03:
+    left = np.concatenate([(r / evidence.data.noise[:, None]).ravel() for r in evidence.residuals])
+    if power.sum() <= 0 or evidence.data.by_channel(left).mean() < 1.03:
         return "none"
     if of_one_sensor(power):
         return "sensor"
@@ -168,10 +169,6 @@ def _path(evidence: Evidence, excess: np.ndarray, effects: Sequence[Effect]) -> 
 def of_one_sensor(excess: np.ndarray) -> bool:
     """Whether one sensor alone disagrees, by the power above the noise in each (n_outputs,)."""
     return bool(excess.max() > WHERE.one_sensor * excess.sum())
-
-
-def _joined(evidence: Evidence) -> np.ndarray:
-    return np.concatenate([(r / evidence.data.noise[:, None]).ravel() for r in evidence.residuals])
 
 
 def _amplitude_dependent(effects: Sequence[Effect], excess: np.ndarray, data: FitData) -> bool:

@@ -131,7 +131,7 @@ def fit_random_force(
     grid = [
         (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], where, stages)
         for where in places
-        for within in [_fractions(where, extent)]
+        for within in [np.atleast_1d(np.asarray(where)) / extent if extent.size else np.zeros(0)]
         for share in RANDOM_FORCE.sizes
         for memory, stages in COLOURS
     ]
@@ -170,11 +170,6 @@ def fit_random_force(
         ),
         tonal=min(tonal(force, data.counted[0].sample_time) for force in forces),
     )
-
-
-def _fractions(where: Where, extent: np.ndarray) -> np.ndarray:
-    """A place in shares of the extent (n_coordinates,)."""
-    return np.atleast_1d(np.asarray(where)) / extent if extent.size else np.zeros(0)
 
 
 def tonal(force: np.ndarray, sample_time: float) -> float:

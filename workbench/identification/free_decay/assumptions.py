@@ -109,7 +109,7 @@ def _segments(
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
         try:
-            stretch = _samples(record, first, last)
+            stretch = record.between(record.time[first], record.time[last - 1])
             found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
         except np.linalg.LinAlgError:
             continue
@@ -122,10 +122,6 @@ def _segments(
         figures[0, w, there] = np.sqrt(mean[:, there].max(axis=0))
         figures[1:, w, there] = np.stack(values)[:, sure]
     return record.start_time + record.sample_time * edges[:-1], figures
-
-
-def _samples(record: Record, first: int, last: int) -> Record:
-    return record.between(record.time[first], record.time[last - 1])
 
 
 def _mean_of_decay(x: np.ndarray) -> np.ndarray:

@@ -98,7 +98,8 @@ class KnownInputs:
         direct = np.vstack([self.direct(record.inputs).T[self.first :] for record in records])
         self.n_inputs = records[0].n_inputs
         self.n_excitations = self.n_inputs + (0 if at_rest else len(records))
-        self.feedthrough = (feedthrough or any_fraction) and not _flat(direct)
+        # The offset of each output holds an input that is constant already.
+        self.feedthrough = (feedthrough or any_fraction) and bool(np.ptp(direct, axis=0).all())
         self.beside, self.changing = beside, changing
         fixed = [direct, constant] if self.feedthrough else [constant]
         if beside is not None:
@@ -376,11 +377,6 @@ def _resampled(line_std: np.ndarray, n_rows: int) -> np.ndarray:
         return line_std
     at, lines = np.linspace(0.0, 1.0, n_rows), np.linspace(0.0, 1.0, len(line_std))
     return np.column_stack([np.interp(at, lines, column) for column in line_std.T])
-
-
-def _flat(inputs: np.ndarray) -> bool:
-    """Whether an input is a constant, which the offset of each output holds already."""
-    return bool((np.ptp(inputs, axis=0) == 0).any())
 
 
 def sources(pole: complex, dt: float, straight: bool) -> tuple[tuple[complex, complex], tuple[complex, complex]]:

@@ -155,12 +155,8 @@ def free_parameters(fit: Fit) -> np.ndarray:
     """Indices of the unknowns searched, real parts first: pole and participation of each mode, less the held entry."""
     n, p = fit.participation.shape
     free = np.ones((n, p + 1), bool)
-    free[np.arange(n), 1 + _held(fit.participation)] = False
+    free[np.arange(n), 1 + np.argmin(np.abs(fit.participation - 1.0), axis=1)] = False
     return np.flatnonzero(np.r_[free.ravel(), free.ravel()])
-
-
-def _held(participation: np.ndarray) -> np.ndarray:
-    return np.asarray(np.argmin(np.abs(participation - 1.0), axis=1))
 
 
 def moves(fit: Fit, part: Part) -> np.ndarray:

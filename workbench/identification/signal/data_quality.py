@@ -95,12 +95,12 @@ def _dead(record: Record) -> Iterator[DataFault]:
         if few and few < DATA.fewest_values <= record.n_samples:
             what = f"stays at {row[0]:g}" if few == 1 else f"takes {few} values only, {row.min():g} to {row.max():g}"
             yield DataFault("dead", (name,), f"output {name!r} {what}: the sensor is dead or too coarse; leave it out")
-        elif few is False and record.n_samples > 2 and _straight(row):
+        elif (
+            few is False
+            and record.n_samples > 2
+            and (np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]))
+        ):
             yield DataFault("dead", (name,), f"output {name!r} is a straight line, a clock or a counter; leave it out")
-
-
-def _straight(row: np.ndarray) -> bool:
-    return bool(np.abs(row - np.linspace(row[0], row[-1], row.size)).max() < 1e-6 * abs(row[-1] - row[0]))
 
 
 def _copied(record: Record, alive: list[int]) -> Iterator[DataFault]:
