@@ -22,7 +22,7 @@ MOST_BARS, FEW_BARS = 16, 6  # of named points: the likeliest are shown, and few
 
 
 def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure:
-    """Measured and simulated by each rig, at the sensor and in the stretch where the first differs most, by record."""
+    """Measured and simulated by each rig, at the sensor and in the segment where the first differs most, by record."""
     records = list(records)[-3:]
     figure, axes = new_figure(len(records), 1, width=10, height=2.6 * len(records), squeeze=False)
     for ax, record in zip(axes[:, 0], records, strict=True):

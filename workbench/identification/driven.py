@@ -193,7 +193,7 @@ def identify_driven(
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
 ) -> Driven:
-    """The modes between inputs and outputs, as many as there are, with participation factors and standard errors.
+    """The modes between inputs and outputs, their number selected, with participation factors and standard errors.
 
     Any excitation serves that moves the modes: noise, multisine, PRBS, an impulse. Each mode enters if it raises the
     likelihood by more than noise would in one record of a thousand.

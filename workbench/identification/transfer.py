@@ -131,7 +131,7 @@ def identify_transfer(
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
 ) -> TransferModes:
-    """The modes of measured transfer functions, as many as there are, each with its standard error.
+    """The modes of measured transfer functions, their number selected, each with its standard error.
 
     More than 1500 lines are fitted band by band, with overlap.
 

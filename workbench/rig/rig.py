@@ -38,7 +38,7 @@ def _misplaced(port: Actuator | Sensor, error: PlaceError) -> PlaceError:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rig(Printed):
-    """Modes, what drives them, what measures them, and what touches them.
+    """A test rig: modes, with actuators, sensors, attached elements and disturbances.
 
     Attributes:
         modes: of the structure; as many as the rig shows.

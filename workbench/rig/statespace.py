@@ -37,7 +37,7 @@ def output_matrix(modes: Modes, sensors: Sequence[Sensor]) -> np.ndarray:
 
 
 def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> control.StateSpace:
-    """The linear model from commands to readings, states (q_1..q_n, q_1'..q_n'), named signals.
+    """The linear model from commands to sensor outputs, states (q_1..q_n, q_1'..q_n'), named signals.
 
     x' = [0 I; -Ω² -C] x + [0; B] u, and y a displacement, slope, velocity, angular velocity or acceleration; an
     acceleration feels the force directly, so D is then not zero. A lag of an actuator or a sensor adds a state each,

@@ -29,7 +29,7 @@ SAYABLE = ("none", "explained")
 
 @dataclass(frozen=True, eq=False)
 class UncertainRig:
-    """What a diagnosis leaves possible: a set of effects with the joint covariance of their parameters.
+    """A corrected rig with its uncertainty: sets of effects, with the joint covariance of their parameters.
 
     Attributes:
         nominal: the rig without any effect.

@@ -108,7 +108,7 @@ def predict(
     seed: int = 0,
     report: Callable[[str, float], None] | None = None,
 ) -> Prediction:
-    """The readings of a test to come, from rest, with 95 % bands over time and frequency.
+    """Predicted sensor outputs of a test, from rest, with 95 % bands over time and frequency.
 
     Each draw of the rig is simulated under the inputs; a relative error Δ of the size that is left unexplained changes
     amplitude and phase of each sensor in each frequency band, y_real = (1 + Δ) y; noise comes last. A band runs between

@@ -300,7 +300,7 @@ def redesign(
     more_work: float = np.inf,
     report: Report = lambda text, share: None,
 ) -> Redesign:
-    """A controller of the same kind, designed anew for the corrected rig, and both proved on the same possible rigs.
+    """A controller of the same kind, redesigned for the corrected rig, and both verified on the same samples of it.
 
     The law and the estimator are designed with the settings that they have, on the modes of the corrected rig, with
     each element at a point as the spring and damper that it is worth in the motion under test. Then every loss on the

@@ -22,7 +22,7 @@ Place = float | tuple[float, float] | str
 
 
 class Between(NamedTuple):
-    """Two places: what stands there acts on the displacement of the first less that of the second."""
+    """A pair of places: what joins them acts on the displacement of the first less that of the second."""
 
     first: Place
     second: Place

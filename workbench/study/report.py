@@ -48,7 +48,7 @@ def case_page_content(folder: Path) -> PageContent:
     case = read_case(folder)
     rig, records = case.rig, (*case.fit, *case.validation)
     beside = plot_responses({"nominal": rig}, records)
-    caption = "Measured beside the nominal model, at the sensor and in the stretch where they differ most."
+    caption = "Measured beside the nominal model, at the sensor and in the segment where they differ most."
     rows = [
         (r.name, "fit" if r in case.fit else "validate", r.n_samples, r.sample_rate_hz, float(r.inputs.std()))
         for r in records

@@ -17,7 +17,7 @@ PER_SIDE = 24  # places along the longer side of a plate, where the most that an
 
 
 class DesignError(ValueError):
-    """A design that cannot be: what conflicts, and the way out."""
+    """A design task without a solution: what conflicts, and the remedy."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -92,7 +92,7 @@ def certify(
     most_cells: int = 200_000_000,
     progress: Progress | None = None,
 ) -> Certificate:
-    """A proof that no placement under the limits has less residual work by more than a gap, as far as it comes.
+    """A certificate that no placement under the limits has less residual work by more than a gap, by branch and bound.
 
     A limit of the condition alone leaves actuators beside the supports, where B vanishes and no bound holds: give a
     margin with it.

@@ -25,7 +25,7 @@ Zone = tuple[Place, Place]
 
 @dataclass(frozen=True)
 class Limits:
-    """What a placement must keep to.
+    """Constraints of a placement.
 
     Attributes:
         effort: largest ∫ FᵀF dt.

@@ -57,7 +57,7 @@ def nodes_of_mode(modes: Modes, mode: int) -> np.ndarray:
 @takes_former_limits
 @one_blas_thread
 def place_actuators(task: PlacementTask, limits: Limits, *, starts: int = 12, seed: int = 0) -> Placement:
-    """The law with its actuators where they spill the least W_R under limits, by CasADi and IPOPT from many starts.
+    """The law with its actuators at the places of least spillover work W_R, by CasADi and IPOPT from many starts.
 
     Where the limits name candidate places, and at named points, every choice of these is evaluated instead; where they
     are too many, one is exchanged for another until that helps no more, and `certify` says how far it is from the best.

@@ -67,7 +67,7 @@ def identify(
     seconds: float | None = SECONDS,
     progress: Progress | None = None,
 ) -> Identified:
-    """The modes that a free decay holds, as many as there are, each with its standard error.
+    """The modes of a free decay, their number selected, each with its standard error.
 
     Records of more than 100,000 values in all are searched many modes at a time, as in `long_records`.
 

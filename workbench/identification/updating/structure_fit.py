@@ -64,7 +64,7 @@ def choose_structure(
     stiffness_terms: Iterable[int] = range(1, MOST_TERMS + 1),
     **known: Any,
 ) -> FittedStructure:
-    """Mass and stiffness as series of as many terms as the modes call for, by `FittedStructure.criterion`.
+    """Mass and stiffness as series, their numbers of terms selected by `FittedStructure.criterion`.
 
     Args:
         measured, nominal: as `fit_structure`.
