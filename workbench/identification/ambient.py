@@ -104,9 +104,9 @@ def identify_ambient(
             frequency is as sure as that of a mode.
         longest: lag, s, as in `correlation_functions`.
         references: names of outputs, as in `correlation_functions`.
-        false_alarm: chance that noise alone is taken for a mode.
-        seconds: of processor time, after which standard errors come from fewer parts of the record, with a remark;
-            None for no limit.
+        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        seconds: of processor time, 30 unless given, after which standard errors come from fewer parts of the record,
+            with a remark; None for no limit.
         progress: called with the search under way and the share of the time that is spent.
 
     Raises:

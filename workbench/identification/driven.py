@@ -62,7 +62,7 @@ class Driven(ModalEstimates):
         feedthrough: (n_outputs, n_inputs) D: of accelerations, and of the modes above those identified.
         feedthrough_std: (n_outputs, n_inputs).
         delays: (n_inputs,) s, τ by which each input acts late.
-        straight: whether inputs run straight from sample to sample.
+        straight: whether inputs follow a first-order hold; otherwise a zero-order one.
         sample_time: s, of the records.
         initial: one (n_modes,) complex a record: z_r at its first sample, where y = Re Σ 2 c_r z_r; zero if at rest.
         noise: (n_records, n_outputs) standard deviation of the residual, in the unit of each output.
@@ -201,16 +201,17 @@ def identify_driven(
     Args:
         records: with the same inputs and outputs at one rate; each output may hold a constant, another in each record.
         at_rest: that nothing moves at the first sample; otherwise each record has an initial state of its own.
-        straight: whether inputs run straight from sample to sample, as measured signals through a filter nearly do;
-            otherwise they are held over each sample interval, as a converter gives them. As the records say
+        straight: whether inputs follow a first-order hold, straight from sample to sample, as measured signals through
+            a filter nearly do; otherwise a zero-order hold, as a converter gives them. As the records say
             (`input_hold`) unless given.
         feedthrough: whether there is a direct term: of accelerations, and of modes beyond the sample rate.
         delays: (n_inputs,) s, by which each input acts late; estimated unless given, up to 60 samples. Of inputs held
             between samples, with a direct term, the fraction of a sample is the one that makes the modes most nearly
             real, for their response is the same whatever it is.
         most_modes: where to stop at the latest.
-        false_alarm: chance that noise alone is taken for a mode.
-        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
+        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
+            limit.
         progress: called with the search under way and the share of the time that is spent.
 
     Returns:

@@ -99,7 +99,8 @@ def ring_down(
         records: of the same sensors at one rate, of any length before the decay.
         start: where the decay is free, s, in every record; found in each unless given.
         n_modes: number of modes; selected unless given.
-        seconds: of processor time, after which the best so far is returned, with a note; None for no limit.
+        seconds: of processor time, 30 unless given, after which the best so far is returned, with a note; None for no
+            limit.
         progress: called with the search under way and the share of the time that is spent.
 
     Raises:

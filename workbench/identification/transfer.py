@@ -146,8 +146,9 @@ def identify_transfer(
             its size in part where neighbouring lines differ so (`noise_with_size`), and standard errors grow with the
             residual about each mode where that is larger than elsewhere.
         most_modes: of a band, where to stop at the latest.
-        false_alarm: chance that noise alone is taken for a mode.
-        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
+        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
+            limit.
         progress: called with the search under way and the share of the time that is spent.
 
     Raises:

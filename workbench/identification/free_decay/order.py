@@ -74,8 +74,9 @@ def identify(
     Args:
         records: free decay in noise, of the same sensors at one rate; each output may hold a constant.
         most_modes: where to stop at the latest; 40 unless given, and 400 in long records.
-        false_alarm: chance that noise alone is taken for a mode.
-        seconds: of processor time, after which the best so far is returned, with a remark; None for no limit.
+        false_alarm: chance that noise alone is taken for a mode; 0.001 unless given.
+        seconds: of processor time, 30 unless given, after which the best so far is returned, with a remark; None for no
+            limit.
         progress: called with the search under way and the share of the time that is spent.
 
     Raises:
