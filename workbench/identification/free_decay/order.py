@@ -52,7 +52,6 @@ class OrderSettings:
     least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
-    round_off: float = 1e-26  # squares of a residual that is round-off, over those of the record
 
 
 ORDER = OrderSettings()
@@ -161,7 +160,7 @@ class _FreeDecay:
         self.records, self.measured, self.budget = records, measured, budget
         self.grids = [_Grid(record, longest) for record in records]
         # Residuals of round-off say nothing of one sensor beside another.
-        self.round_off = ORDER.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
+        self.round_off = FIT.round_off * np.array([(record.outputs**2).sum(axis=1) for record in records]) + 1e-300
         cells = self.grids[0].n_cells
         signals = 2 * sum(r.n_outputs for r in records)
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
@@ -304,7 +303,7 @@ class _FreeDecay:
         poles, [fit], *_ = search([record], poles, np.ones((1, 1)), True, SELECTION.few_steps, budget=self.budget)
         both, pair, others = float(fit.squares.sum()), poles[[r, s]], np.delete(poles, [r, s])
         one = left_by_backbone(record, pair, others, offset=True, enough=both)
-        floor = ORDER.round_off * float((record.outputs**2).sum()) + 1e-300
+        floor = FIT.round_off * float((record.outputs**2).sum()) + 1e-300
         return record.n_samples * float(np.log((one + floor) / (both + floor)))
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:

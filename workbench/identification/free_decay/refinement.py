@@ -24,17 +24,6 @@ from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
 
-@dataclass(frozen=True)
-class RefinementSettings:
-    """Constants of the fit of free decays, beside those of every fit of modes (`searches.FIT`)."""
-
-    round_off: float = 1e-13  # of the residual, relative to the record
-    fastest_decay: float = 1.0  # nepers within a sample: no pole is searched beyond
-
-
-REFINEMENT = RefinementSettings()
-
-
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
     """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
     omega = np.abs(poles)
@@ -362,9 +351,7 @@ class _Poles:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(
-            FIT.negligible * cost / self.free, REFINEMENT.round_off**2 * self.signal, 1e-4 * self.round_off
-        )
+        return decrease <= max(FIT.negligible * cost / self.free, FIT.round_off * self.signal, 1e-4 * self.round_off)
 
 
 def _folded(poles: np.ndarray, sample_time: float) -> np.ndarray:
@@ -377,7 +364,7 @@ def _inadmissible(poles: np.ndarray, records: Sequence[Record]) -> np.ndarray:
     """Which poles do not oscillate, pass the Nyquist frequency, grow too much over a record, or decay at once."""
     dt, longest = records[0].sample_time, max(r.n_samples * r.sample_time for r in records)
     turn = poles.imag * dt
-    growing, gone = poles.real * longest >= FIT.most_growth, -poles.real * dt > REFINEMENT.fastest_decay
+    growing, gone = poles.real * longest >= FIT.most_growth, -poles.real * dt > FIT.fastest_decay
     return np.asarray((turn <= 0) | (turn >= np.pi) | growing | gone)
 
 

@@ -17,7 +17,6 @@ exact. Noise that is not white is weighted line by line of the cosine transform 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import factorial
 from typing import Any
 
@@ -33,15 +32,6 @@ from workbench.identification.signal.projection import noise_along, noise_near, 
 from workbench.identification.signal.searches import SELECTION
 from workbench.records.record import Record
 
-
-@dataclass(frozen=True)
-class InputsSettings:
-    """Constants of records with known inputs."""
-
-    peaks_a_rate: int = 12  # candidates of each rate of decay
-
-
-INPUTS = InputsSettings()
 # φ_k(x) = Σ x^i / (i + k)!, which ends below rounding for |x| < 6: a pole turns less than π a sample.
 TERMS = 40
 SERIES = [np.array([1.0 / factorial(i + k) for i in range(TERMS)]) for k in (1, 2)]
@@ -357,11 +347,11 @@ class KnownInputs:
                 score += (agreed / np.maximum(whole / (1.0 - np.exp(-2.0 * rate * self.dt)), least)).sum(axis=0)
             score[~lowest] = 0.0
             peaks = 1 + np.flatnonzero((score[1:-1] > score[:-2]) & (score[1:-1] >= score[2:]))
-            best = peaks[np.argsort(score[peaks])[-INPUTS.peaks_a_rate :]]
+            best = peaks[np.argsort(score[peaks])[-SELECTION.peaks_a_rate :]]
             found.append(-rate + 1j * omega[best])
             strength.append(score[best])
         order = np.argsort(np.concatenate(strength))[::-1]
-        return np.concatenate(found)[order[: 3 * INPUTS.peaks_a_rate]]
+        return np.concatenate(found)[order[: 3 * SELECTION.peaks_a_rate]]
 
     def noise_ratio(self, residual: np.ndarray, pole: complex) -> float:
         longest = max(self.rows, key=lambda rows: rows.stop - rows.start)

@@ -19,18 +19,6 @@ from scipy.linalg import qr, solve_triangular
 
 from workbench.identification.signal.searches import FIT, Budget, minimise
 
-
-@dataclass(frozen=True)
-class ModalFitSettings:
-    """Constants of the fit of modes, beside those of every fit of modes (`searches.FIT`)."""
-
-    round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
-    # participation factor over that held at one: factors that run apart without end are no mode's, and overflow
-    most_unlike: float = 1e20
-
-
-MODAL_FIT = ModalFitSettings()
-
 Pair = tuple[np.ndarray, np.ndarray]
 
 
@@ -235,7 +223,7 @@ class _OutputError:
         growing = poles.real > FIT.most_growth * self.data.resolution / (2.0 * np.pi)
         if ((poles.imag <= 0) | (poles.imag >= highest) | (-poles.real > fastest) | growing).any():
             return None, step
-        if not (np.abs(participation) < MODAL_FIT.most_unlike).all():
+        if not (np.abs(participation) < FIT.most_unlike).all():
             return None, step
         try:
             return projected(self.data, poles, participation), step
@@ -243,7 +231,7 @@ class _OutputError:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(self.least * cost / self.data.values.size, MODAL_FIT.round_off * self.signal)
+        return decrease <= max(self.least * cost / self.data.values.size, FIT.round_off * self.signal)
 
 
 def settled(

@@ -7,23 +7,11 @@ terms as lower n ln var(e) + p ln n; before, each line gets back its leverage, t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import dct, idct
 
 from workbench.identification.signal.projection import PROJECTION, differ, variances, white
-
-
-@dataclass(frozen=True)
-class NoiseSettings:
-    """Constants of the estimate of a noise spectrum."""
-
-    alike: float = 0.1  # rms of log ratios below which two spectra are the same
-    most_taken: float = 0.9  # leverage at most: a line that the fit took whole says nothing of its noise
-
-
-NOISE = NoiseSettings()
 
 
 def lines_of(samples: np.ndarray) -> np.ndarray:
@@ -66,7 +54,7 @@ def noise_spectrum(
     if flat.all() and not differ(squares, free).any():
         return None
     good = [
-        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, NOISE.most_taken)))
+        samples_of(lines_of(each) / np.sqrt(1.0 - np.clip(share, 0.0, PROJECTION.most_taken)))
         for each, share in zip(left, taken, strict=True)
     ]
     found = [np.tile(row, (len(each), 1)) for row, each in zip(levels, left, strict=True)]
@@ -83,7 +71,7 @@ def alike(one: Sequence[np.ndarray] | None, other: Sequence[np.ndarray] | None) 
     """Whether two noise spectra are the same."""
     if one is None or other is None:
         return one is other
-    return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < NOISE.alike)
+    return bool(np.sqrt((np.log(np.vstack(one) / np.vstack(other)) ** 2).mean(axis=0)).max() < PROJECTION.spectra_alike)
 
 
 def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:

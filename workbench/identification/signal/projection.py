@@ -42,6 +42,8 @@ class ProjectionSettings:
     order: int = 12  # of the autoregressive model of coloured noise
     samples_each: int = 40  # for each of its coefficients
     rounding: float = 1e-9  # residual of records without noise, relative
+    spectra_alike: float = 0.1  # rms of log ratios below which two spectra are the same
+    most_taken: float = 0.9  # leverage at most: a line that the fit took whole says nothing of its noise
 
 
 PROJECTION = ProjectionSettings()

@@ -36,7 +36,11 @@ class FitSettings:
     most_steps: int = 60
     # of χ², each value: a step is negligible once it moves the estimate by less than a thousandth of its standard error
     negligible: float = 1e-6
+    round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
     most_growth: float = 20.0  # nepers over a record: no pole is searched that grows faster
+    fastest_decay: float = 1.0  # nepers within a sample: no pole is searched beyond
+    # participation factor over that held at one: factors that run apart without end are no mode's, and overflow
+    most_unlike: float = 1e20
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class SelectionSettings:
     weak: float = 4.0  # times the limit, below which a mode may be noise and is tried again
     close: float = 2.0  # bandwidths to the next mode, likewise
     noise_bins: int = 50  # on either side, from which the noise about a pole is taken
+    peaks_a_rate: int = 12  # candidates of each rate of decay, of records with known inputs
 
 
 FIT = FitSettings()
