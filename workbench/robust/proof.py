@@ -34,7 +34,7 @@ class Verification:
         settling: (n_draws,) s until the energy stays below a hundredth of its peak; inf where it does not within the
             test.
         energy: (3, n_samples) of all modes: median over the draws, and lower and upper end of the 95 % interval.
-        margin: relative error of all readings, at once and of any phase, that the loop bears for sure; 0 where it is
+        margin: relative uncertainty of all outputs at once, of any phase, that the loop surely tolerates; 0 where it is
             not stable, inf where nothing is fed back, nan where it has no linear part.
         margin_frequency_hz: where the least of it is.
     """

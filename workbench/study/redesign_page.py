@@ -59,7 +59,7 @@ def redesign_page(
             )
         )
     tables: list[Table] = [
-        ("On the same draws: median (95 %)", ("", "present", "redesigned"), _figures(found)),
+        ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
         (
             "Steps",
             ("step", "what", "loss [%]", "kept"),
@@ -83,12 +83,12 @@ def redesign_page(
 
 def _figures(found: Redesign) -> list[tuple[str, ...]]:
     old, new = found.present_proof, found.proof
-    rows: list[tuple[str, ...]] = [("stable draws", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
+    rows: list[tuple[str, ...]] = [("stable samples", *(f"{int(p.stable.sum())} of {p.n_draws}" for p in (old, new)))]
     for r in found.controlled:
-        rows.append((f"damping of mode {r + 1} [%]", *(_told(100.0 * p.damping[:, r]) for p in (old, new))))
+        rows.append((f"damping ratio of mode {r + 1} [%]", *(_told(100.0 * p.damping[:, r]) for p in (old, new))))
     each = (
-        ("worst_damping", "worst damping of any mode [%]", 100.0),
-        ("settling", "settling [s]", 1.0),
+        ("worst_damping", "least damping ratio of any mode [%]", 100.0),
+        ("settling", "settling time [s]", 1.0),
         ("peak_force", "peak force [N]", 1.0),
         ("stroke", "largest displacement at an actuator [m]", 1.0),
         ("controlled_work", "work in controlled modes, W_C [J]", 1.0),
@@ -96,7 +96,7 @@ def _figures(found: Redesign) -> list[tuple[str, ...]]:
         ("effort", "effort, ∫ FᵀF dt", 1.0),
     )
     rows += [(words, *(_told(scale * getattr(p, name)) for p in (old, new))) for name, words, scale in each]
-    rows.append(("error of all readings that the loop bears [%]", *(_margin(p) for p in (old, new))))
+    rows.append(("output uncertainty tolerated (small gain) [%]", *(_margin(p) for p in (old, new))))
     return rows
 
 
