@@ -1,4 +1,4 @@
-"""A design at the rate of the computer that is to run it: what sampling costs it, and what delay it still bears."""
+"""A design at the rate of the computer that is to run it: what sampling costs it, and its delay margin."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -95,10 +95,10 @@ class SampledDesign(Printed):
     def remarks(self) -> tuple[str, ...]:
         """What a user should know before it runs: stability before and after sampling, and what is aliased."""
         before = close_with(self.modes, self.source).margin
-        bears = f"further delay borne: {1e3 * self.delay_margin:.3g} ms"
+        delay = f"delay margin {1e3 * self.delay_margin:.3g} ms"
         if not np.isfinite(self.delay_margin):
-            bears = f"{MOST_LATE} samples of further delay do not destabilise it"
-        said = [f"stability margin {self.margin:.3g} 1/s, {before:.3g} 1/s in continuous time; {bears}"]
+            delay = f"delay margin beyond {MOST_LATE} samples"
+        said = [f"stability margin {self.margin:.3g} 1/s, {before:.3g} 1/s in continuous time; {delay}"]
         rate, own = self.sample_rate_hz, self.source.law.controlled
         folded = [(r, f) for r, f in enumerate(self.modes.frequencies_hz) if f > 0.5 * rate and r not in own]
         if folded:
