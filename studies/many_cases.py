@@ -17,7 +17,7 @@ from workbench.design.spillover.spillover import effort, spillover
 from workbench.draw.tables import plot_cases
 from workbench.rig.actuators import Actuator
 from workbench.structure.member import Beam
-from workbench.study.engines import packed, unpacked
+from workbench.study.runs.engines import packed, unpacked
 
 N_TIMED, PAUSE, ROUNDS = 200, 0.05, 3
 WEIGHTS = np.geomspace(1.0, 100.0, 9)

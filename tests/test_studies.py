@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from workbench.study.catalogue import describe, run_study
-from workbench.study.outcome import Outcome
+from workbench.study.runs.outcome import Outcome
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = Path(os.environ.get("WORKBENCH_SHARED", ROOT.parent / "shared"))

@@ -415,7 +415,7 @@ def test_cases_that_fail_are_reported_at_the_end_beside_the_others(tmp_path, mon
     rows = (tmp_path / "out/many-cases.csv").read_text().splitlines()
     assert rows[0].startswith("at,third,seed,error,seconds") and rows[1].startswith("1,0.3333333333333333,,,")
     [kept] = (tmp_path / "out/cache").rglob("*.json")
-    monkeypatch.setattr("workbench.study.engines.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("workbench.study.runs.engines.CONNECT_SECONDS", 0.5)
     away = run("study", "many", "--scheduler", "tcp://127.0.0.1:1")
     assert away.exit_code == 2 and "no Dask scheduler answers" in away.output and kept.is_file()
 

@@ -13,7 +13,7 @@ from workbench.cli.app import app
 from workbench.records.files import read_record, write_record
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.record import Channel, Record
-from workbench.study.look import look_at
+from workbench.study.pages.look import look_at
 
 ENDINGS = (".csv", ".npz", ".mat", ".h5", ".uff")
 LONGEST, MOST = 10.0, 2 * 2**20  # s; KiB, as the system counts

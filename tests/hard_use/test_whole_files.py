@@ -6,7 +6,7 @@ import pytest
 from typer.testing import CliRunner
 
 from workbench.cli.app import app
-from workbench.study.whole_file import write_whole
+from workbench.study.runs.whole_file import write_whole
 
 
 def test_an_interrupted_report_leaves_the_one_before(tmp_path, monkeypatch):

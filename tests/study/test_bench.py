@@ -23,9 +23,9 @@ from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import PointShapes
 from workbench.study.bench import bench_server
-from workbench.study.cases import StudyError
 from workbench.study.catalogue import describe, run_study
-from workbench.study.outcome import Outcome
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.outcome import Outcome
 from workbench.study.saved_design import save
 from workbench.study.trying import asked, read_structure, shown, start, try_out
 from workbench.trials.plane_frame import Section, plane_frame

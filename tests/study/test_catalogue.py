@@ -3,7 +3,7 @@
 import pytest
 
 from workbench.study.catalogue import find_study, list_studies, output_root, run_study
-from workbench.study.outcome import Outcome
+from workbench.study.runs.outcome import Outcome
 
 SCRIPT = '"""Is one one?"""\n\n\ndef study(outcome, data=None):\n    outcome.check("one", 1.0, 1.0)\n'
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from workbench.structure.member import Beam
-from workbench.study.cases import StudyError
-from workbench.study.fingerprint import fingerprint
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.fingerprint import fingerprint
 
 SOURCE = """
 import numpy as np
@@ -116,7 +116,7 @@ def test_it_is_the_same_in_every_process(tmp_path):
     script = (
         "import sys, importlib.util as u; s = u.spec_from_file_location('mine', sys.argv[1]);"
         "m = u.module_from_spec(s); sys.modules['mine'] = m; s.loader.exec_module(m);"
-        "from workbench.study.fingerprint import fingerprint; print(fingerprint(m.function))"
+        "from workbench.study.runs.fingerprint import fingerprint; print(fingerprint(m.function))"
     )
     command = [sys.executable, "-c", script, tmp_path / "mine.py"]
     started = [
@@ -139,7 +139,7 @@ def test_it_knows_its_own_source(monkeypatch):
     def function(x):
         return Beam
 
-    from workbench.study import versions
+    from workbench.study.runs import versions
 
     first = fingerprint(function)
     versions.versions.cache_clear()

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from workbench import study
-from workbench.study.cases import StudyError
-from workbench.study.versions import PACKAGE, own_source
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.versions import PACKAGE, own_source
 
 SCRIPT = """
 import os, sys, time
@@ -148,7 +148,7 @@ def test_a_cluster_loses_a_worker_and_no_case(tmp_path, dask_cluster):
 
 
 def test_a_worker_with_another_workbench_is_refused():
-    from workbench.study.engines import _gathered
+    from workbench.study.runs.engines import _gathered
 
     class Finished:
         def result(self):
@@ -160,6 +160,6 @@ def test_a_worker_with_another_workbench_is_refused():
 
 def test_a_scheduler_that_is_not_there_is_said_to_be_so(monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr("workbench.study.engines.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("workbench.study.runs.engines.CONNECT_SECONDS", 0.5)
     with pytest.raises(StudyError, match=r"no Dask scheduler answers at tcp://127.0.0.1:1 "):
         study.run([{"at": 1, "log": "x"}], slow_case, cache=None, scheduler="tcp://127.0.0.1:1")

@@ -8,8 +8,8 @@ import pytest
 
 from workbench.draw.style import new_figure
 from workbench.study.catalogue import StudyError, describe
-from workbench.study.outcome import Outcome, plain
-from workbench.study.page import PageContent, study_page, write_page
+from workbench.study.pages.page import PageContent, study_page, write_page
+from workbench.study.runs.outcome import Outcome, plain
 
 
 class Tags(HTMLParser):

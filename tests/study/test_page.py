@@ -15,7 +15,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.member import Beam
 from workbench.structure.modes import SampledModes
-from workbench.study.page import PageContent, block, page_content_of, write_page
+from workbench.study.pages.page import PageContent, block, page_content_of, write_page
 from workbench.study.report import page_content_in
 
 WIDTHS = (390, 1200)

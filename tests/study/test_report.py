@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from workbench.study.cases import StudyError
-from workbench.study.page import write_page
+from workbench.study.pages.page import write_page
 from workbench.study.report import page_content_about, page_content_in
+from workbench.study.runs.cases import StudyError
 
 VERDICT = {
     "case": "arm", "outcome": "explained", "sentence": "A spring explains it.", "nearest": [], "notes": ["a note"],

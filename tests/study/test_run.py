@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from workbench import study
-from workbench.study.cache import decoded, encoded, read_record, write_record
-from workbench.study.cases import StudyError
+from workbench.study.runs.cache import decoded, encoded, read_record, write_record
+from workbench.study.runs.cases import StudyError
 
 HERE = {"workers": 1}
 

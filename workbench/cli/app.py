@@ -30,7 +30,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from workbench.study.versions import versions
+        from workbench.study.runs.versions import versions
 
         for name, version in versions().items():
             typer.echo(f"{name:<16} {version}")

@@ -33,8 +33,8 @@ def check(
 
     from workbench.cases.case import read_case
     from workbench.robust.check import check_prediction, log_test, read_log
-    from workbench.study.prediction_page import prediction_page
-    from workbench.study.whole_file import check_target
+    from workbench.study.pages.prediction_page import prediction_page
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     log = case / LOG if log is None else log

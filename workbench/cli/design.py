@@ -45,7 +45,7 @@ def design(
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
-    from workbench.study.whole_file import check_target
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     found = read_structure_rig(rig)

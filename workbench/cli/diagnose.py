@@ -53,8 +53,8 @@ def diagnose(
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.robust.posterior import UncertainRig
     from workbench.study.measured_case import measured_case
-    from workbench.study.verdict_page import verdict_page
-    from workbench.study.whole_file import check_target, write_whole
+    from workbench.study.pages.verdict_page import verdict_page
+    from workbench.study.runs.whole_file import check_target, write_whole
 
     check_target(json_path)
     if (case is None) == (nominal is None):

@@ -36,7 +36,7 @@ def export(
     from workbench.cases.case import read_rig
     from workbench.design.export.export import export as hand_over
     from workbench.rig.sensors import MEASURED
-    from workbench.study.whole_file import check_target
+    from workbench.study.runs.whole_file import check_target
 
     check_target(to)
     if not 0 < rate_hz < float("inf"):

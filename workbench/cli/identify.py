@@ -59,8 +59,8 @@ def identify(
     from workbench.identification.signal.modal_estimates import HEADINGS
     from workbench.records.files import read_measured
     from workbench.records.limits import Limits
-    from workbench.study.identification_report import identification_report
-    from workbench.study.whole_file import check_target
+    from workbench.study.pages.identification_report import identification_report
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     check_target(page)
@@ -89,7 +89,7 @@ def identify(
         say(f"  {line.replace('`seconds`', '--seconds')}")
     if page is not None:
         from workbench.study.identification_page import identification_page
-        from workbench.study.page import write_page
+        from workbench.study.pages.page import write_page
 
         made_by = " ".join(["workbench identify", *map(str, records)])
         say(f"  page {short(write_page(page, identification_page(found, read, made_by=made_by)))}")

@@ -25,8 +25,8 @@ def look(
     """
     from workbench.records.files import read_measured
     from workbench.records.limits import Limits
-    from workbench.study.look import HEADINGS, look_at
-    from workbench.study.page import write_page
+    from workbench.study.pages.look import HEADINGS, look_at
+    from workbench.study.pages.page import write_page
 
     measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=Limits.of_gib(memory))
     seen = look_at(measured, file)

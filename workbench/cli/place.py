@@ -64,7 +64,7 @@ def place(
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place_actuators as least_work
     from workbench.design.placement.task import patch_of
-    from workbench.study.whole_file import check_target
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     check_target(picture)

@@ -33,8 +33,8 @@ def predict(
     Example: workbench predict cases/arm planned.csv --verdict verdict.json
     """
     from workbench.cases.case import read_case
-    from workbench.study.prediction_page import prediction_page
-    from workbench.study.whole_file import check_target
+    from workbench.study.pages.prediction_page import prediction_page
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     found = read_case(case)

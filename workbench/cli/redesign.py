@@ -64,8 +64,8 @@ def redesign(
     from workbench.design.laws.law import controlled_indices
     from workbench.robust.on_rig import Design, impulse_test
     from workbench.robust.redesign import redesign as run
-    from workbench.study.redesign_page import redesign_page
-    from workbench.study.whole_file import check_target
+    from workbench.study.pages.redesign_page import redesign_page
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     check_target(to)

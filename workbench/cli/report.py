@@ -19,7 +19,7 @@ def report(
 
     Example: workbench report verdict.json
     """
-    from workbench.study.page import write_page
+    from workbench.study.pages.page import write_page
     from workbench.study.report import page_content_about
 
     name, page_content = page_content_about(what)

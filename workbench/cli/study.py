@@ -59,7 +59,7 @@ def _run_one_of_several(found: "StudyFile", data: Path | None, scheduler: str | 
 def _run(found: "StudyFile", data: Path | None, scheduler: str | None) -> bool:
     """Whether every case ran and every check holds."""
     from workbench.study.catalogue import output_root, run_study
-    from workbench.study.outcome import Outcome
+    from workbench.study.runs.outcome import Outcome
 
     if found.fault:
         complain(found.fault)

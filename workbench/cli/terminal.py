@@ -103,8 +103,8 @@ def reporter(progress: Progress, first: str) -> Callable[[str, float], None]:
 
 def write_json(path: Path | None, content: Mapping[str, Any]) -> None:
     """Write results as JSON where a path is given, and say so."""
-    from workbench.study.outcome import plain
-    from workbench.study.whole_file import write_whole
+    from workbench.study.runs.outcome import plain
+    from workbench.study.runs.whole_file import write_whole
 
     if path is not None:
         write_whole(path, json.dumps(plain(content), indent=1, allow_nan=False) + "\n")

@@ -22,7 +22,7 @@ def trial(
     """
     from workbench.cases.case import read_case
     from workbench.draw.trials import plot_confusion
-    from workbench.study.whole_file import check_target
+    from workbench.study.runs.whole_file import check_target
     from workbench.trials.hold import hold_trials
 
     check_target(json_path)

@@ -14,8 +14,8 @@ from jinja2 import Environment
 
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Interval, NamedPoints, Rectangle
-from workbench.study.cases import StudyError
-from workbench.study.page import asset, in_script
+from workbench.study.pages.page import asset, in_script
+from workbench.study.runs.cases import StudyError
 from workbench.study.saved_design import save
 from workbench.study.trying import asked, setting, shown
 

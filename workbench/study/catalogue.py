@@ -7,9 +7,9 @@ import sysconfig
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.study.cases import StudyError
-from workbench.study.outcome import Outcome
-from workbench.study.page import study_page
+from workbench.study.pages.page import study_page
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.outcome import Outcome
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
-from workbench.study.identification_report import IdentificationReport
-from workbench.study.page import PageContent, block
+from workbench.study.pages.identification_report import IdentificationReport
+from workbench.study.pages.page import PageContent, block
 from workbench.study.report import identified
 
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram

@@ -15,10 +15,10 @@ from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_p
 from workbench.gap.effects.catalogue import in_words
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
-from workbench.study.cases import StudyError
 from workbench.study.catalogue import find_study, output_root
-from workbench.study.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
-from workbench.study.verdict_page import STANDING_OF, case_inputs, moving_modes
+from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
+from workbench.study.pages.verdict_page import STANDING_OF, case_inputs, moving_modes
+from workbench.study.runs.cases import StudyError
 
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000

@@ -7,9 +7,9 @@ from pathlib import Path
 from workbench.cases.points import write_points
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints, Rectangle
+from workbench.study.runs.whole_file import write_whole
 from workbench.study.templates import free_path
 from workbench.study.trying import Design, try_out
-from workbench.study.whole_file import write_whole
 
 SCRIPT = '''"""Does the design found on the bench do what the bench showed?"""
 

@@ -3,8 +3,8 @@
 import re
 from pathlib import Path
 
-from workbench.study.cases import StudyError
-from workbench.study.whole_file import write_whole
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.whole_file import write_whole
 
 ASSETS = Path(__file__).with_name("assets")
 NAME = re.compile(r"[a-z][a-z0-9_]{0,40}")

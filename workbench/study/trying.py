@@ -22,7 +22,7 @@ from workbench.draw.motion import frame_net
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, centred_at, middle, reach
-from workbench.study.cases import StudyError
+from workbench.study.runs.cases import StudyError
 
 LAWS = ("IMSC", "coupled LQR")
 MOST_PORTS = 40

@@ -13,7 +13,7 @@ import workbench
 from workbench.gap.search import settings
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import SEARCH
-from workbench.study.outcome import Outcome
+from workbench.study.runs.outcome import Outcome
 from workbench.trials.make import write_trials
 
 ROOT = Path(workbench.__file__).parents[1]

@@ -16,7 +16,7 @@ from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.signal.data_quality import data_faults
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
-from workbench.study.page import PageContent, block
+from workbench.study.pages.page import PageContent, block
 
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)

@@ -6,8 +6,8 @@ from workbench.draw.robust import MOST_SENSORS, plot_prediction
 from workbench.records.record import Record
 from workbench.robust.check import PredictionCheck
 from workbench.robust.prediction import LEVEL, Prediction
-from workbench.study.page import PageContent, block, write_page
-from workbench.study.verdict_page import case_inputs
+from workbench.study.pages.page import PageContent, block, write_page
+from workbench.study.pages.verdict_page import case_inputs
 
 
 def prediction_page(

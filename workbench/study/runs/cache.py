@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.study.whole_file import write_whole
+from workbench.study.runs.whole_file import write_whole
 
 ARRAY, COMPLEX = "__array__", "__complex__"
 KINDS = "biufc"  # of arrays: booleans, integers, floats, complex numbers

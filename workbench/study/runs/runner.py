@@ -8,11 +8,11 @@ from typing import Any
 
 import joblib
 
-from workbench.study.cache import decoded, read_record
-from workbench.study.cases import StudyError, checked, key_of, seed_of
-from workbench.study.engines import Job, cluster, here, keep, processes
-from workbench.study.fingerprint import fingerprint
-from workbench.study.results import Result, Results
+from workbench.study.runs.cache import decoded, read_record
+from workbench.study.runs.cases import StudyError, checked, key_of, seed_of
+from workbench.study.runs.engines import Job, cluster, here, keep, processes
+from workbench.study.runs.fingerprint import fingerprint
+from workbench.study.runs.results import Result, Results
 
 CACHE = Path("out/cache")
 

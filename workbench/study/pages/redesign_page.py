@@ -16,9 +16,9 @@ from workbench.rig.actuators import Actuator
 from workbench.robust.proof import Verification, interval
 from workbench.robust.redesign import Redesign
 from workbench.structure.domain import NamedPoints, Where
-from workbench.study.outcome import Shown
-from workbench.study.page import PageContent, Table, block, write_page
-from workbench.study.verdict_page import case_inputs
+from workbench.study.pages.page import PageContent, Table, block, write_page
+from workbench.study.pages.verdict_page import case_inputs
+from workbench.study.runs.outcome import Shown
 
 MOST = 3000  # samples of a record that are replayed
 RUNS_AWAY = 4.0  # times the redesigned loop's largest modal displacement, at which the present one's is cut off

@@ -14,10 +14,10 @@ import cloudpickle
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from workbench.study.cache import encoded, read_record, write_record
-from workbench.study.cases import RESERVED, StudyError
-from workbench.study.fingerprint import is_own
-from workbench.study.versions import own_source
+from workbench.study.runs.cache import encoded, read_record, write_record
+from workbench.study.runs.cases import RESERVED, StudyError
+from workbench.study.runs.fingerprint import is_own
+from workbench.study.runs.versions import own_source
 
 if TYPE_CHECKING:
     from distributed import Future

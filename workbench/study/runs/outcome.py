@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from workbench.draw.style import plain_ticks
-from workbench.study.results import Results
-from workbench.study.runner import CACHE, run
-from workbench.study.whole_file import write_whole
+from workbench.study.runs.results import Results
+from workbench.study.runs.runner import CACHE, run
+from workbench.study.runs.whole_file import write_whole
 
 DIGITS = 10
 

@@ -11,12 +11,12 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from workbench.draw.interactive import drawable
-from workbench.study.cases import StudyError
-from workbench.study.outcome import Outcome, Shown
-from workbench.study.versions import versions
-from workbench.study.whole_file import write_whole
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.outcome import Outcome, Shown
+from workbench.study.runs.versions import versions
+from workbench.study.runs.whole_file import write_whole
 
-ASSETS = Path(__file__).with_name("assets")
+ASSETS = Path(__file__).parents[1] / "assets"
 SCRIPTS = ("figure.js", "motion.js", "table.js")
 FORMAT = "workbench page 1"
 MOST_ROWS = 2000

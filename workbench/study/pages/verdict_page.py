@@ -19,7 +19,7 @@ from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
-from workbench.study.page import PageContent, Table, block, to_its_error, write_page
+from workbench.study.pages.page import PageContent, Table, block, to_its_error, write_page
 
 MOVING = (
     "The modes of the nominal model, and of the corrected one where it differs; circles are sensors, triangles inputs."

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from workbench.study.cases import StudyError
-from workbench.study.versions import PACKAGE, own_source, versions
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.versions import PACKAGE, own_source, versions
 
 LIBRARIES = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range, slice)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 
-from workbench.study.cases import StudyError
-from workbench.study.versions import versions
-from workbench.study.whole_file import write_whole
+from workbench.study.runs.cases import StudyError
+from workbench.study.runs.versions import versions
+from workbench.study.runs.whole_file import write_whole
 
 if TYPE_CHECKING:
     import pandas as pd
