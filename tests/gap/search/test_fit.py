@@ -7,8 +7,8 @@ import pytest
 
 from workbench.gap.diagnose import _fails_unseen
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect
-from workbench.gap.effects.limiting_cases import fewer, simpler_forms
+from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.limiting_cases import fewer, merged_sets, simpler_forms
 from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.random_force import tonal
 from workbench.gap.prediction.residuals import FitData
@@ -16,6 +16,7 @@ from workbench.gap.prediction.unmodelled_force import force_filter, sampled_mode
 from workbench.gap.report.shrinkage import Shrinkage
 from workbench.gap.search.fit import cost_of, fit, slopes
 from workbench.rig.elements import CubicSpring, PeriodicForce
+from workbench.rig.simulate import simulate
 
 NOISE, DT = 1e-5, 0.01
 CUBIC, SPRING, LOSS = (kind_named(n) for n in ("cubic_spring", "ground_spring", "local_stiffness_loss"))
@@ -115,6 +116,23 @@ def test_two_effects_of_one_kind_may_be_one():
     assert [s[0] for s in sets] == [other] * 3
     assert sorted(s[1].values["at"] for s in sets) == pytest.approx([0.5, 0.7, 0.9])
     assert not list(fewer((first, other)))
+
+
+def test_friction_and_a_constant_force_are_friction_that_differs_between_the_directions(rig):
+    """Motion for motion, where the actuator stands where the friction acts; number for number."""
+    drive = rig.actuators[0]
+    friction = Effect(kind_named("coulomb_friction"), None, {"at": drive.at, "force": 0.02, "smoothing_speed": 1e-3})
+    bias = Effect(kind_named("actuator_bias"), drive.name, {"force": 0.006})
+    other = Effect(SPRING, None, {"at": 1.2, "stiffness": 2.0})
+    ((kept, merged),) = merged_sets((bias, friction, other))
+    assert kept is other and merged.kind.name == "two_way_friction"
+    commands = np.repeat(np.random.default_rng(2).normal(size=(len(rig.actuators), 60)), 5, axis=1)
+    apart, one = (
+        simulate(apply_all(rig, effects), commands, sample_time=DT, substeps=64).outputs
+        for effects in ((friction, bias), (merged,))
+    )
+    assert one == pytest.approx(apart, abs=1e-3 * np.abs(apart).max())
+    assert not list(merged_sets((friction, replace(bias, values={"force": 0.03}))))
 
 
 def test_a_tone_is_no_random_force():

@@ -207,6 +207,7 @@ class Kind:
         phrase: how the sentence of the verdict calls it.
         simpler: effect, rig -> its limiting cases at bounds of its parameters, with values to start a fit from.
         wider: effect -> what it is a limiting case of and records can mistake for it, with values to start a fit from.
+        merged: effect, another -> the one effect that both together may be, with values to start a fit from; or None.
         signed: whether the change is linear in its one number, which may be of either sign; one start is then enough.
         found_in: "search", where its starts are tried; "readings", where it shows in them as they are; "residual",
             where only its statistics can be found.
@@ -233,6 +234,7 @@ class Kind:
     phrase: str = ""
     simpler: Callable[["Effect", Rig], Iterable["Effect"]] = lambda effect, rig: ()
     wider: Callable[["Effect"], Iterable["Effect"]] = lambda effect: ()
+    merged: "Callable[[Effect, Effect], Effect | None]" = lambda effect, other: None
     signed: bool = False
     found_in: Literal["search", "readings", "residual"] = "search"
     alone: bool = False

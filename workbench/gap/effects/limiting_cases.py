@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 from workbench.gap.effects.effect import COORDINATES, Effect, key_of
 from workbench.rig.rig import Rig
@@ -44,6 +44,14 @@ def wider_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
     for i, effect in enumerate(effects):
         for wider in effect.kind.wider(effect):
             yield (*effects[:i], wider, *effects[i + 1 :])
+
+
+def merged_sets(effects: Sequence[Effect]) -> Iterator[tuple[Effect, ...]]:
+    """The sets with two effects of different kinds as the one that both together may be."""
+    for one, other in permutations(effects, 2):
+        merged = one.kind.merged(one, other)
+        if merged is not None:
+            yield (*(effect for effect in effects if effect is not one and effect is not other), merged)
 
 
 def simpler_sets(effects: Sequence[Effect], rig: Rig) -> Iterator[tuple[Effect, ...]]:

@@ -17,6 +17,7 @@ from workbench.gap.effects.effect import (
     place_parameters,
     place_values,
 )
+from workbench.gap.effects.ports import ACTUATOR_BIAS
 from workbench.gap.effects.structural import GROUND_SPRING, POINT_DAMPER
 from workbench.rig.elements import (
     AirDrag,
@@ -255,6 +256,16 @@ def _either_way(friction: Effect) -> tuple[Effect, ...]:
     return (Effect(TWO_WAY_FRICTION, None, {n: v for n, v in numbers.items() if n != "force"}),)
 
 
+def _with_a_constant_force(friction: Effect, other: Effect) -> Effect | None:
+    """Friction and a constant force in one: what a drive's own offset reads like where the friction acts."""
+    if other.kind is not ACTUATOR_BIAS:
+        return None
+    (both,), force, offset = _either_way(friction), friction.values["force"], other.values["force"]
+    if abs(offset) >= force:
+        return None
+    return replace(both, values={**both.values, "force_forward": force - offset, "force_backward": force + offset})
+
+
 COULOMB_FRICTION = Kind(
     name="coulomb_friction",
     path="structure",
@@ -267,6 +278,7 @@ COULOMB_FRICTION = Kind(
     starts=_friction_starts,
     nonlinear=True,
     wider=_either_way,
+    merged=_with_a_constant_force,
     simpler=_viscous,
     force_laws={"velocity": lambda v, u: -v["force"] * np.tanh(u / v["smoothing_speed"])},
     numbers=_without_sudden,

@@ -10,6 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all, key_of
 from workbench.gap.effects.limiting_cases import (
     contained,
     each_left_out,
+    merged_sets,
     simpler_sets,
     wider_sets,
     with_one_simpler,
@@ -436,6 +437,7 @@ class Stepwise:
         equals = [s for s in tried if len(s.effects) > 1 and not self._tells_apart(best, s)]
         fresh = [
             *simpler_sets(best.effects, self.search.rig),
+            *merged_sets(best.effects),
             *(fewer for s in equals for fewer in each_left_out(s.effects)),
         ]
         sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
