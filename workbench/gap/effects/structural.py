@@ -450,6 +450,10 @@ def _one_mode_fewer(truncation: Effect, rig: Rig) -> tuple[Effect, ...]:
     return (Effect(TRUNCATED_MODES, fewer, {}),) if fewer > rig.modes.n_modes else ()
 
 
+def _more_modes(truncation: Effect) -> tuple[Effect, ...]:
+    return tuple(Effect(TRUNCATED_MODES, truncation.target + more, {}) for more in (1, 2, 4))
+
+
 TRUNCATED_MODES = Kind(
     name="truncated_modes",
     path="structure",
@@ -459,6 +463,7 @@ TRUNCATED_MODES = Kind(
     targets=lambda rig: () if rig.structure is None else tuple(range(rig.modes.n_modes + 1, rig.modes.n_modes + 17)),
     phrase="modes left out of the model",
     simpler=_one_mode_fewer,
+    wider=_more_modes,
     alone=True,
     numbers=lambda truncation, rig: {"kept": rig.modes.n_modes, "needed": truncation.target},
     remark=lambda truncation, rig: f"{truncation.target} are needed, {rig.modes.n_modes} are kept",

@@ -232,7 +232,7 @@ def attribute(
         best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
         best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
         if outcome == "explained":
-            standing = tuple(e for e in best.effects if e in seen or e.stands_out(search.rig))
+            standing = tuple(e for e in best.effects if e in seen or _stands_out(within, best, e))
             best = best.only(search.rig, standing)
             outcome = outcome if any(not e.kind.first for e in standing) else "none"
     if noise is None:
@@ -253,6 +253,16 @@ def attribute(
         seen=seen,
         is_cut=is_cut,
     )
+
+
+def _stands_out(search: Search, best: Fit, effect: Effect) -> bool:
+    """Whether a number of an effect stands out of its deviation, or all of them together do: what the records need."""
+    if effect.stands_out(search.rig):
+        return True
+    data, others = search.data.stepped(SELECTION.fine), [e for e in best.effects if e is not effect]
+    without = fit(search.rig, others, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
+    with_it = cost_of(search.rig, best.effects, data)
+    return search.tells_apart(with_it, without.cost, max(best.n_parameters - without.n_parameters, 0))
 
 
 def beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:

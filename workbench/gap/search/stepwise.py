@@ -440,8 +440,8 @@ class Stepwise:
             *merged_sets(best.effects),
             *(fewer for s in equals for fewer in each_left_out(s.effects)),
         ]
-        sets = [*tried, *self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))]
-        sets += self._simpler_singles(best)
+        quickly = self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))
+        sets = [*tried, *self._on_all(quickly, best), *self._simpler_singles(best)]
         # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
         best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
         enough = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
@@ -454,6 +454,16 @@ class Stepwise:
             and not self._tells_apart(best, step)
         ]
         return min(fewer, key=lambda s: (self._size(s), s.fit.cost)) if fewer else best
+
+    def _on_all(self, quickly: Sequence[Step], best: Step) -> list[Step]:
+        """The sets, fitted to all records where they may be as good as the best, which was fitted to all of them."""
+        if not self.explains(best):
+            return list(quickly)
+        near = STEPWISE.near * best.fit.cost
+        return self.search.workers.map(
+            lambda s: fit_jointly(self.search, s.effects, s.errors, rounds=2) if s.fit.cost < near else s,
+            list(quickly),
+        )
 
     def _in_limit(self, step: Step) -> Step:
         """The set as what it comes to at bounds of its parameters, where what is left for good is more than noise.
