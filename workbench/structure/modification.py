@@ -18,7 +18,8 @@ def attach(
     """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
 
     Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes (`truncation_error`).
-    Damping ratios stay with the modes, in order. Where profiles or matrices are known, solve anew instead.
+    Damping ratios stay with the modes, in order; a damping matrix that couples them is that of dampers, and stays with
+    the structure. Where profiles or matrices are known, solve anew instead.
 
     Args:
         modes: as many as the changed shapes take.
@@ -53,8 +54,11 @@ def attach(
         _check_stable(eigenvalues)
         vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
         omega = np.sqrt(np.maximum(eigenvalues, 0.0))
-        # a rigid mode has no ratio: what damps it stays as it is
-        damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
+        if modes.proportional:
+            # a rigid mode has no ratio: what damps it stays as it is
+            damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
+        else:
+            damping = vectors.T @ modes.damping @ vectors
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
     for part in extra_damping:
