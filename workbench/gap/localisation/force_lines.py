@@ -8,6 +8,9 @@ with g, the force there, any number at all; d is the state at the start of the r
 lines. What no g accounts for is noise where x is right. A line counts by how far the force stands out of the noise in
 it, with weights that do not depend on x: a wrong idea of the force's spectrum then costs precision, and biases nothing.
 
+Where modes lie above half the sample rate and accelerations are read, a force between the samples rings them, and the
+sampling folds that onto lines below: r = Σ_k h(x, ω + k ω_s) g_k, with each g_k any number at all.
+
 Velocities of a state are in units of the modes' own, so that no column of T is far larger than another.
 
 Projections on one unknown source: Stoica & Nehorai, IEEE Trans. Acoust. Speech Signal Process. 37 (1989) 720.
@@ -19,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.arrays import Complexes, Floats
+from workbench.arrays import Complexes, Floats, Integers
 from workbench.gap.prediction.unmodelled_force import SampledModel
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import reading_of
@@ -149,16 +152,26 @@ def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int,
 def _coupled(
     rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float
 ) -> CoupledReceptances:
-    modes = rig.modes
-    dynamic = rate[:, None, None] * modes.damping
-    each = np.arange(modes.n_modes)
-    dynamic[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 + rate[:, None] ** 2
-    rows, orders = reading_of(rig)
-    compliance = rate[:, None, None] ** orders[:, None] * (rows @ np.linalg.inv(dynamic))
+    compliance = _compliance(rig, *reading_of(rig), rate)
     transposed = z[:, None, None] * np.eye(model.transition.shape[0]) - model.transition.T
     outputs = np.broadcast_to(model.output.T, (z.size, *model.output.T.shape))
     tail = z[:, None, None] * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2) * _velocities(rig)
     return CoupledReceptances(compliance / noise[:, None], share * tail / noise[:, None])
+
+
+def _compliance(rig: Rig, rows: Floats, orders: Integers, rate: Complexes) -> Complexes:
+    """Readings (n_lines, n_sensors, n_modes) of unit modal forces, at rates iω (n_lines,); see `reading_of`."""
+    modes = rig.modes
+    if modes.proportional:
+        dynamic = rate[:, None] * np.diag(modes.damping) + (1.0 + UNDAMPED) * modes.omega**2 + rate[:, None] ** 2
+        moved: Complexes = rows / dynamic[:, None, :]
+    else:
+        coupled = rate[:, None, None] * modes.damping
+        each = np.arange(modes.n_modes)
+        coupled[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 + rate[:, None] ** 2
+        moved = rows @ np.linalg.inv(coupled)
+    read: Complexes = rate[:, None, None] ** orders[:, None] * moved
+    return read
 
 
 def _uncoupled(
@@ -199,11 +212,13 @@ class Lines:
         receptances: of the rig, to forces and to states at the ends.
         left: (n_lines, n_sensors) the residual; its noise has unit variance.
         weights: (n_lines,).
+        folded: (n_folds, n_lines, n_sensors, n_modes) of modal forces whose frequencies are folded onto each line.
     """
 
     receptances: Receptances
     left: np.ndarray
     weights: np.ndarray
+    folded: np.ndarray
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
@@ -213,7 +228,7 @@ class Lines:
     def freedom(self) -> int:
         """Values that stay noise once a force, of any law, and the ends are accounted for."""
         n_lines, n_sensors = self.left.shape
-        return int(max(2 * n_lines * (n_sensors - 1) - self._products[1].size, 0))
+        return int(max(2 * n_lines * (n_sensors - 1 - len(self.folded)) - self._products[1].size, 0))
 
     @cached_property
     def power(self) -> float:
@@ -223,19 +238,29 @@ class Lines:
     def weighted(self, weights: np.ndarray) -> "Lines":
         """The lines by other weights (n_lines,), without those that count for nothing."""
         kept = weights > COUNTING
-        return Lines(self.receptances.on(kept), self.left[kept], weights[kept])
+        return self._on(kept, weights[kept])
+
+    def strongest(self, most: int) -> "Lines":
+        """At most so many lines, those of the most power."""
+        strong = np.argsort(-self.weights * np.sum(np.abs(self.left) ** 2, axis=1))[:most]
+        return self._on(strong, self.weights[strong])
+
+    def _on(self, kept: np.ndarray, weights: np.ndarray) -> "Lines":
+        return Lines(self.receptances.on(kept), self.left[kept], weights, self.folded[:, kept])
 
     def misfit(self, shape: np.ndarray) -> float:
         """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
-        u, a, _ = self._along(shape)
         root = np.sqrt(self.weights)
-        a = a * root
-        end, along = self._end(u * root[:, None], a)
+        seen = [self._along(direction) for direction in self._directions(shape)]
+        u, a = np.concatenate([u * root[:, None] for u, _ in seen]), np.concatenate([a * root for _, a in seen])
+        end, along = self._end(u, a)
         return self.power - 2.0 * float(np.sum(np.abs(a) ** 2)) - float(along @ end)
 
     def force_share(self, shape: np.ndarray) -> np.ndarray:
         """Share (n_lines,) of a force there in what is read along it: the weight of each line."""
-        u, a, power = self._along(shape)
+        h = self.receptances.to_force(shape)
+        power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
+        u, a = self._along(h / np.sqrt(power)[:, None])
         share, sure = np.ones_like(power), np.ones_like(power)
         for _ in range(ROUNDS):
             root = np.sqrt(share)
@@ -254,12 +279,16 @@ class Lines:
         along = along - real_product(u, a)
         return np.linalg.lstsq(own - real_product(u, u), along, rcond=1e-12)[0], along
 
-    def _along(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The tail and the residual along the reading of a force, and that reading's power."""
-        h = self.receptances.to_force(shape)
-        power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
-        h = (h / np.sqrt(power)[:, None]).conj()
-        return self.receptances.along(h), np.sum(h * self.left, axis=1), power
+    def _directions(self, shape: np.ndarray) -> list[np.ndarray]:
+        """Orthonormal directions (n_lines, n_sensors) that a force of any law is read along."""
+        h = np.stack([self.receptances.to_force(shape), *(self.folded @ shape)], axis=2)
+        h = h / np.sqrt(np.maximum(np.sum(np.abs(h) ** 2, axis=1, keepdims=True), 1e-300))
+        return [h[:, :, 0]] if not len(self.folded) else list(np.moveaxis(np.linalg.qr(h)[0], 2, 0))
+
+    def _along(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The tail and the residual along a direction."""
+        along = direction.conj()
+        return self.receptances.along(along), np.sum(along * self.left, axis=1)
 
 
 def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
@@ -267,14 +296,18 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
 
     The ends of the record are left out, and lines where little is read.
     """
-    strong = np.argsort(-lines.weights * np.sum(np.abs(lines.left) ** 2, axis=1))[:SCREENED]
-    power = lines.power
-    lines = Lines(lines.receptances.on(strong), lines.left[strong], lines.weights[strong])
+    left, lines = np.full(len(shapes), lines.power), lines.strongest(SCREENED)
     to_force = np.moveaxis(np.array([lines.receptances.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
-    left = np.full(len(shapes), power)
-    for h, r, weight in zip(to_force, lines.left, lines.weights, strict=True):
-        seen = h @ shapes.T
-        left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2 / np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300)
+    for *through, r, weight in zip(to_force, *lines.folded, lines.left, lines.weights, strict=True):
+        directions: list[Complexes] = []
+        for h in through:
+            seen = h @ shapes.T
+            for _ in range(2 if directions else 0):  # once more takes away what rounding left
+                for other in directions:
+                    seen = seen - other * np.sum(other.conj() * seen, axis=0)
+            seen = seen / np.sqrt(np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300))
+            left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2
+            directions.append(seen)
     return left
 
 
@@ -293,15 +326,30 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
         sample_time: s.
     """
     noise = np.sqrt(model.noise_variance)
-    made: dict[int, tuple[np.ndarray, Receptances]] = {}
+    made: dict[int, tuple[np.ndarray, Receptances, Complexes]] = {}
     lines = []
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
             top = max(int(0.5 * TOP * n), 2)
             taken = np.arange(1, top, 1 + top // MOST_LINES)
-            made[n] = taken, receptances_of(rig, model, 2.0 * np.pi * taken / (n * sample_time), n, sample_time)
-        taken, receptances = made[n]
+            omega = 2.0 * np.pi * taken / (n * sample_time)
+            made[n] = taken, receptances_of(rig, model, omega, n, sample_time), _folded(rig, noise, omega, sample_time)
+        taken, receptances, folded = made[n]
         left = np.fft.rfft(residual, axis=1)[:, taken].T / noise
-        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size)))
+        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size), folded))
     return lines
+
+
+def _folded(rig: Rig, noise: Floats, omega: Floats, sample_time: float) -> Complexes:
+    """Readings (n_folds, n_lines, n_sensors, n_modes) of modal forces whose frequencies are folded onto lines.
+
+    As far up as there are modes, where accelerations are read, and as the sensors can tell apart; displacements and
+    velocities hardly follow a force so quick.
+    """
+    rows, orders = reading_of(rig)
+    rate = 2.0 * np.pi / sample_time
+    folds = min(int(2.0 * rig.modes.omega[-1] / rate), (len(rows) - 1) // 2) if (orders == 2).any() else 0
+    turns = [(-1) ** k * ((k + 1) // 2) for k in range(1, folds + 1)]  # -1, 1, -2, ...
+    found = [_compliance(rig, rows, orders, 1j * (omega + turn * rate)) / noise[:, None] for turn in turns]
+    return np.array(found).reshape(folds, omega.size, *rows.shape)
