@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
 from workbench.structure.modification import attach, truncation_error
@@ -88,3 +88,9 @@ def test_a_mass_on_a_structure_with_dampers_is_one_in_its_matrices():
         for modes in (attach(model(mass).modes(5), (PointMass("r", 1.5),)), model(heavier).modes(5))
     ]
     np.testing.assert_allclose(*poles, rtol=1e-9)
+
+
+def test_a_mass_between_two_points_is_refused():
+    model = FiniteElements(np.eye(2), np.diag([1.0, 2.0]), nodes=NamedPoints(("p", "q")))
+    with pytest.raises(ValueError, match="a mass stands at one point; give it at each of the two"):
+        attach(model.modes(2), (PointMass(Between("p", "q"), 0.1),))

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import eigh
 
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
@@ -157,6 +157,8 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
 
 def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
     """Shapes (n_directions, n_modes) of what an attachment moves by: a mass moves in every direction of its node."""
+    if isinstance(part, PointMass) and isinstance(part.at, Between):
+        raise ValueError(f"{part}: a mass stands at one point; give it at each of the two")
     if isinstance(part, PointMass) and isinstance(modes.domain, NamedPoints) and derivative == 0:
         return modes.phi(modes.domain.translations(str(part.at)))
     return modes.phi_at(part.at, derivative)[None, :]

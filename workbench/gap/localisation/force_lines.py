@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.arrays import Complexes, Floats, Integers
+from workbench.arrays import Complexes, Floats
 from workbench.gap.prediction.unmodelled_force import SampledModel
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import reading_of
@@ -152,26 +152,16 @@ def receptances_of(rig: Rig, model: SampledModel, omega: Floats, n_samples: int,
 def _coupled(
     rig: Rig, model: SampledModel, rate: Complexes, z: Complexes, noise: Floats, share: float
 ) -> CoupledReceptances:
-    compliance = _compliance(rig, *reading_of(rig), rate)
+    modes = rig.modes
+    dynamic = rate[:, None, None] * modes.damping
+    each = np.arange(modes.n_modes)
+    dynamic[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 + rate[:, None] ** 2
+    rows, orders = reading_of(rig)
+    compliance = rate[:, None, None] ** orders[:, None] * (rows @ np.linalg.inv(dynamic))
     transposed = z[:, None, None] * np.eye(model.transition.shape[0]) - model.transition.T
     outputs = np.broadcast_to(model.output.T, (z.size, *model.output.T.shape))
     tail = z[:, None, None] * np.swapaxes(np.linalg.solve(transposed, outputs), 1, 2) * _velocities(rig)
     return CoupledReceptances(compliance / noise[:, None], share * tail / noise[:, None])
-
-
-def _compliance(rig: Rig, rows: Floats, orders: Integers, rate: Complexes) -> Complexes:
-    """Readings (n_lines, n_sensors, n_modes) of unit modal forces, at rates iω (n_lines,); see `reading_of`."""
-    modes = rig.modes
-    if modes.proportional:
-        dynamic = rate[:, None] * np.diag(modes.damping) + (1.0 + UNDAMPED) * modes.omega**2 + rate[:, None] ** 2
-        moved: Complexes = rows / dynamic[:, None, :]
-    else:
-        coupled = rate[:, None, None] * modes.damping
-        each = np.arange(modes.n_modes)
-        coupled[:, each, each] += (1.0 + UNDAMPED) * modes.omega**2 + rate[:, None] ** 2
-        moved = rows @ np.linalg.inv(coupled)
-    read: Complexes = rate[:, None, None] ** orders[:, None] * moved
-    return read
 
 
 def _uncoupled(
@@ -212,13 +202,13 @@ class Lines:
         receptances: of the rig, to forces and to states at the ends.
         left: (n_lines, n_sensors) the residual; its noise has unit variance.
         weights: (n_lines,).
-        folded: (n_folds, n_lines, n_sensors, n_modes) of modal forces whose frequencies are folded onto each line.
+        folded: of the rig, to forces whose frequencies are folded onto the lines, one for each fold.
     """
 
     receptances: Receptances
     left: np.ndarray
     weights: np.ndarray
-    folded: np.ndarray
+    folded: tuple[Receptances, ...]
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
@@ -246,7 +236,8 @@ class Lines:
         return self._on(strong, self.weights[strong])
 
     def _on(self, kept: np.ndarray, weights: np.ndarray) -> "Lines":
-        return Lines(self.receptances.on(kept), self.left[kept], weights, self.folded[:, kept])
+        folded = tuple(each.on(kept) for each in self.folded)
+        return Lines(self.receptances.on(kept), self.left[kept], weights, folded)
 
     def misfit(self, shape: np.ndarray) -> float:
         """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
@@ -281,9 +272,9 @@ class Lines:
 
     def _directions(self, shape: np.ndarray) -> list[np.ndarray]:
         """Orthonormal directions (n_lines, n_sensors) that a force of any law is read along."""
-        h = np.stack([self.receptances.to_force(shape), *(self.folded @ shape)], axis=2)
+        h = np.stack([each.to_force(shape) for each in (self.receptances, *self.folded)], axis=2)
         h = h / np.sqrt(np.maximum(np.sum(np.abs(h) ** 2, axis=1, keepdims=True), 1e-300))
-        return [h[:, :, 0]] if not len(self.folded) else list(np.moveaxis(np.linalg.qr(h)[0], 2, 0))
+        return [h[:, :, 0]] if not self.folded else list(np.moveaxis(np.linalg.qr(h)[0], 2, 0))
 
     def _along(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The tail and the residual along a direction."""
@@ -297,8 +288,11 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
     The ends of the record are left out, and lines where little is read.
     """
     left, lines = np.full(len(shapes), lines.power), lines.strongest(SCREENED)
-    to_force = np.moveaxis(np.array([lines.receptances.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
-    for *through, r, weight in zip(to_force, *lines.folded, lines.left, lines.weights, strict=True):
+    to_force = [
+        np.moveaxis(np.array([each.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
+        for each in (lines.receptances, *lines.folded)
+    ]
+    for *through, r, weight in zip(*to_force, lines.left, lines.weights, strict=True):
         directions: list[Complexes] = []
         for h in through:
             seen = h @ shapes.T
@@ -326,30 +320,28 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
         sample_time: s.
     """
     noise = np.sqrt(model.noise_variance)
-    made: dict[int, tuple[np.ndarray, Receptances, Complexes]] = {}
+    made: dict[int, tuple[np.ndarray, list[Receptances]]] = {}
     lines = []
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
             top = max(int(0.5 * TOP * n), 2)
             taken = np.arange(1, top, 1 + top // MOST_LINES)
+            rates = 2.0 * np.pi / sample_time * np.array([0, *_folds(rig, sample_time)])
             omega = 2.0 * np.pi * taken / (n * sample_time)
-            made[n] = taken, receptances_of(rig, model, omega, n, sample_time), _folded(rig, noise, omega, sample_time)
-        taken, receptances, folded = made[n]
+            made[n] = taken, [receptances_of(rig, model, omega + rate, n, sample_time) for rate in rates]
+        taken, (receptances, *folded) = made[n]
         left = np.fft.rfft(residual, axis=1)[:, taken].T / noise
-        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size), folded))
+        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size), tuple(folded)))
     return lines
 
 
-def _folded(rig: Rig, noise: Floats, omega: Floats, sample_time: float) -> Complexes:
-    """Readings (n_folds, n_lines, n_sensors, n_modes) of modal forces whose frequencies are folded onto lines.
+def _folds(rig: Rig, sample_time: float) -> list[int]:
+    """By how many times the sample rate the frequencies of forces differ that are folded onto lines: -1, 1, -2, ...
 
     As far up as there are modes, where accelerations are read, and as the sensors can tell apart; displacements and
     velocities hardly follow a force so quick.
     """
-    rows, orders = reading_of(rig)
-    rate = 2.0 * np.pi / sample_time
-    folds = min(int(2.0 * rig.modes.omega[-1] / rate), (len(rows) - 1) // 2) if (orders == 2).any() else 0
-    turns = [(-1) ** k * ((k + 1) // 2) for k in range(1, folds + 1)]  # -1, 1, -2, ...
-    found = [_compliance(rig, rows, orders, 1j * (omega + turn * rate)) / noise[:, None] for turn in turns]
-    return np.array(found).reshape(folds, omega.size, *rows.shape)
+    _, orders = reading_of(rig)
+    folds = min(int(rig.modes.omega[-1] * sample_time / np.pi), (len(orders) - 1) // 2) if (orders == 2).any() else 0
+    return [(-1) ** k * ((k + 1) // 2) for k in range(1, folds + 1)]
