@@ -250,7 +250,7 @@ class Lines:
     def force_share(self, shape: np.ndarray) -> np.ndarray:
         """Share (n_lines,) of a force there in what is read along it: the weight of each line."""
         h = self.receptances.to_force(shape)
-        power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
+        power: Floats = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
         u, a = self._along(h / np.sqrt(power)[:, None])
         share, sure = np.ones_like(power), np.ones_like(power)
         for _ in range(ROUNDS):
