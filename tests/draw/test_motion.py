@@ -7,7 +7,7 @@ from workbench.design.loop.closed_loop import Response
 from workbench.draw.motion import SWAY, mode_motion, response_motion
 from workbench.rig.actuators import Actuator
 from workbench.structure.domain import NamedPoints
-from workbench.structure.modes import Modes, PointShapes
+from workbench.structure.modes import Modes, PointShapes, SampledModes
 from workbench.structure.plate import Plate
 
 
@@ -66,3 +66,21 @@ def test_a_frame_moves_each_node_in_its_directions_and_closes_its_loop():
     np.testing.assert_allclose(np.array(shown["tracks"][1]["moves"])[0], moves)
     with pytest.raises(ValueError, match="positions are known"):
         mode_motion({"nominal": Modes([10.0], [0.01], PointShapes([[1.0], [2.0]]), NamedPoints(("p", "q")))})
+
+
+def test_sampled_modes_of_a_plate_move_over_it_each_sensor_with_its_phase():
+    places = np.array([(0.2, 0.3), (0.7, 0.3), (0.2, 0.6), (0.7, 0.6), (0.45, 0.45)])
+    shapes = np.sin(np.pi * places[:, :1] / 1.0) * np.sin(np.pi * places[:, 1:] / 0.8) * np.array([1.0, -2.0])
+    shapes = shapes * np.exp(0.5j * np.pi * np.array([0, 0, 0, 0, 1]))[:, None]  # the last a quarter of a period ahead
+    sampled = SampledModes(np.array([10.0, 20.0]), np.array([0.01, 0.02]), shapes, places)
+    shown = mode_motion({"identified": sampled})
+    rest = np.array(shown["net"]["rest"])
+    np.testing.assert_allclose(rest, np.column_stack([places @ [1.0, 0.4], 0.45 * places[:, 1]]), rtol=1e-4)
+    joined = {frozenset(ends) for ends in shown["net"]["lines"]}
+    assert {frozenset((i, 4)) for i in range(4)} <= joined and frozenset((0, 3)) not in joined
+    (track,) = shown["tracks"]
+    for r in range(2):
+        moved = np.array(track["moves"][r]) + 1j * np.array(track["imaginary"][r])
+        assert not moved[:, 0].any()
+        largest = np.abs(shapes[:, r]).max()
+        np.testing.assert_allclose(moved[:, 1] * largest / (SWAY * np.ptp(rest, axis=0).max()), shapes[:, r], atol=1e-4)

@@ -143,3 +143,19 @@ def test_what_a_universal_file_cannot_say_is_asked_for(tmp_path):
         read_modes(tmp_path / "m.op2")
     with pytest.raises(RecordFileError, match="names no format of modes"):
         read_modes(tmp_path / "m.csv")
+
+
+@pytest.mark.parametrize(
+    ("changed", "given", "message"),
+    [
+        ({}, {"modal_mass": [1.0, 2.0]}, "modal_mass is one number, or one a mode: 3 modes need as many; got 2"),
+        ({}, {"damping_ratios": [0.01] * 4}, "damping_ratios is one number, or one a mode: .* got 4"),
+        ({"frequencies_hz": [3.0, -5.0, 8.0]}, {}, "frequencies_hz must be .* not negative; of mode 2 it is -5;"),
+        ({"frequencies_hz": [3.0, 5.0, np.nan]}, {}, "of mode 3 it is nan"),
+    ],
+)
+def test_numbers_of_modes_that_do_not_fit_are_named_with_the_file(tmp_path, changed, given, message):
+    path = tmp_path / "model.npz"
+    np.savez(path, **{"shapes": np.eye(4)[:, :3], "frequencies_hz": [3.0, 5.0, 8.0], **changed})
+    with pytest.raises(RecordFileError, match=f"model.npz: .*{message}"):
+        read_modes(path, **given)

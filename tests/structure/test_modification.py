@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Beam
 from workbench.structure.modification import attach, truncation_error
@@ -70,3 +71,26 @@ def test_no_cost_is_stated_where_the_flexibility_at_a_point_has_no_end():
     modes = net.modes(40)
     true = np.abs(attach(modes, parts).omega[:20] / net.attached(parts).modes(20).omega - 1.0)
     assert true.max() > 5e-4 and np.isinf(truncation_error(modes, parts)[:20][true > 1e-9]).all()
+
+
+def test_a_mass_on_a_structure_with_dampers_is_one_in_its_matrices():
+    rng = np.random.default_rng(5)
+    mass, stiffness, damping = (a @ a.T + 3.0 * np.eye(5) for a in rng.normal(size=(3, 5, 5)))
+    names = tuple("pqrst")
+
+    def model(m):
+        return FiniteElements(m, 400.0 * stiffness, nodes=NamedPoints(names), damping=0.05 * damping)
+
+    heavier = mass.copy()
+    heavier[2, 2] += 1.5
+    poles = [
+        np.sort_complex(np.linalg.eigvals(modes.state_matrix))
+        for modes in (attach(model(mass).modes(5), (PointMass("r", 1.5),)), model(heavier).modes(5))
+    ]
+    np.testing.assert_allclose(*poles, rtol=1e-9)
+
+
+def test_a_mass_between_two_points_is_refused():
+    model = FiniteElements(np.eye(2), np.diag([1.0, 2.0]), nodes=NamedPoints(("p", "q")))
+    with pytest.raises(ValueError, match="a mass stands at one point; give it at each of the two"):
+        attach(model.modes(2), (PointMass(Between("p", "q"), 0.1),))

@@ -76,17 +76,18 @@ def mode_motion(
 ) -> dict[str, Any]:
     """Mode shapes in motion, one mode at a time; several sets of modes over each other, each scaled to one.
 
-    Sampled modes are shown at their sensors, with the phase that each sensor has. A plate is a net of lines and a frame
-    its nodes, neighbours joined, as both are seen from above the front; a plane frame from the front.
+    Sampled modes are shown at their sensors, with the phase that each sensor has; on a plate neighbours are joined. A
+    plate is a net of lines and a frame its nodes, neighbours joined, as both are seen from above the front; a plane
+    frame from the front.
 
     Raises:
         ValueError: modes at named points without positions.
     """
     first = next(iter(modes.values()))
+    if isinstance(first, SampledModes) and first.is_over:
+        return _net_motion(scattered_net(first.positions), modes, actuators, sensors)
     if isinstance(first, Modes) and not isinstance(first.domain, Interval):
-        return _net_motion(
-            {name: found for name, found in modes.items() if isinstance(found, Modes)}, actuators, sensors
-        )
+        return _net_motion(_net(first.domain), modes, actuators, sensors)
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
         if isinstance(found, SampledModes):
@@ -116,9 +117,12 @@ def mode_motion(
     return {"kind": "modes", "x": tracks[0]["x"], "tracks": tracks, **_places(actuators, sensors)}
 
 
-def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]) -> dict[str, Any]:
-    first = next(iter(modes.values()))
-    spots = _net(first.domain)
+def _net_motion(
+    spots: "Net",
+    modes: Mapping[str, Modes | SampledModes],
+    actuators: Sequence[Actuator],
+    sensors: Sequence[Sensor],
+) -> dict[str, Any]:
     size = np.ptp(spots.rest, axis=0).max()
     tracks: list[dict[str, Any]] = []
     for name, found in modes.items():
@@ -127,11 +131,13 @@ def _net_motion(modes: Mapping[str, Modes], actuators: Sequence[Actuator], senso
         if tracks:  # two sets of modes move together, whatever the sign of each
             n = min(moves.shape[2], len(tracks[0]["moves"]))
             other = np.moveaxis(np.array(tracks[0]["moves"])[:n], 0, 2)
-            moves[:, :, :n] *= np.where((moves[:, :, :n] * other).sum(axis=(0, 1)) < 0, -1.0, 1.0)
+            moves[:, :, :n] *= np.where((moves[:, :, :n].real * other).sum(axis=(0, 1)) < 0, -1.0, 1.0)
+        moves = np.moveaxis(moves, 2, 0)
         tracks.append(
             {
                 "label": name,
-                "moves": _numbers(np.moveaxis(moves, 2, 0)),
+                "moves": _numbers(moves.real),
+                **({"imaginary": _numbers(moves.imag)} if np.iscomplexobj(moves) else {}),
                 "frequencies_hz": _numbers(found.frequencies_hz),
                 "damping": _numbers(found.zeta),
             }
@@ -157,13 +163,13 @@ class Net:
     Attributes:
         rest: (n_spots, 2) at rest, m, as they are seen.
         lines: pairs of spots that are joined.
-        moves: modes -> (n_spots, 2, n_modes) displacements as they are seen.
+        moves: modes -> (n_spots, 2, n_modes) displacements as they are seen, complex where sensors differ in phase.
         at: place -> (2,) where it, or the middle of a patch, is seen.
     """
 
     rest: np.ndarray
     lines: list[list[int]]
-    moves: Callable[[Modes], np.ndarray]
+    moves: Callable[[Any], np.ndarray]
     at: Callable[[Any], np.ndarray]
 
 
@@ -190,6 +196,16 @@ def _plate_net(domain: Rectangle) -> Net:
         return np.stack([np.zeros_like(up), up], axis=1)
 
     return Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place)[:2] @ flat))
+
+
+def scattered_net(places: np.ndarray) -> Net:
+    """Sensors on a plate, at places (n_sensors, 2), neighbours joined; what they read moves up, each with its phase."""
+    at = np.column_stack([places, np.zeros(len(places))])
+
+    def moves(modes: SampledModes) -> np.ndarray:
+        return np.stack([np.zeros_like(modes.shapes), modes.shapes], axis=1)
+
+    return Net(_seen(at), _neighbours(at), moves, lambda place: _seen(np.r_[place, 0.0]))
 
 
 def frame_net(domain: Domain) -> Net:

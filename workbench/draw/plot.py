@@ -20,7 +20,13 @@ from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.spectra import plot_distortion
 from workbench.draw.style import COLOURS, GREY, new_figure
-from workbench.draw.surface import plot_point_modes, plot_surface_bands, plot_surface_modes, plot_surface_motion
+from workbench.draw.surface import (
+    plot_point_modes,
+    plot_scattered_modes,
+    plot_surface_bands,
+    plot_surface_modes,
+    plot_surface_motion,
+)
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.shapes.bands import Bands
 from workbench.identification.signal.distortion import Distortion
@@ -81,6 +87,8 @@ def _(result: Modes) -> Figure:
 
 @plot.register
 def _(result: SampledModes) -> Figure:
+    if result.is_over:
+        return plot_scattered_modes(result, count=MOST_PANELS)
     shapes = result.shapes[:, :MOST_PANELS]
     figure, axes = _panels(shapes.shape[1])
     placed = result.is_along

@@ -1,6 +1,7 @@
 """Figures of plates, membranes and frames: shapes with their nodal lines, and motion at some instants."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,11 @@ from matplotlib.ticker import MaxNLocator
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement, PlacementTask
-from workbench.draw.motion import SWAY, frame_net
+from workbench.draw.motion import SWAY, Net, frame_net, scattered_net
 from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.shapes.bands import Bands
 from workbench.structure.domain import Patch, Rectangle
-from workbench.structure.modes import Modes
+from workbench.structure.modes import Modes, SampledModes
 
 PER_SIDE = 121  # of the longer one: points where a shape is drawn
 SHOWN_WORK = 1e-8  # of the largest work in one mode: what is less is not drawn
@@ -200,9 +201,18 @@ def plot_point_modes(modes: Modes, *, count: int | None = None) -> Figure:
     Raises:
         ValueError: modes of another domain, or points without positions.
     """
-    net = frame_net(modes.domain)
-    moves, size = net.moves(modes), np.ptp(net.rest, axis=0).max()
-    count = min(count or modes.n_modes, modes.n_modes)
+    return _net_panels(frame_net(modes.domain), modes, min(count or modes.n_modes, modes.n_modes))
+
+
+def plot_scattered_modes(modes: SampledModes, *, count: int) -> Figure:
+    """Shapes at sensors on a plate, a panel a mode, each sensor at the phase in which most of them are largest."""
+    phase = np.exp(-0.5j * np.angle(np.sum(modes.shapes**2, axis=0)))
+    turned = replace(modes, shapes=modes.shapes * phase)
+    return _net_panels(scattered_net(modes.positions), turned, min(count, modes.n_modes))
+
+
+def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
+    moves, size = net.moves(modes).real, np.ptp(net.rest, axis=0).max()
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     figure, grid = new_figure(rows, columns, width=2.8 * columns, height=0.4 + 2.8 * rows, squeeze=False)

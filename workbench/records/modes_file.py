@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import Floats
 from workbench.records import hdf5_file, mat_file, npz_file, uff_modes
 from workbench.records.limits import RecordFileError, check_size, unreadable
 from workbench.structure.domain import NamedPoints
@@ -81,7 +82,15 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
             f"{path} needs `shapes` (n_points, n_modes) and `frequencies_hz` or `omega`; it holds"
             f" {', '.join(sorted(arrays)) or 'nothing'}"
         )
-    omega = np.ravel(arrays["omega"] if "omega" in arrays else 2.0 * np.pi * arrays["frequencies_hz"])
+    given = "omega" if "omega" in arrays else "frequencies_hz"
+    frequencies = np.ravel(arrays[given]).astype(float)
+    if not (np.isfinite(frequencies) & (frequencies >= 0)).all():
+        r = int(np.argmin(np.isfinite(frequencies) & (frequencies >= 0)))
+        raise RecordFileError(
+            f"{path}: {given} must be finite and not negative; of mode {r + 1} it is {frequencies[r]:.6g};"
+            " leave out modes that are unstable"
+        )
+    omega = frequencies if given == "omega" else 2.0 * np.pi * frequencies
     shapes = np.asarray(arrays["shapes"])
     if np.iscomplexobj(shapes):
         raise RecordFileError(f"{path}: its shapes are complex; give the real normal modes")
@@ -89,7 +98,7 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
         raise RecordFileError(
             f"{path}: shapes must have shape (n_points, n_modes) with {omega.size} modes; it is {shapes.shape}"
         )
-    zeta = np.broadcast_to(np.ravel(arrays.get("damping_ratios", np.zeros(1))), omega.shape)
+    zeta = _one_a_mode(path, "damping_ratios", arrays.get("damping_ratios", 0.0), omega.size)
     order = np.argsort(omega, kind="stable")
     shapes = np.array(_scaled(path, shapes.astype(float), arrays)[:, order])
     shapes.flags.writeable = False
@@ -125,7 +134,7 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
                 f"{path}: modes {r + 1} and {s + 1} are not orthogonal with its mass matrix, by {between.max():.2g} of"
                 " their modal masses; are shapes and matrix of one model, in one order of points?"
             )
-        stated = np.broadcast_to(np.ravel(arrays.get("modal_mass", masses)).astype(float), (n_modes,))
+        stated = _one_a_mode(path, "modal_mass", arrays.get("modal_mass", masses), n_modes)
         wrong = np.abs(masses / np.where(stated > 0, stated, masses) - 1.0)
         if wrong.max() > ORTHOGONAL:
             r = int(wrong.argmax())
@@ -135,7 +144,7 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
                 " leave out modal_mass, or correct the matrix"
             )
     elif "modal_mass" in arrays:
-        masses = np.broadcast_to(np.ravel(arrays["modal_mass"]).astype(float), (n_modes,))
+        masses = _one_a_mode(path, "modal_mass", arrays["modal_mass"], n_modes)
     else:
         return shapes
     if not (masses > 0).all():
@@ -145,6 +154,16 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
             " read_modes(path, modal_mass=...), 1.0 where the shapes are mass-normalised"
         )
     return shapes / np.sqrt(masses)
+
+
+def _one_a_mode(path: Path, name: str, values: ArrayLike, n_modes: int) -> Floats:
+    """The same number of every mode, or one of each: (n_modes,)."""
+    found = np.ravel(np.asarray(values, float))
+    if found.size not in (1, n_modes):
+        raise RecordFileError(
+            f"{path}: {name} is one number, or one a mode: {n_modes} modes need as many; got {found.size}"
+        )
+    return np.broadcast_to(found, (n_modes,))
 
 
 def _points(path: Path, n: int, arrays: Mapping[str, np.ndarray]) -> NamedPoints:

@@ -350,6 +350,11 @@ class SampledModes(Printed):
         return self.positions.ndim == 1 and self.positions.dtype != object and not self.unplaced.any()
 
     @property
+    def is_over(self) -> bool:
+        """Whether every sensor has a known place on a plate."""
+        return self.positions.ndim == 2 and not self.unplaced.any()
+
+    @property
     def poles(self) -> Complexes:
         """Upper-half-plane poles (n_modes,): -ζω + iω√(1-ζ²), rad/s."""
         return -self.zeta * self.omega + 1j * self.omega * np.sqrt(np.maximum(1.0 - self.zeta**2, 0.0))

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.linalg import eigh
 
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
 from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
@@ -18,7 +18,8 @@ def attach(
     """The modes with masses, springs and dampers attached, by Rayleigh-Ritz in the modes at hand.
 
     Exact for dampers; for masses and springs as good as the modes at hand span the changed shapes (`truncation_error`).
-    Damping ratios stay with the modes, in order. Where profiles or matrices are known, solve anew instead.
+    Damping ratios stay with the modes, in order; a damping matrix that couples them is that of dampers, and stays with
+    the structure. Where profiles or matrices are known, solve anew instead.
 
     Args:
         modes: as many as the changed shapes take.
@@ -53,8 +54,11 @@ def attach(
         _check_stable(eigenvalues)
         vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
         omega = np.sqrt(np.maximum(eigenvalues, 0.0))
-        # a rigid mode has no ratio: what damps it stays as it is
-        damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
+        if modes.proportional:
+            # a rigid mode has no ratio: what damps it stays as it is
+            damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
+        else:
+            damping = vectors.T @ modes.damping @ vectors
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
     for part in extra_damping:
@@ -153,6 +157,8 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
 
 def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
     """Shapes (n_directions, n_modes) of what an attachment moves by: a mass moves in every direction of its node."""
+    if isinstance(part, PointMass) and isinstance(part.at, Between):
+        raise ValueError(f"{part}: a mass stands at one point; give it at each of the two")
     if isinstance(part, PointMass) and isinstance(modes.domain, NamedPoints) and derivative == 0:
         return modes.phi(modes.domain.translations(str(part.at)))
     return modes.phi_at(part.at, derivative)[None, :]

@@ -4,11 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import eigh
 
 from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.structural import modes_of
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
+from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
 from workbench.structure.supports import Edge, PointMass, PointSpring
 
@@ -79,3 +83,24 @@ def test_a_plate_has_the_modes_that_a_model_left_out(edges, monkeypatch):
         np.testing.assert_allclose(full.omega, exact.omega[:count], rtol=1e-4)
         np.testing.assert_allclose(full.zeta, 0.01)
     assert not solved, "a search has no time for a solution of each count"
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_a_damper_is_as_strong_whichever_effect_was_found_first(order):
+    rng = np.random.default_rng(11)
+    omega, zeta, (m, c, factor) = np.array([9.0, 20.0, 31.0, 55.0]), 0.01, (0.4, 0.7, 1.2)
+    shapes = rng.normal(size=(3, 4))
+    points = NamedPoints(("p", "q", "r"))
+    rig = Rig(Modes(omega=omega, damping=np.full(4, zeta), shapes=PointShapes(shapes), domain=points), (), ())
+    effects = [
+        Effect(kind_named("point_damper"), None, {"at": Between("p", "q"), "coefficient": c}),
+        Effect(kind_named("point_mass"), None, {"at": "r", "mass": m}),
+        Effect(kind_named("modulus_error"), None, {"factor": factor}),
+    ]
+    poles = np.linalg.eigvals(apply_all(rig, [effects[i] for i in order]).modes.state_matrix)
+    # the same by hand: modes of the heavier structure keep their ratios, and the damper acts on them
+    values, vectors = eigh(np.diag(factor * omega**2), np.eye(4) + m * np.outer(shapes[2], shapes[2]))
+    felt = (shapes[0] - shapes[1]) @ vectors
+    damping = np.diag(2.0 * zeta * np.sqrt(values)) + c * np.outer(felt, felt)
+    expected = np.linalg.eigvals(np.block([[np.zeros((4, 4)), np.eye(4)], [-np.diag(values), -damping]]))
+    np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(expected), rtol=1e-9)

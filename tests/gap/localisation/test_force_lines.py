@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 
-from workbench.gap.localisation.force_lines import CoupledReceptances, UncoupledReceptances, receptances_of
+from workbench.gap.localisation.force_lines import (
+    CoupledReceptances,
+    UncoupledReceptances,
+    lines_of,
+    receptances_of,
+    screened,
+)
 from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -88,3 +94,29 @@ def test_products_are_those_of_what_is_read(receptances):
     kept = weights > 0.5
     own, along = receptances.on(kept).products(left[kept], weights[kept])
     assert np.allclose(along, 2.0 * np.einsum("slp,l,ls->p", tail[:, kept].conj(), weights[kept], left[kept]).real)
+
+
+def test_a_force_is_found_whose_response_the_sampling_folds_down(hinged_rig):
+    places = (0.31, 0.7, 1.1, 1.53, 1.83)
+    sensors = tuple(Sensor(f"a{i}", x, "acceleration") for i, x in enumerate(places))
+    rig = replace(hinged_rig(), sensors=sensors)
+    rig = replace(rig, modes=rig.structure.modes(6))
+    modes, n, finer = rig.modes, 6, 40
+    dt = 2.0 * np.pi / (1.3 * modes.omega[4])  # the last modes lie above half the sample rate
+    a = np.block([[np.zeros((n, n)), np.eye(n)], [-np.diag(modes.omega**2), -modes.damping]])
+    shape, read = modes.phi(0.83)[0], modes.phi(places)
+    b = np.r_[np.zeros(n), shape]
+    held = expm(np.block([[a, b[:, None]], [np.zeros((1, 2 * n + 1))]]) * dt / finer)
+    force = np.random.default_rng(4).normal(size=SAMPLES * finer // 8).repeat(8)  # jumps between the samples
+    x, readings = np.zeros(2 * n), []
+    for i, g in enumerate(force):
+        if i % finer == 0:
+            readings.append(read @ (a[n:] @ x + shape * g))
+        x = held[:-1, :-1] @ x + held[:-1, -1] * g
+    residual, noise = np.array(readings).T, np.full(5, 1e-3 * np.std(readings))
+    (lines,) = lines_of(rig, sampled_model(modes, sensors, noise, dt), [residual], dt)
+    assert lines.misfit(shape) < 0.02 * lines.power
+    others = np.array([modes.phi(x)[0] for x in (0.2, 0.5, 0.7, 0.83, 0.95, 1.2, 1.6)])
+    misfits = np.array([lines.misfit(other) for other in others])
+    assert misfits.argmin() == 3 and np.sort(misfits)[1] > 5.0 * misfits[3]
+    assert screened(lines, others).argmin() == 3

@@ -222,6 +222,8 @@ class Kind:
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.
         stands: effect, rig -> its place where no parameter holds it, and what the sentence calls it.
         first: whether it changes the nominal model itself, before any other effect acts on it.
+        last: whether it acts on modes as all other effects have made them: where modes keep their damping ratios, a
+            damper there before a mass would be of another strength.
     """
 
     name: str
@@ -247,6 +249,7 @@ class Kind:
     second_channel: str = "with"
     joined: str = " and "
     first: bool = False
+    last: bool = False
     known: ClassVar[WeakValueDictionary[int, "Kind"]] = WeakValueDictionary()  # by identity: none is equal to another
 
     def __post_init__(self) -> None:
@@ -324,7 +327,7 @@ def key_of(effects: Iterable[Effect]) -> tuple[str, ...]:
 
 
 def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
-    """The rig with every effect in it, in order, errors of the nominal model before all others."""
-    for effect in sorted(effects, key=lambda e: not e.kind.first):
+    """The rig with every effect in it, in order, errors of the nominal model before all others and dampers after."""
+    for effect in sorted(effects, key=lambda e: (e.kind.last, not e.kind.first)):
         rig = effect.apply(rig)
     return rig

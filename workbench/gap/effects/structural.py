@@ -293,6 +293,7 @@ POINT_DAMPER = Kind(
     apply=solved_once(lambda rig, _, v: _with_attachment(rig, PointDamper(place_of(v), v["coefficient"]))),
     starts=_point_starts("coefficient", "velocity", _typical_damping),
     phrase="a viscous damper to ground",
+    last=True,
     force_laws={"velocity": lambda v, u: -v["coefficient"] * u},
 )
 

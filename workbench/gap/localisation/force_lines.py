@@ -8,6 +8,9 @@ with g, the force there, any number at all; d is the state at the start of the r
 lines. What no g accounts for is noise where x is right. A line counts by how far the force stands out of the noise in
 it, with weights that do not depend on x: a wrong idea of the force's spectrum then costs precision, and biases nothing.
 
+Where modes lie above half the sample rate and accelerations are read, a force between the samples rings them, and the
+sampling folds that onto lines below: r = Σ_k h(x, ω + k ω_s) g_k, with each g_k any number at all.
+
 Velocities of a state are in units of the modes' own, so that no column of T is far larger than another.
 
 Projections on one unknown source: Stoica & Nehorai, IEEE Trans. Acoust. Speech Signal Process. 37 (1989) 720.
@@ -207,11 +210,13 @@ class Lines:
         receptances: of the rig, to forces and to states at the ends.
         left: (n_lines, n_sensors) the residual; its noise has unit variance.
         weights: (n_lines,).
+        folded: of the rig, to forces whose frequencies are folded onto the lines, one for each fold.
     """
 
     receptances: Receptances
     left: np.ndarray
     weights: np.ndarray
+    folded: tuple[Receptances, ...]
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
@@ -221,7 +226,7 @@ class Lines:
     def freedom(self) -> int:
         """Values that stay noise once a force, of any law, and the ends are accounted for."""
         n_lines, n_sensors = self.left.shape
-        return int(max(2 * n_lines * (n_sensors - 1) - self._products[1].size, 0))
+        return int(max(2 * n_lines * (n_sensors - 1 - len(self.folded)) - self._products[1].size, 0))
 
     @cached_property
     def power(self) -> float:
@@ -231,19 +236,30 @@ class Lines:
     def weighted(self, weights: np.ndarray) -> "Lines":
         """The lines by other weights (n_lines,), without those that count for nothing."""
         kept = weights > LINES.counting
-        return Lines(self.receptances.on(kept), self.left[kept], weights[kept])
+        return self._on(kept, weights[kept])
+
+    def strongest(self, most: int) -> "Lines":
+        """At most so many lines, those of the most power."""
+        strong = np.argsort(-self.weights * np.sum(np.abs(self.left) ** 2, axis=1))[:most]
+        return self._on(strong, self.weights[strong])
+
+    def _on(self, kept: np.ndarray, weights: np.ndarray) -> "Lines":
+        folded = tuple(each.on(kept) for each in self.folded)
+        return Lines(self.receptances.on(kept), self.left[kept], weights, folded)
 
     def misfit(self, shape: np.ndarray) -> float:
         """Sum of squares that a force leaves where the modes have that shape (n_modes,)."""
-        u, a, _ = self._along(shape)
         root = np.sqrt(self.weights)
-        a = a * root
-        end, along = self._end(u * root[:, None], a)
+        seen = [self._along(direction) for direction in self._directions(shape)]
+        u, a = np.concatenate([u * root[:, None] for u, _ in seen]), np.concatenate([a * root for _, a in seen])
+        end, along = self._end(u, a)
         return self.power - 2.0 * float(np.sum(np.abs(a) ** 2)) - float(along @ end)
 
     def force_share(self, shape: np.ndarray) -> np.ndarray:
         """Share (n_lines,) of a force there in what is read along it: the weight of each line."""
-        u, a, power = self._along(shape)
+        h = self.receptances.to_force(shape)
+        power: Floats = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
+        u, a = self._along(h / np.sqrt(power)[:, None])
         share, sure = np.ones_like(power), np.ones_like(power)
         for _ in range(LINES.rounds):
             root = np.sqrt(share)
@@ -262,12 +278,16 @@ class Lines:
         along = along - real_product(u, a)
         return np.linalg.lstsq(own - real_product(u, u), along, rcond=1e-12)[0], along
 
-    def _along(self, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The tail and the residual along the reading of a force, and that reading's power."""
-        h = self.receptances.to_force(shape)
-        power = np.maximum(np.sum(np.abs(h) ** 2, axis=1), 1e-300)
-        h = (h / np.sqrt(power)[:, None]).conj()
-        return self.receptances.along(h), np.sum(h * self.left, axis=1), power
+    def _directions(self, shape: np.ndarray) -> list[np.ndarray]:
+        """Orthonormal directions (n_lines, n_sensors) that a force of any law is read along."""
+        h = np.stack([each.to_force(shape) for each in (self.receptances, *self.folded)], axis=2)
+        h = h / np.sqrt(np.maximum(np.sum(np.abs(h) ** 2, axis=1, keepdims=True), 1e-300))
+        return [h[:, :, 0]] if not self.folded else list(np.moveaxis(np.linalg.qr(h)[0], 2, 0))
+
+    def _along(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The tail and the residual along a direction."""
+        along = direction.conj()
+        return self.receptances.along(along), np.sum(along * self.left, axis=1)
 
 
 def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
@@ -275,14 +295,21 @@ def screened(lines: Lines, shapes: np.ndarray) -> np.ndarray:
 
     The ends of the record are left out, and lines where little is read.
     """
-    strong = np.argsort(-lines.weights * np.sum(np.abs(lines.left) ** 2, axis=1))[: LINES.screened]
-    power = lines.power
-    lines = Lines(lines.receptances.on(strong), lines.left[strong], lines.weights[strong])
-    to_force = np.moveaxis(np.array([lines.receptances.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
-    left = np.full(len(shapes), power)
-    for h, r, weight in zip(to_force, lines.left, lines.weights, strict=True):
-        seen = h @ shapes.T
-        left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2 / np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300)
+    left, lines = np.full(len(shapes), lines.power), lines.strongest(LINES.screened)
+    to_force = [
+        np.moveaxis(np.array([each.to_force(mode) for mode in np.eye(shapes.shape[1])]), 0, 2)
+        for each in (lines.receptances, *lines.folded)
+    ]
+    for *through, r, weight in zip(*to_force, lines.left, lines.weights, strict=True):
+        directions: list[Complexes] = []
+        for h in through:
+            seen = h @ shapes.T
+            for _ in range(2 if directions else 0):  # once more takes away what rounding left
+                for other in directions:
+                    seen = seen - other * np.sum(other.conj() * seen, axis=0)
+            seen = seen / np.sqrt(np.maximum(np.sum(np.abs(seen) ** 2, axis=0), 1e-300))
+            left -= 2.0 * weight * np.abs(r.conj() @ seen) ** 2
+            directions.append(seen)
     return left
 
 
@@ -301,15 +328,28 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
         sample_time: s.
     """
     noise = np.sqrt(model.noise_variance)
-    made: dict[int, tuple[np.ndarray, Receptances]] = {}
+    made: dict[int, tuple[np.ndarray, list[Receptances]]] = {}
     lines = []
     for residual in residuals:
         n = residual.shape[1]
         if n not in made:
             top = max(int(0.5 * LINES.top * n), 2)
             taken = np.arange(1, top, 1 + top // LINES.most_lines)
-            made[n] = taken, receptances_of(rig, model, 2.0 * np.pi * taken / (n * sample_time), n, sample_time)
-        taken, receptances = made[n]
+            rates = 2.0 * np.pi / sample_time * np.array([0, *_folds(rig, sample_time)])
+            omega = 2.0 * np.pi * taken / (n * sample_time)
+            made[n] = taken, [receptances_of(rig, model, omega + rate, n, sample_time) for rate in rates]
+        taken, (receptances, *folded) = made[n]
         left = np.fft.rfft(residual, axis=1)[:, taken].T / noise
-        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size)))
+        lines.append(Lines(receptances, left / np.sqrt(n), np.ones(taken.size), tuple(folded)))
     return lines
+
+
+def _folds(rig: Rig, sample_time: float) -> list[int]:
+    """By how many times the sample rate the frequencies of forces differ that are folded onto lines: -1, 1, -2, ...
+
+    As far up as there are modes, where accelerations are read, and as the sensors can tell apart; displacements and
+    velocities hardly follow a force so quick.
+    """
+    _, orders = reading_of(rig)
+    folds = min(int(rig.modes.omega[-1] * sample_time / np.pi), (len(orders) - 1) // 2) if (orders == 2).any() else 0
+    return [(-1) ** k * ((k + 1) // 2) for k in range(1, folds + 1)]

@@ -53,10 +53,11 @@ workbench.move = function (root, spec) {
   // a net: spots of a plate or a frame, moved in the plane of the picture; responses side by side, modes over each other
   var net = spec.net;
   function spun(track, phase, frame) {
-    var c = Math.cos(phase), moves = track.moves;
+    var c = Math.cos(phase), s = Math.sin(phase), moves = track.moves, behind = track.imaginary;
     if (modes && !moves[mode]) return null;
     return net.rest.map(function (p, i) {
-      if (modes) return [p[0] + c * moves[mode][i][0], p[1] + c * moves[mode][i][1]];
+      if (modes && !behind) return [p[0] + c * moves[mode][i][0], p[1] + c * moves[mode][i][1]];
+      if (modes) return [p[0] + c * moves[mode][i][0] - s * behind[mode][i][0], p[1] + c * moves[mode][i][1] - s * behind[mode][i][1]];
       for (var u = p[0], v = p[1], r = 0; r < moves.length; r++) { u += moves[r][i][0] * track.modal[r][frame]; v += moves[r][i][1] * track.modal[r][frame]; }
       return [u, v];
     });
