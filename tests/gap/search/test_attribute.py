@@ -1,4 +1,4 @@
-"""What explains records, beside a rig that was itself identified."""
+"""What explains records: beside a rig that was itself identified, and of numbers that do not stand out alone."""
 
 from dataclasses import replace
 
@@ -10,8 +10,9 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import IdentifiedPrior
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.attribute import beside_identified
+from workbench.gap.search.attribute import _as_it_stands, beside_identified
 from workbench.gap.search.fit import fit
+from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
@@ -53,3 +54,21 @@ def test_a_mass_that_stood_for_an_error_of_the_identified_frequency_is_left_out(
     assert alone.effects[1].values["mass"] > 0.008, "without the doubt it stands for the error"
     found = beside_identified(search, alone, IdentifiedPrior.of_modes(nominal), ())
     assert sorted(e.kind.name for e in found.effects if not e.kind.first) == kinds
+
+
+def test_friction_far_below_its_smoothing_speed_is_a_damper():
+    """Of a damper of 0.3 N s/m the records tell the ratio of force and speed alone, and neither stands out."""
+    nominal = identified(OMEGA)
+    damper = Effect(kind_named("point_damper"), None, {"at": "y", "coefficient": 0.3})
+    rng = np.random.default_rng(4)
+    clean = simulate(damper.apply(nominal), rng.normal(size=(1, 600)), sample_time=0.05, name="test")
+    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
+    data = FitData((record,), np.array([NOISE]))
+    before = data.by_channel(data.residual(nominal))
+    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    friction = Effect(kind_named("coulomb_friction"), None, {"at": "y", "force": 30.0, "smoothing_speed": 100.0})
+    found = with_intervals(nominal, fit(nominal, (friction,), data), data)
+    assert found.effects[0].kind is friction.kind and not found.effects[0].stands_out(nominal)
+    (told,) = _as_it_stands(search, found, (), 0.0).effects
+    assert told.kind is damper.kind
+    assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.deviations["coefficient"])

@@ -231,8 +231,12 @@ def _viscous(friction: Effect, _: Rig) -> tuple[Effect, ...]:
 
 
 def _is_sudden(friction: Effect) -> bool:
-    """Whether its smoothing speed is too small for the records to tell it from none."""
-    return bool(friction.deviations.get("smoothing_speed", 0.0) > friction.values["smoothing_speed"])
+    """Whether its smoothing speed is too small for the records to tell it from none.
+
+    Where it is too large for them they tell the force as little, for it is a damper then.
+    """
+    unsure = {name for name, deviation in friction.deviations.items() if deviation > friction.values[name]}
+    return "smoothing_speed" in unsure and not any(name.startswith("force") for name in unsure)
 
 
 def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
-from workbench.gap.effects.limiting_cases import each_left_out
+from workbench.gap.effects.limiting_cases import each_left_out, simpler_forms
 from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_step
 from workbench.gap.localisation.evidence import Evidence
@@ -232,9 +232,8 @@ def attribute(
         best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
         best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
         if outcome == "explained":
-            standing = tuple(e for e in best.effects if e in seen or _stands_out(within, best, e))
-            best = best.only(search.rig, standing)
-            outcome = outcome if any(not e.kind.first for e in standing) else "none"
+            best = _as_it_stands(within, best, seen, logged)
+            outcome = outcome if any(not e.kind.first for e in best.effects) else "none"
     if noise is None:
         noise = noise_of(search, best) if random is None else search.data.noise
     report("done", 1.0)
@@ -255,14 +254,29 @@ def attribute(
     )
 
 
-def _stands_out(search: Search, best: Fit, effect: Effect) -> bool:
-    """Whether a number of an effect stands out of its deviation, or all of them together do: what the records need."""
-    if effect.stands_out(search.rig):
-        return True
-    data, others = search.data.stepped(SELECTION.fine), [e for e in best.effects if e is not effect]
-    without = fit(search.rig, others, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
-    with_it = cost_of(search.rig, best.effects, data)
-    return search.tells_apart(with_it, without.cost, max(best.n_parameters - without.n_parameters, 0))
+def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
+    """The fit without effects of which no number stands out of its deviation, or with such a one as a limiting case.
+
+    Where the records need it all the same, they tell two of its numbers together alone: friction far below its
+    smoothing speed is a damper, a hysteretic spring that always slides is friction.
+    """
+    data, rig = search.data.stepped(SELECTION.fine), search.rig
+
+    def again(effects: Sequence[Effect]) -> Fit:
+        return fit(rig, effects, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
+
+    for effect in best.effects:
+        if effect in seen or effect.stands_out(rig):
+            continue
+        others = [e for e in best.effects if e is not effect and e not in seen]
+        here = cost_of(rig, best.effects, data)
+        simpler = [again(others), *(again((*others, form)) for form in simpler_forms(effect, rig))]
+        for fewer in sorted(simpler, key=lambda f: f.n_parameters):
+            if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
+                fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)
+                settled = (e.kind.settled(e) for e in fewer.effects)
+                return _as_it_stands(search, replace(fewer, effects=(*seen, *settled)), seen, logged)
+    return best
 
 
 def beside_identified(search: Search, best: Fit, identified: IdentifiedPrior, seen: Sequence[Effect]) -> Fit:

@@ -459,7 +459,7 @@ class Stepwise:
         """The sets, fitted to all records where they may be as good as the best, which was fitted to all of them."""
         if not self.explains(best):
             return list(quickly)
-        near = STEPWISE.near * best.fit.cost
+        near = max(STEPWISE.near * best.fit.cost, STEPWISE.least * self._gap)
         return self.search.workers.map(
             lambda s: fit_jointly(self.search, s.effects, s.errors, rounds=2) if s.fit.cost < near else s,
             list(quickly),
