@@ -31,6 +31,7 @@ Report = Callable[[str, float], None]
 
 PAYS = 0.005  # of the loss: what a step must take away
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
+SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
 MORE_COST = 0.01  # of the present one's: what counts as no more
 
@@ -137,7 +138,7 @@ class Redesign:
         if not both.any():
             return np.inf, np.inf
         costs = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (new, old))
-        works = (np.abs(p.work[both]).sum(axis=1) for p in (new, old))
+        works = (p.all_work[both] for p in (new, old))
         cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
 
@@ -161,7 +162,10 @@ class Redesign:
         """The redesign in one sentence."""
         old, new = self.present_proof, self.proof
         unstable = old.n_draws - int(old.stable.sum())
-        effort = interval(new.effort)[0] / max(interval(old.effort)[0], 1e-300)
+        effort, work = (
+            interval(after)[0] / max(interval(before)[0], 1e-300)
+            for before, after in ((old.effort, new.effort), (old.all_work, new.all_work))
+        )
         if old.share_stable < 0.5:
             text = f"the present controller is unstable on {_of(unstable, old.n_draws)} draws; redesigned, it "
             text += self._does(new, "95 %: ")
@@ -169,6 +173,7 @@ class Redesign:
             text = f"the present controller {self._does(old, '95 %: ')}"
             text += f", unstable on {unstable} draws" if unstable else ""
             text += f"; redesigned: {self._does(new, '', named=False)}, {_times(effort)} effort"
+            text += "" if _times(work) == _times(1.0) else f" and {_times(work)} work"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
         text += f" {self.left_undamped}" if self.left_undamped else ""
         text += "" if self.pays else f" {self._kept}"
@@ -437,28 +442,28 @@ def _compensated(
         if pays:
             kept.append(name)
             best, now = trial, step
-    # a limit holds the effort down: more gain wins vibration back for it
+    # a limit holds the effort down: more gain wins vibration back for it, and a slower filter keeps residual modes,
+    # which the readings carry and a limited force cannot follow, out of the commands
     bounded = any(np.isfinite(named(rig.actuators, a.name).limit) for a in loop.law.actuators)
-    tunings = [("gain", "weight", WEIGHTS), ("estimator", "noise", SPEEDS)]
-    for name, setting, factors in tunings if bounded else tunings[1:]:
-        for factor in factors:
-            try:
-                other = tuned(loop, rig, setting, factor)
-            except DesignError:
-                continue  # none is that fast
-            if other is None:
-                break
-            trial = compensated(rig, other, test.sample_time, kept)
-            step = tried(name, f"{setting} taken as {factor:g} times what was designed for", trial)
-            if name == "gain":
-                pays = step.loss < now.loss - PAYS
-            else:  # no trade: no part may be worse than under the present controller and before
-                bearable = np.maximum(now.excess, steps[0].excess)
-                pays = step.cost < now.cost - PAYS and step.loss <= now.loss and bool((step.excess <= bearable).all())
-            if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
-                steps = [*(s for s in steps if s.name != name), step]
-                best, now, chosen = trial, step, other
-        loop = chosen
+    gains = [("gain", weight, noise) for noise in SLOWER for weight in WEIGHTS] if bounded else []
+    for name, weight_by, noise_by in (*gains, *(("estimator", 1.0, noise) for noise in SPEEDS)):
+        try:
+            other = tuned(chosen if name == "estimator" else loop, rig, weight=weight_by, noise=noise_by)
+        except DesignError:
+            continue  # none is that fast
+        if other is None:
+            continue
+        trial = compensated(rig, other, test.sample_time, kept)
+        step = tried(name, _tuning(weight_by, noise_by), trial)
+        if name == "gain":
+            pays = step.loss < now.loss - PAYS
+        else:  # no trade: no part may be worse than under the present controller and before
+            bearable = np.maximum(now.excess, steps[0].excess)
+            pays = step.cost < now.cost - PAYS and step.loss <= now.loss and bool((step.excess <= bearable).all())
+        if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
+            steps = [*(s for s in steps if s.name != name), step]
+            best, now, chosen = trial, step, other
+    loop = chosen
     removed: list[str] = []
     for name in _faulty(rig, loop):
         try:
@@ -473,6 +478,12 @@ def _compensated(
             removed.append(name)
             best, now = trial, step
     return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight
+
+
+def _tuning(weight: float, noise: float) -> str:
+    """By what a law and its filter were tuned, in words."""
+    said = [f"{what} taken as {by:g} times" for what, by in (("weight", weight), ("noise", noise)) if by != 1]
+    return f"{' and '.join(said)} what was designed for"
 
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
