@@ -29,9 +29,12 @@ from workbench.threads import one_blas_thread
 
 Report = Callable[[str, float], None]
 
+AWAY = 1e3  # a loss from which on the motion is said to diverge
 PAYS = 0.005  # of the loss: what a step must take away
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
+SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the forces of a law that is unstable as it is designed: weight over its own
+SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # of the readings of its Kalman filter: noise over its own
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
 MORE_COST = 0.01  # of the present one's: what counts as no more
 
@@ -63,6 +66,16 @@ class Step:
     loss: float
     cost: float
     kept: bool
+
+    @property
+    def diverges(self) -> bool:
+        """Whether the motion grows so far that a loss in per cent says nothing."""
+        return not self.loss < AWAY
+
+    @property
+    def lost(self) -> str:
+        """The loss in words."""
+        return "diverges" if self.diverges else f"{100.0 * self.loss:.3g} %"
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,13 +189,15 @@ class Redesign:
             text += "" if _times(work) == _times(1.0) else f" and {_times(work)} work"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
         text += f" {self.left_undamped}" if self.left_undamped else ""
-        text += "" if self.pays else f" {self._kept}"
+        text += "" if self.pays and not self._neither else f" {self._kept}"
         return text if self.possible.explained else f"{text} {self._promise}"
 
     @property
     def _kept(self) -> str:
         """Why the present controller stays."""
         old, new = self.present_proof, self.proof
+        if self._neither:
+            return self._neither
         if new.stable.sum() < old.stable.sum():
             why = "it is stable on more draws"
         elif self._better and np.isfinite(self._over).all():
@@ -190,6 +205,18 @@ class Redesign:
         else:
             why = "the new one costs no less and settles no sooner"
         return f"Keep the present controller: {why}."
+
+    @property
+    def _neither(self) -> str:
+        """That no controller is to be used, and what can be done; empty where one is stable on most of the draws."""
+        old, new = self.present_proof, self.proof
+        if max(old.share_stable, new.share_stable) >= 0.5:
+            return ""
+        return (
+            f"Use neither controller: the present one is stable on {_of(int(old.stable.sum()), old.n_draws)} draws, the"
+            f" redesigned on {int(new.stable.sum()):,}; weight the forces more, make the estimator slower, control"
+            " fewer modes, or read more sensors."
+        )
 
     def _does(self, proof: Verification, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
@@ -204,10 +231,11 @@ class Redesign:
     @property
     def advice(self) -> str:
         """Which controller to use, and what it does after the test."""
-        if not self.pays:
+        if not self.pays or self._neither:
             return self._kept
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
-        forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
+        told = np.isfinite(forces).all() and self.present_proof.share_stable >= 0.5
+        forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if told else ""
         return (
             f"Use the redesigned controller: it {self._difference('the present one')}{forced} (medians of the draws)."
         )
@@ -412,6 +440,7 @@ def _compensated(
     perfect = replace(
         rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
     )
+    loop, softened = _stabilised(perfect, loop, test)
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
     weight = force_weight(ideal, loop.law.controlled)
     optimum = max(2.0 * _vibration(ideal) + weight * ideal.effort, 1e-300)
@@ -428,7 +457,7 @@ def _compensated(
     best = compensated(rig, loop, test.sample_time, ())
     steps = [
         tried("present", f"{present.name}, as it is", present),
-        tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig", best),
+        tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig{softened}", best),
     ]
     now, chosen = steps[-1], loop
     for name in STEPS:
@@ -480,9 +509,38 @@ def _compensated(
     return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight
 
 
+def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
+    """The loop, and in words by what it is slower or softer than designed where only so it is stable on a rig.
+
+    Of the tunings that are, the one under which all modes vibrate least; the loop as it is where none is.
+    """
+
+    def vibration(one: Loop | None) -> float:
+        if one is None:
+            return np.inf
+        controller = compensated(rig, one, test.sample_time, ())
+        unstable = loop_poles(rig, controller, loop.modes).spectral_radius >= 1.0
+        return np.inf if unstable else _vibration(run_loop(rig, controller, test))
+
+    def designed(weight: float, noise: float) -> Loop | None:
+        try:
+            return tuned(loop, rig, weight=weight, noise=noise)
+        except DesignError:
+            return None  # none is that slow
+
+    if np.isfinite(vibration(loop)):
+        return loop, ""
+    for weight in SOFTER:
+        trials = [(vibration(one), one, noise) for noise in SLOWEST if (one := designed(weight, noise)) is not None]
+        least, best, noise = min(trials, key=lambda trial: trial[0], default=(np.inf, None, 1.0))
+        if best is not None and np.isfinite(least):
+            return best, f", {_tuning(weight, noise)}: otherwise unstable"
+    return loop, ""
+
+
 def _tuning(weight: float, noise: float) -> str:
     """By what a law and its filter were tuned, in words."""
-    said = [f"{what} taken as {by:g} times" for what, by in (("weight", weight), ("noise", noise)) if by != 1]
+    said = [f"{what} taken as {by:.3g} times" for what, by in (("weight", weight), ("noise", noise)) if by != 1]
     return f"{' and '.join(said)} what was designed for"
 
 

@@ -62,8 +62,8 @@ def redesign_page(
         ("On the same samples: median (95 % interval)", ("", "present", "redesigned"), _figures(found)),
         (
             "Steps",
-            ("step", "what", "loss [%]", "kept"),
-            [(s.name, s.what, f"{100.0 * s.loss:.3g}", "yes" if s.kept else "no") for s in found.steps],
+            ("step", "what", "loss", "kept"),
+            [(s.name, s.what, s.lost, "yes" if s.kept else "no") for s in found.steps],
         ),
     ]
     used = found.proof if found.pays else found.present_proof
