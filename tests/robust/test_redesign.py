@@ -200,6 +200,15 @@ def test_on_off_control_is_told_by_its_settling(rig):
     assert "settles in" in found.sentence and found.steps[-1].loss < 0.1 * found.steps[0].loss
 
 
+def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
+    """Each of them pushes with a given force, so that the less effort of one that does nothing is no merit."""
+    law = plain_law("on-off", rig, 2, impulse_at=0.8, impulse=0.5)
+    sticking = possible(rig, effect("actuator_dead_zone", "all", width=0.9 * max(r.force for r in law.relays)))
+    found = redesign(sticking, law, test=LoopTest(2500, DT, 0.8, 0.5, seed=0), draws=2, placement=False)
+    assert found.after.effort > 1.5 * found.before.effort and found.weight == 0.0
+    assert found.pays and found.advice.startswith("Use the redesigned controller: it settles in")
+
+
 def test_moving_the_actuators_is_offered_where_it_pays(rig):
     law = imsc(rig.modes, 2, rig.actuators, weight=0.5)
     found = redesign(possible(rig, effect("modulus_error", factor=0.8)), law, sample_time=DT, impulse_at=0.8, draws=2)

@@ -55,7 +55,7 @@ def plot_steps(result: Redesign) -> Figure:
     for i, step in enumerate(result.steps):
         ax.text(losses[i], i, f"  {step.lost}", va="center", fontsize=8)
     ax.set_yticks(range(len(names)), names)
-    ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.15 * max(*losses, 1e-6)))
+    ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.25 * max(*losses, 1e-6)))
     ax.set_xlabel("vibration and effort above the ideal [%]")
     return figure
 

@@ -92,7 +92,7 @@ class Redesign:
         before, after: the present and the redesigned controller on the corrected rig under test.
         present_proof, proof: both on the same draws.
         weight: ρ of the cost J = 2 ∫ energy dt + ρ ∫ FᵀF dt, whose terms are equal over the controlled modes where
-            actuators and sensors are perfect.
+            actuators and sensors are perfect; 0 for on-off control.
         more_cost, more_work: shares by which the redesigned controller may cost more, J, and do more work, W, than the
             present one.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
@@ -152,7 +152,8 @@ class Redesign:
             return np.inf, np.inf
         costs = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (new, old))
         works = (p.all_work[both] for p in (new, old))
-        cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
+        with np.errstate(divide="ignore", invalid="ignore"):  # a controller that does nothing does no work
+            cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
 
     @property
@@ -233,12 +234,12 @@ class Redesign:
         """Which controller to use, and what it does after the test."""
         if not self.pays or self._neither:
             return self._kept
+        difference = self._difference("the present one")
+        if self.present_proof.share_stable < 0.5:
+            return f"Use the redesigned controller: it {difference}."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
-        told = np.isfinite(forces).all() and self.present_proof.share_stable >= 0.5
-        forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if told else ""
-        return (
-            f"Use the redesigned controller: it {self._difference('the present one')}{forced} (medians of the draws)."
-        )
+        forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
+        return f"Use the redesigned controller: it {difference}{forced} (medians of the draws)."
 
     def _difference(self, other: str) -> str:
         """What the redesigned controller does better than the present one, in words."""
@@ -442,7 +443,8 @@ def _compensated(
     )
     loop, softened = _stabilised(perfect, loop, test)
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
-    weight = force_weight(ideal, loop.law.controlled)
+    # relays have forces of a given size, which nothing is traded for: they are judged by vibration and settling alone
+    weight = 0.0 if isinstance(loop.law, OnOffLaw) else force_weight(ideal, loop.law.controlled)
     optimum = max(2.0 * _vibration(ideal) + weight * ideal.effort, 1e-300)
 
     def tried(name: str, what: str, controller: DigitalController) -> Step:
