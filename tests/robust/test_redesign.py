@@ -166,6 +166,15 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
     assert back.pays or pays or stable == [True, True], "more stable draws come first"
 
 
+def test_a_gain_of_nothing_is_no_reason_to_change_the_controller(rig, controller):
+    sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    present, proofs = told([True, True], [1.0, 1.0], [-1.0, -1.0]), {}
+    for less in (0.001, 0.02):
+        proofs[less] = told([True, True], [1.0 - less] * 2, [-1.0, -1.0])
+    found = [replace(sure, present_proof=present, proof=proof, weight=0.0) for proof in proofs.values()]
+    assert [one.advice.split(":")[0] for one in found] == ["Either controller does", "Use the redesigned controller"]
+
+
 def test_the_ends_of_an_interval_are_told_apart(rig, controller):
     sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     near, far = (

@@ -30,7 +30,7 @@ from workbench.threads import one_blas_thread
 Report = Callable[[str, float], None]
 
 AWAY = 1e3  # a loss from which on the motion is said to diverge
-PAYS = 0.005  # of the loss: what a step must take away
+PAYS = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
 SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the forces of a law that is unstable as it is designed: weight over its own
@@ -237,6 +237,8 @@ class Redesign:
         difference = self._difference("the present one")
         if self.present_proof.share_stable < 0.5:
             return f"Use the redesigned controller: it {difference}."
+        if 1.0 - self._over[0] < PAYS and _settles(self.proof) == _settles(self.present_proof):
+            return f"Either controller does: the redesigned {difference} (medians of the draws)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
         return f"Use the redesigned controller: it {difference}{forced} (medians of the draws)."
