@@ -87,6 +87,7 @@ def plant(index, seed, searched=False):
         told[name] = {
             "stable": run.stable,
             "work": float(np.abs(run.work).sum()),
+            "work put in": float(np.maximum(run.work, 0.0).sum()),
             "vibration": run.vibration,
             "effort": run.effort,
             "cost": 2.0 * run.vibration + weight * run.effort,
@@ -179,6 +180,8 @@ def report(outcome, rows):
     )
     within = [row for row in rows if row["nominal"]["stable"] and row["no more work"]["stable"]]
     asked = np.array([row["no more work"]["work"] / row["nominal"]["work"] for row in within])
+    more = [_more_work(row) for row, over in zip(before, harder, strict=True) if over > 1 + WORSE]
+    outcome.table(f"plants on which the redesign does over {100 * WORSE:g} % more work than the nominal design", more)
     unstable = [row for row in rows if not row["nominal"]["stable"]]
     lost = [row for row in rows if not row["redesigned"]["stable"]]
     inside = np.array([row["inside the bands"] for row in rows if row["inside the bands"] is not None])
@@ -193,6 +196,14 @@ def report(outcome, rows):
     )
     most = {"cost": worse.max(), "work": harder.max(), "work, where no more is allowed": asked.max()}
     outcome.table("over the nominal design, most", most)
+    outcome.say(
+        f"On {len(more)} the redesign does over {100 * WORSE:g} % more work than the nominal design;"
+        f" on {sum(row['work'][1] > 1 + WORSE for row in more)} of them so does the design on the true effects. It"
+        f" leaves {min((row['vibration'] for row in more), default=1.0):.3f} to"
+        f" {max((row['vibration'] for row in more), default=1.0):.3f} times the vibration, for"
+        f" {min((row['cost'] for row in more), default=1.0):.3f} to"
+        f" {max((row['cost'] for row in more), default=1.0):.3f} times the cost."
+    )
     outcome.check("plants that ended in an error", PLANTS - len(rows), 0)
     away = abs(ratios["work"] - 1.0)
     outcome.check("redesign over the design on the true effects, work: median away from one", away, 0.05)
@@ -201,6 +212,8 @@ def report(outcome, rows):
     for what, over in (("costs", worse), ("is asked for no more work and does", asked)):
         words = f"{what} over {100 * WORSE:g} % more {'work ' * (over is asked)}than the nominal design"
         outcome.check(f"plants on which the redesign {words}", int((over > 1 + WORSE).sum()), 0)
+    wasted = sum(row["vibration"] > 1.0 for row in more)
+    outcome.check("plants of those with more work on which it leaves more vibration", wasted, 0)
     spoilt = [row for row in lost if row["nominal"]["stable"]]
     outcome.check("plants that the nominal design keeps stable and the redesign does not", len(spoilt), 0)
     outcome.check("share of readings inside the 95 % bands", inside.mean(), 0.90, at_least=True)
@@ -208,6 +221,19 @@ def report(outcome, rows):
     outcome.figure(
         "cost", _figure(rows), "Cost of each hidden plant under both controllers, over that of the design on the truth."
     )
+
+
+def _more_work(row):
+    """Work, what of it goes into modes, vibration and cost over those of the nominal design; work of the truth too."""
+    nominal, redesigned, best = (row[name] for name in ("nominal", "redesigned", "true"))
+    return {
+        "kinds": row["kinds"],
+        "work": [one["work"] / nominal["work"] for one in (redesigned, best)],
+        "taken out": (redesigned["work"] - redesigned["work put in"]) / (nominal["work"] - nominal["work put in"]),
+        "put in": redesigned["work put in"] / max(nominal["work put in"], 1e-300),
+        "vibration": redesigned["vibration"] / nominal["vibration"],
+        "cost": redesigned["cost"] / nominal["cost"],
+    }
 
 
 def _told(outcome, result) -> bool:

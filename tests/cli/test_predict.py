@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.cases.case import Case
+from workbench.cases.case import Case, read_case
 from workbench.cases.writing import write_case
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
@@ -73,7 +73,7 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
         (("check", "late", "low"), "was fitted, so it is no test"),
         (("predict", "late", "nothing.csv"), "neither a file nor a record of the case, which are low"),
         (("check", "late", "friday.csv", "--log", "friday.csv"), "friday.csv is no log of tests"),
-        (("predict", "late", "friday.csv", "--draws", "3"), "need 40 draws or more"),
+        (("predict", "late", "friday.csv", "--draws", "3"), "greater than or equal to 40"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(run, case, arguments, said):
@@ -81,3 +81,23 @@ def test_what_cannot_be_is_said_in_one_line(run, case, arguments, said):
     assert done.exit_code == 2
     assert said in done.stderr and len(done.stderr.strip().splitlines()) == 1
     assert not (case / "late" / "tests.csv").exists()
+
+
+@pytest.mark.slow
+def test_a_verdict_that_is_made_on_the_way_is_kept(run, case):
+    done = run("check", "late", "friday.csv", "--draws", 40)
+    assert done.exit_code == 0, done.output
+    kept = json.loads((case / "out" / "late-verdict.json").read_text())
+    assert [e["kind"] for e in kept["posterior"]["effects"]] == ["actuator_delay"]
+    assert "--verdict out/late-verdict.json the next command need not diagnose" in " ".join(done.stderr.split())
+    again = run("check", "late", "friday.csv", "--draws", 40, "--verdict", "out/late-verdict.json")
+    assert again.output.splitlines()[0] == done.stdout.splitlines()[0]
+
+
+def test_what_is_wired_wrongly_is_said_before_it_is_diagnosed(run, case):
+    read = read_case(case / "late")
+    turned = tuple(replace(r, outputs=r.outputs * np.array([[1.0], [-1.0]])) for r in read.fit)
+    write_case(replace(read, fit=turned), case / "turned")
+    refused = run("predict", case / "turned", "friday.csv")
+    assert refused.exit_code == 2
+    assert "d1 has the sign turned: multiply by -1; correct the case" in refused.stderr and not (case / "out").exists()

@@ -1,5 +1,6 @@
 """The controller that options describe: law, modes and estimator, for `export` and `redesign` alike."""
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,7 +12,7 @@ if TYPE_CHECKING:
     from workbench.rig.rig import Rig
     from workbench.structure.domain import Where
 
-ESTIMATORS = ("luenberger", "kalman")
+ESTIMATORS = ("luenberger", "kalman", "modal-filter")
 DAMPING = 0.1  # unless given
 
 LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
@@ -62,12 +63,14 @@ def law_from(
 def observed(
     rig: "Rig", law: "Law | OnOffLaw", estimator: str, *, disturbance: float, sample_time: float
 ) -> "Controller":
-    """The law on an observer of all outputs that read motion or rate.
+    """The law on an observer of all outputs that read motion or rate, or through a modal filter of those that do both.
 
     Raises:
         ValueError: an estimator that is none, a law that switches, or no such output.
     """
+    from workbench.design.estimation.controller import filtered
     from workbench.design.estimation.observers import kalman, luenberger
+    from workbench.design.estimation.surface_filter import filter_on
     from workbench.design.laws.law import Law
     from workbench.design.spillover.comparison import OBSERVER_POLES
     from workbench.rig.sensors import MEASURED
@@ -81,6 +84,17 @@ def observed(
     sensors = [s for s in rig.sensors if MEASURED[s.quantity][1] < 2]
     if not sensors:
         raise ValueError("every output is an acceleration; an observer needs motion or rates, so add a sensor")
+    if estimator == "modal-filter":
+        rates = {s.at for s in sensors if s.quantity == "velocity"}
+        places = [s.at for s in sensors if s.quantity == "displacement" and s.at in rates]
+        if not places:
+            raise ValueError(
+                "a modal filter reads displacement and velocity at the same places, which no two outputs do; add"
+                " outputs, or take an observer"
+            )
+        found = filtered(law, filter_on(rig.structure, rig.modes, law.controlled, places))
+        own = [next(s for s in sensors if (s.at, s.quantity) == (one.at, one.quantity)) for one in found.sensors]
+        return replace(found, sensors=tuple(own))
     if estimator == "luenberger":
         return luenberger(rig.modes, law, sensors, poles=OBSERVER_POLES * rig.modes.omega[list(law.controlled)])
     # a noise of variance σ² held over each sample has the intensity σ² T

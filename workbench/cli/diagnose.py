@@ -1,12 +1,12 @@
 """`workbench diagnose`: where simulation and test disagree, and why."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from workbench.cli.possible import write_verdict
 from workbench.cli.terminal import JsonPath, PagePath, guarded, names_in, progress_bar, reporter, say, short
 
 SHOWN_RIVALS = 3
@@ -51,10 +51,9 @@ def diagnose(
     from workbench.gap.effects.effect import COORDINATES
     from workbench.gap.report.verdict import place_in_words
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
-    from workbench.robust.posterior import UncertainRig
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page
-    from workbench.study.runs.whole_file import check_target, write_whole
+    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     if (case is None) == (nominal is None):
@@ -107,8 +106,7 @@ def diagnose(
     for note in verdict.notes:
         say(f"  {note}")
     if json_path is not None:
-        shown["posterior"] = UncertainRig.of(verdict).to_json()
-        write_whole(json_path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
+        write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")
     target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)
     say(f"  page       {short(target)}")

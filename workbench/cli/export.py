@@ -20,7 +20,7 @@ def export(
     weight: LawWeight = None,
     damping: Damping = None,
     estimator: Annotated[
-        str, typer.Option(metavar="|".join(ESTIMATORS), help="Observer that the law acts on.")
+        str, typer.Option(metavar="|".join(ESTIMATORS), help="Observer or modal filter that the law acts on.")
     ] = ESTIMATORS[0],
     disturbance: Disturbance = 1.0,
     computing_delay_ms: Annotated[

@@ -9,11 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import typer
 
+from workbench.cli.terminal import errors, short
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 
 if TYPE_CHECKING:
     from workbench.cases.case import Case
+    from workbench.gap.report.verdict import Verdict
     from workbench.robust.posterior import UncertainRig
     from workbench.robust.prediction import Prediction
 
@@ -27,16 +29,45 @@ Workers = Annotated[int | None, typer.Option(help="Processes that share the diag
 def possible_rig(
     case: "Case", verdict: Path | None, *, workers: int | None, report: Callable[[str, float], None]
 ) -> "tuple[UncertainRig, tuple[float, ...] | None]":
-    """The uncertain rig of a case, and the noise (n_outputs,) that its diagnosis found; from a verdict where given."""
-    from workbench.gap.diagnose import diagnose
+    """The uncertain rig of a case, and the noise (n_outputs,) that its diagnosis found; from a verdict where given.
+
+    A verdict that is made here is kept as out/NAME-verdict.json.
+
+    Raises:
+        ValueError: no verdict of this case, or channels that are certainly exchanged or turned.
+    """
+    from workbench.gap.diagnose import SECONDS, diagnose
+    from workbench.gap.report.wiring import check_kept_apart, wiring
     from workbench.robust.posterior import UncertainRig
 
     if verdict is not None:
         return read_verdict(verdict, case.rig)
+    check_kept_apart(case.fit, case.validation)
+    kept = Path("out") / f"{case.name}-verdict.json"
+    for fault in wiring(case.rig, case.fit):
+        if fault.certain:
+            raise ValueError(
+                f"{fault.sentence.rstrip('.')}; correct the case, or go on as it is by `workbench diagnose CASE"
+                f" --as-wired --json {kept.name}`, and give that file as --verdict"
+            )
+    errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
     found = diagnose(
         case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report
     )  # fmt: skip
+    write_verdict(found, kept)
+    errors.print(f"  {found.sentence}")
+    errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")
     return UncertainRig.of(found), found.budget.noise_found or None
+
+
+def write_verdict(verdict: "Verdict", path: Path) -> None:
+    """Write a verdict with its uncertainty as JSON, as `read_verdict` reads it."""
+    from workbench.robust.posterior import UncertainRig
+    from workbench.study.runs.whole_file import write_whole
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    shown = verdict.to_json() | {"posterior": UncertainRig.of(verdict).to_json()}
+    write_whole(path, json.dumps(shown, indent=1, allow_nan=False) + "\n")
 
 
 def predicted(

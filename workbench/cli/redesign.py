@@ -28,7 +28,7 @@ def redesign(
     damping: Damping = None,
     estimator: Annotated[
         str | None,
-        typer.Option(metavar="|".join(ESTIMATORS), help="Observer in use; a Kalman filter tuned to it unless given."),
+        typer.Option(metavar="|".join(ESTIMATORS), help="Estimator in use; a Kalman filter tuned to it unless given."),
     ] = None,
     disturbance: Disturbance = 1.0,
     rate_hz: Annotated[
@@ -103,7 +103,7 @@ def redesign(
     say(result.sentence, bold=True)
     table = Table("step", "what", "loss", "kept", box=None, pad_edge=False)
     for step in result.steps:
-        table.add_row(step.name, step.what, f"{100 * step.loss:.3g} %", "yes" if step.kept else "no")
+        table.add_row(step.name, step.what, step.lost, "yes" if step.kept else "no")
     console.print(table)
     if result.relocation is not None:
         say(f"  {result.relocation.sentence}")

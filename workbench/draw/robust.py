@@ -19,7 +19,8 @@ def plot_redesign(result: Redesign) -> Figure:
     figure, (left, right) = new_figure(1, 2, width=10, height=4.2, width_ratios=(2, 1))
     time = result.test.time
     both = (("present", result.present_proof, OLD), ("redesigned", result.proof, NEW))
-    top = max(float(p.energy[0].max()) for _, p, _ in both if np.isfinite(p.energy[0]).any())
+    # after an impulse both begin at the same energy; one that diverges leaves the figure at its top
+    top = min(float(p.energy[0].max()) for _, p, _ in both)
     for name, proof, colour in both:
         middle, low, high = np.clip(proof.energy / max(top, 1e-300), 1e-9, 1e3)
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
@@ -47,20 +48,14 @@ def plot_steps(result: Redesign) -> Figure:
     """What each step leaves of the loss against perfect actuators and sensors."""
     figure, ax = new_figure(width=9, height=1.2 + 0.45 * len(result.steps))
     names = [step.name + ("" if step.kept else " (left out)") for step in result.steps]
-    most = max((s.loss for s in result.steps if np.isfinite(s.loss)), default=1.0)
+    most = max((s.loss for s in result.steps if not s.diverges), default=1.0)
     losses = [100.0 * min(step.loss, 3.0 * max(most, 0.1)) for step in result.steps]
     colours = [OLD if step.name == "present" else NEW if step.kept else GREY for step in result.steps]
     ax.barh(range(len(names)), losses, color=colours)
     for i, step in enumerate(result.steps):
-        ax.text(
-            losses[i],
-            i,
-            f"  {100.0 * step.loss:.3g} %" if np.isfinite(step.loss) else "  diverges",
-            va="center",
-            fontsize=8,
-        )
+        ax.text(losses[i], i, f"  {step.lost}", va="center", fontsize=8)
     ax.set_yticks(range(len(names)), names)
-    ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.15 * max(*losses, 1e-6)))
+    ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.25 * max(*losses, 1e-6)))
     ax.set_xlabel("vibration and effort above the ideal [%]")
     return figure
 

@@ -249,25 +249,29 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
     return Loop(modes, law, controller)
 
 
-def tuned(loop: Loop, rig: Rig, setting: str, factor: float) -> Loop | None:
-    """The loop designed for a multiple of a setting; None where its design has no such setting.
+def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> Loop | None:
+    """The loop designed for multiples of its settings; None where its design has no such setting.
 
     Args:
         loop: as it is.
         rig: whose actuators and sensors are taken, by name.
-        setting: "weight" of the law's forces, or "noise" of the readings of a Kalman filter.
-        factor: by which it is multiplied.
+        weight: of the law's forces, over its own.
+        noise: of the readings of a Kalman filter, over its own.
 
     Raises:
-        DesignError: nothing can be designed with it.
+        DesignError: nothing can be designed with them.
     """
-    name = "law" if setting == "weight" else "controller"
-    part: Any = getattr(loop, name)
-    keywords = getattr(part.designed_by, "keywords", {})
-    if setting not in keywords:
-        return None
-    other = partial(part.designed_by.func, **{**keywords, setting: factor * np.asarray(keywords[setting])})
-    return designed_anew(loop._replace(**{name: replace(part, designed_by=other)}), rig, loop.modes)
+    parts: dict[str, Any] = {}
+    for name, setting, factor in (("law", "weight", weight), ("controller", "noise", noise)):
+        part: Any = getattr(loop, name)
+        keywords = getattr(part.designed_by, "keywords", {})
+        if factor == 1.0:
+            continue
+        if setting not in keywords:
+            return None
+        other = partial(part.designed_by.func, **{**keywords, setting: factor * np.asarray(keywords[setting])})
+        parts[name] = replace(part, designed_by=other)
+    return designed_anew(loop._replace(**parts), rig, loop.modes)
 
 
 def _estimated(

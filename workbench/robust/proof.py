@@ -71,6 +71,11 @@ class Verification:
         return np.asarray(self.damping.min(axis=1))
 
     @property
+    def all_work(self) -> np.ndarray:
+        """W (n_draws,) = Σ_r |W_r|."""
+        return np.asarray(np.abs(self.work).sum(axis=1))
+
+    @property
     def controlled_work(self) -> np.ndarray:
         """W_C (n_draws,)."""
         return np.asarray(self.work[:, list(self.controlled)].sum(axis=1))

@@ -29,8 +29,12 @@ from workbench.threads import one_blas_thread
 
 Report = Callable[[str, float], None]
 
-PAYS = 0.005  # of the loss: what a step must take away
+AWAY = 1e3  # a loss from which on the motion is said to diverge
+PAYS = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
+SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
+SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the forces of a law that is unstable as it is designed: weight over its own
+SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # of the readings of its Kalman filter: noise over its own
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
 MORE_COST = 0.01  # of the present one's: what counts as no more
 
@@ -63,6 +67,16 @@ class Step:
     cost: float
     kept: bool
 
+    @property
+    def diverges(self) -> bool:
+        """Whether the motion grows so far that a loss in per cent says nothing."""
+        return not self.loss < AWAY
+
+    @property
+    def lost(self) -> str:
+        """The loss in words."""
+        return "diverges" if self.diverges else f"{100.0 * self.loss:.3g} %"
+
 
 @dataclass(frozen=True, eq=False)
 class Redesign:
@@ -78,7 +92,7 @@ class Redesign:
         before, after: the present and the redesigned controller on the corrected rig under test.
         present_proof, proof: both on the same draws.
         weight: ρ of the cost J = 2 ∫ energy dt + ρ ∫ FᵀF dt, whose terms are equal over the controlled modes where
-            actuators and sensors are perfect.
+            actuators and sensors are perfect; 0 for on-off control.
         more_cost, more_work: shares by which the redesigned controller may cost more, J, and do more work, W, than the
             present one.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
@@ -137,8 +151,9 @@ class Redesign:
         if not both.any():
             return np.inf, np.inf
         costs = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (new, old))
-        works = (np.abs(p.work[both]).sum(axis=1) for p in (new, old))
-        cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
+        works = (p.all_work[both] for p in (new, old))
+        with np.errstate(divide="ignore", invalid="ignore"):  # a controller that does nothing does no work
+            cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
 
     @property
@@ -161,7 +176,10 @@ class Redesign:
         """The redesign in one sentence."""
         old, new = self.present_proof, self.proof
         unstable = old.n_draws - int(old.stable.sum())
-        effort = interval(new.effort)[0] / max(interval(old.effort)[0], 1e-300)
+        effort, work = (
+            interval(after)[0] / max(interval(before)[0], 1e-300)
+            for before, after in ((old.effort, new.effort), (old.all_work, new.all_work))
+        )
         if old.share_stable < 0.5:
             text = f"the present controller is unstable on {_of(unstable, old.n_draws)} draws; redesigned, it "
             text += self._does(new, "95 %: ")
@@ -169,15 +187,18 @@ class Redesign:
             text = f"the present controller {self._does(old, '95 %: ')}"
             text += f", unstable on {unstable} draws" if unstable else ""
             text += f"; redesigned: {self._does(new, '', named=False)}, {_times(effort)} effort"
+            text += "" if _times(work) == _times(1.0) else f" and {_times(work)} work"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
         text += f" {self.left_undamped}" if self.left_undamped else ""
-        text += "" if self.pays else f" {self._kept}"
+        text += "" if self.pays and not self._neither else f" {self._kept}"
         return text if self.possible.explained else f"{text} {self._promise}"
 
     @property
     def _kept(self) -> str:
         """Why the present controller stays."""
         old, new = self.present_proof, self.proof
+        if self._neither:
+            return self._neither
         if new.stable.sum() < old.stable.sum():
             why = "it is stable on more draws"
         elif self._better and np.isfinite(self._over).all():
@@ -185,6 +206,18 @@ class Redesign:
         else:
             why = "the new one costs no less and settles no sooner"
         return f"Keep the present controller: {why}."
+
+    @property
+    def _neither(self) -> str:
+        """That no controller is to be used, and what can be done; empty where one is stable on most of the draws."""
+        old, new = self.present_proof, self.proof
+        if max(old.share_stable, new.share_stable) >= 0.5:
+            return ""
+        return (
+            f"Use neither controller: the present one is stable on {_of(int(old.stable.sum()), old.n_draws)} draws, the"
+            f" redesigned on {int(new.stable.sum()):,}; weight the forces more, make the estimator slower, control"
+            " fewer modes, or read more sensors."
+        )
 
     def _does(self, proof: Verification, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
@@ -199,13 +232,16 @@ class Redesign:
     @property
     def advice(self) -> str:
         """Which controller to use, and what it does after the test."""
-        if not self.pays:
+        if not self.pays or self._neither:
             return self._kept
+        difference = self._difference("the present one")
+        if self.present_proof.share_stable < 0.5:
+            return f"Use the redesigned controller: it {difference}."
+        if 1.0 - self._over[0] < PAYS and _settles(self.proof) == _settles(self.present_proof):
+            return f"Either controller does: the redesigned {difference} (medians of the draws)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
-        return (
-            f"Use the redesigned controller: it {self._difference('the present one')}{forced} (medians of the draws)."
-        )
+        return f"Use the redesigned controller: it {difference}{forced} (medians of the draws)."
 
     def _difference(self, other: str) -> str:
         """What the redesigned controller does better than the present one, in words."""
@@ -407,8 +443,10 @@ def _compensated(
     perfect = replace(
         rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
     )
+    loop, softened = _stabilised(perfect, loop, test)
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
-    weight = force_weight(ideal, loop.law.controlled)
+    # relays have forces of a given size, which nothing is traded for: they are judged by vibration and settling alone
+    weight = 0.0 if isinstance(loop.law, OnOffLaw) else force_weight(ideal, loop.law.controlled)
     optimum = max(2.0 * _vibration(ideal) + weight * ideal.effort, 1e-300)
 
     def tried(name: str, what: str, controller: DigitalController) -> Step:
@@ -423,7 +461,7 @@ def _compensated(
     best = compensated(rig, loop, test.sample_time, ())
     steps = [
         tried("present", f"{present.name}, as it is", present),
-        tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig", best),
+        tried("law and estimator", f"{loop.controller.name}, designed for the corrected rig{softened}", best),
     ]
     now, chosen = steps[-1], loop
     for name in STEPS:
@@ -437,28 +475,28 @@ def _compensated(
         if pays:
             kept.append(name)
             best, now = trial, step
-    # a limit holds the effort down: more gain wins vibration back for it
+    # a limit holds the effort down: more gain wins vibration back for it, and a slower filter keeps residual modes,
+    # which the readings carry and a limited force cannot follow, out of the commands
     bounded = any(np.isfinite(named(rig.actuators, a.name).limit) for a in loop.law.actuators)
-    tunings = [("gain", "weight", WEIGHTS), ("estimator", "noise", SPEEDS)]
-    for name, setting, factors in tunings if bounded else tunings[1:]:
-        for factor in factors:
-            try:
-                other = tuned(loop, rig, setting, factor)
-            except DesignError:
-                continue  # none is that fast
-            if other is None:
-                break
-            trial = compensated(rig, other, test.sample_time, kept)
-            step = tried(name, f"{setting} taken as {factor:g} times what was designed for", trial)
-            if name == "gain":
-                pays = step.loss < now.loss - PAYS
-            else:  # no trade: no part may be worse than under the present controller and before
-                bearable = np.maximum(now.excess, steps[0].excess)
-                pays = step.cost < now.cost - PAYS and step.loss <= now.loss and bool((step.excess <= bearable).all())
-            if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
-                steps = [*(s for s in steps if s.name != name), step]
-                best, now, chosen = trial, step, other
-        loop = chosen
+    gains = [("gain", weight, noise) for noise in SLOWER for weight in WEIGHTS] if bounded else []
+    for name, weight_by, noise_by in (*gains, *(("estimator", 1.0, noise) for noise in SPEEDS)):
+        try:
+            other = tuned(chosen if name == "estimator" else loop, rig, weight=weight_by, noise=noise_by)
+        except DesignError:
+            continue  # none is that fast
+        if other is None:
+            continue
+        trial = compensated(rig, other, test.sample_time, kept)
+        step = tried(name, _tuning(weight_by, noise_by), trial)
+        if name == "gain":
+            pays = step.loss < now.loss - PAYS
+        else:  # no trade: no part may be worse than under the present controller and before
+            bearable = np.maximum(now.excess, steps[0].excess)
+            pays = step.cost < now.cost - PAYS and step.loss <= now.loss and bool((step.excess <= bearable).all())
+        if pays and loop_poles(rig, trial, loop.modes).spectral_radius < 1.0:
+            steps = [*(s for s in steps if s.name != name), step]
+            best, now, chosen = trial, step, other
+    loop = chosen
     removed: list[str] = []
     for name in _faulty(rig, loop):
         try:
@@ -473,6 +511,41 @@ def _compensated(
             removed.append(name)
             best, now = trial, step
     return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight
+
+
+def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
+    """The loop, and in words by what it is slower or softer than designed where only so it is stable on a rig.
+
+    Of the tunings that are, the one under which all modes vibrate least; the loop as it is where none is.
+    """
+
+    def vibration(one: Loop | None) -> float:
+        if one is None:
+            return np.inf
+        controller = compensated(rig, one, test.sample_time, ())
+        unstable = loop_poles(rig, controller, loop.modes).spectral_radius >= 1.0
+        return np.inf if unstable else _vibration(run_loop(rig, controller, test))
+
+    def designed(weight: float, noise: float) -> Loop | None:
+        try:
+            return tuned(loop, rig, weight=weight, noise=noise)
+        except DesignError:
+            return None  # none is that slow
+
+    if np.isfinite(vibration(loop)):
+        return loop, ""
+    for weight in SOFTER:
+        trials = [(vibration(one), one, noise) for noise in SLOWEST if (one := designed(weight, noise)) is not None]
+        least, best, noise = min(trials, key=lambda trial: trial[0], default=(np.inf, None, 1.0))
+        if best is not None and np.isfinite(least):
+            return best, f", {_tuning(weight, noise)}: otherwise unstable"
+    return loop, ""
+
+
+def _tuning(weight: float, noise: float) -> str:
+    """By what a law and its filter were tuned, in words."""
+    said = [f"{what} taken as {by:.3g} times" for what, by in (("weight", weight), ("noise", noise)) if by != 1]
+    return f"{' and '.join(said)} what was designed for"
 
 
 def _faulty(rig: Rig, loop: Loop) -> list[str]:
