@@ -392,3 +392,27 @@ def test_a_record_too_short_for_a_mode_is_refused_in_one_line(tmp_path, samples,
         SAVE[ending](path, t=time, a=values)
     result = CliRunner().invoke(app, ["identify", str(path)])
     assert result.exit_code == 2 and f"has {samples} samples" in result.output, result.output
+
+
+def test_a_file_cut_short_is_no_shorter_record(tmp_path):
+    from nptdms import ChannelObject, TdmsWriter
+    from scipy.io import wavfile
+
+    values = np.sin(np.arange(2000) / 7.0)
+    wavfile.write(tmp_path / "whole.wav", 1000, values.astype(np.float32))
+    with TdmsWriter(tmp_path / "whole.tdms") as file:
+        file.write_segment([ChannelObject("group", "a", values, properties={"wf_increment": 1e-3})])
+    for whole, share in ((tmp_path / "whole.wav", 0.1), (tmp_path / "whole.tdms", 0.5)):
+        assert read_record(whole).n_samples == 2000
+        content, cut = whole.read_bytes(), whole.with_stem("cut")
+        cut.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(RecordFileError, match=r"Reached EOF prematurely|cut short"):
+            read_record(cut)
+
+
+@pytest.mark.parametrize("ending", [".asc", ".dat", ".tsv"])
+def test_text_of_instruments_has_many_endings(tmp_path, ending):
+    path = tmp_path / f"vibrometer{ending}"
+    path.write_text("Time (s)\tVelocity (mm/s)\n" + "\n".join(f"{k / 100:.2f}\t{k % 7}" for k in range(40)))
+    record = read_record(path)
+    assert record.outputs[0, 6] == pytest.approx(6e-3) and record.output_channels[0].quantity == "velocity"

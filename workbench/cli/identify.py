@@ -24,7 +24,7 @@ from workbench.cli.terminal import (
 @guarded
 def identify(
     records: Annotated[
-        list[Path], typer.Argument(help="Files of the same sensors: .csv, .txt, .npz, .mat, .h5, .uff.")
+        list[Path], typer.Argument(help="Files of the same sensors: .csv, .txt, .npz, .mat, .h5, .uff, .tdms, .wav.")
     ],
     modes: Annotated[int | None, typer.Option(help="Number of modes; estimated unless given.")] = None,
     sample_rate_hz: Annotated[

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.polynomial.legendre import legvander
+from scipy.fft import irfft
 
 from workbench.identification.free_decay.assumptions import (
     AmplitudeDependence,
@@ -14,11 +14,11 @@ from workbench.identification.free_decay.assumptions import (
 )
 from workbench.identification.free_decay.ibrahim import stabilise, stable_modes, stacked_delays
 from workbench.identification.free_decay.order import identify_within
-from workbench.identification.free_decay.preparation import HIGHEST_DEGREE, decay_start, without_drift
+from workbench.identification.free_decay.preparation import decay_start, without_drift, without_polynomial
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
-from workbench.identification.signal.projection import project
+from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import SECONDS, Budget, Progress
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes
@@ -224,12 +224,13 @@ def _check_undriven(record: Record) -> None:
     """
     # Drifts may be strong at both ends, and do not oscillate.
     n = record.n_samples
-    slow = np.linalg.qr(legvander(np.linspace(-1.0, 1.0, n), HIGHEST_DEGREE))[0]
-    about = record.outputs - (record.outputs @ slow) @ slow.T
-    about = about / np.maximum(about.std(axis=1, keepdims=True), 1e-300)
-    energy = [float((part**2).sum()) for part in np.array_split(about, 2, axis=1)]
-    power = (np.abs(np.fft.rfft(about, 2 * n, axis=1)) ** 2).sum(axis=0)
-    correlation = np.fft.irfft(power)[1:n] / (n - np.arange(1, n)) / len(about)
+    about = without_polynomial(record.outputs)
+    about /= np.maximum(about.std(axis=1, keepdims=True), 1e-300)
+    energy = [float(np.vdot(part, part)) for part in np.array_split(about, 2, axis=1)]
+    # In single precision: in double, the transforms of a long record are four times its size.
+    about = about.astype(np.float32)
+    correlation = irfft(_power(about, 2 * n), 2 * n)[1:n] / (n - np.arange(1, n)) / len(about)
+    forget_transforms(n)
     soon, late = (
         float(np.sqrt((part**2).mean())) for part in (correlation[: n // 20 + 1], correlation[n // 3 : n // 2])
     )
@@ -244,6 +245,14 @@ def _check_undriven(record: Record) -> None:
             f"record {record.name!r} is no free decay: it is as strong at its end as at its beginning, and not"
             f" correlated over its length. {WAY_OUT}"
         )
+
+
+def _power(rows: np.ndarray, size: int) -> np.ndarray:
+    """|·|² of the transforms of rows, padded to a length, summed over them."""
+    power = power_of(rows[0], size)
+    for row in rows[1:]:
+        power += power_of(row, size)
+    return power
 
 
 WAY_OUT = (
@@ -269,13 +278,15 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
     Noise of sensors is no larger there than beside.
     """
     for record, residual, noise in zip(records, left, refined.noise, strict=True):
-        scaled = ((part / noise[:, None]) for part in (residual, record.outputs))
-        power, motion = ((np.abs(np.fft.rfft(part, axis=1)[:, 1:]) ** 2).sum(axis=0) for part in scaled)
+        power, motion = (_power(part / noise[:, None], record.n_samples)[1:] for part in (residual, record.outputs))
         bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
-        away = np.abs(np.arange(1, power.size + 1)[:, None] - refined.modes.poles.imag / bin_width)
-        narrow = np.maximum(RING_DOWN.band, np.abs(refined.modes.poles.real) / bin_width)
-        inside = (away < narrow).any(axis=1)
-        beside = ((away > 2.0 * narrow) & (away < RING_DOWN.beside + narrow)).any(axis=1) & ~inside
+        inside, beside = np.zeros((2, power.size), bool)
+        for pole in refined.modes.poles:
+            away = np.abs(np.arange(1, power.size + 1) - pole.imag / bin_width)
+            narrow = max(RING_DOWN.band, abs(pole.real) / bin_width)
+            inside |= away < narrow
+            beside |= (away > 2.0 * narrow) & (away < RING_DOWN.beside + narrow)
+        beside &= ~inside
         share, whole = (float(power[k].sum() / motion[k].sum()) for k in (inside, slice(None)))
         level = np.median(power[beside]) if beside.any() else 0.0
         about = share > RING_DOWN.left_over and power[inside].mean() > RING_DOWN.stands_out * level
@@ -292,8 +303,8 @@ def _energy(refined: Refined, records: list[Record]) -> np.ndarray:
     """Of each mode in all records, (n_modes,), each output in units of its noise."""
     found = np.zeros(refined.modes.n_modes)
     for record, amplitudes, noise in zip(records, refined.amplitudes, refined.noise, strict=True):
-        decay = np.exp(2.0 * record.sample_time * np.outer(refined.modes.poles.real, np.arange(record.n_samples)))
-        found += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * decay.sum(axis=1)
+        lasts = power_sums(np.exp(2.0 * record.sample_time * refined.modes.poles.real), record.n_samples)[0].real
+        found += (np.abs(amplitudes / noise[:, None]) ** 2).sum(axis=0) * lasts
     return found
 
 
@@ -313,9 +324,9 @@ def _goes_on(refined: Refined, records: list[Record]) -> tuple[str, ...]:
 
 def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[str, ...]:
     """A remark where the residual is not white."""
-    about = sum(float(((r.outputs - r.outputs.mean(axis=1, keepdims=True)) ** 2).sum()) for r in records)
-    squares = sum(float((residual**2).sum()) for residual in left)
-    following = sum(float((residual[:, 1:] * residual[:, :-1]).sum()) for residual in left)
+    about = sum(float(r.outputs.var(axis=1).sum()) * r.n_samples for r in records)
+    squares = sum(float(row @ row) for residual in left for row in residual)
+    following = sum(float(row[1:] @ row[:-1]) for residual in left for row in residual)
     size = sum(residual.size for residual in left)
     if squares < 1e-12 * about or abs(following) < SURE * squares / np.sqrt(size):
         return ()

@@ -20,6 +20,9 @@ from workbench.records.transfer_functions import TransferFunctions, complex_colu
 FORMATS = {
     ".csv": csv_file,
     ".txt": csv_file,
+    ".asc": csv_file,
+    ".dat": csv_file,
+    ".tsv": csv_file,
     ".npz": npz_file,
     ".mat": mat_file,
     ".h5": hdf5_file,
@@ -40,7 +43,7 @@ def read_record(
     Units behind the names, `Acc [g]`, become SI, and unequal time steps equal ones: `Record.remarks` says so.
 
     Args:
-        path: of a .csv, .txt, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
+        path: of a .csv, .txt, .asc, .dat, .tsv, .npz, .mat, .h5, .hdf5, .uff, .unv, .tdms or .wav file.
         sample_rate_hz: where the file itself has no time.
         inputs: names of the signals that went in, where the file does not say.
         limits: of memory and processor time.

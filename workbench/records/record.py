@@ -177,18 +177,28 @@ class Record(Printed):
 
     def between(self, start: float | None = None, stop: float | None = None) -> "Record":
         """The samples with start <= time <= stop (s); the time axis is kept."""
-        time = self.time
-        slack = 1e-9 * self.sample_time
-        keep = (time >= (time[0] if start is None else start) - slack) & (
-            time <= (time[-1] if stop is None else stop) + slack
-        )
-        if not keep.any():
-            raise ValueError(
-                f"record {self.name!r} runs from {time[0]:g} to {time[-1]:g} s: nothing in {start}..{stop}"
-            )
+        slack, ends = 1e-9 * self.sample_time, (self._instant(0), self._instant(self.n_samples - 1))
+        first, last = 0, self.n_samples - 1
+        # Rounding may put the quotient on either side of a sample.
+        if start is not None and not start - slack <= ends[0]:
+            first = int(max(min(self.n_samples, (start - self.start_time) / self.sample_time), 1)) - 1
+            while first < self.n_samples and not self._instant(first) >= start - slack:
+                first += 1
+        if stop is not None and not stop + slack >= ends[1]:
+            last = int(max(-1.0, (stop - self.start_time) / self.sample_time)) + 1
+            while last >= 0 and not self._instant(last) <= stop + slack:
+                last -= 1
+        if first > last:
+            raise ValueError(f"record {self.name!r} runs from {ends[0]:g} to {ends[1]:g} s: nothing in {start}..{stop}")
+        if last - first == self.n_samples - 1:
+            return self
+        kept = slice(first, last + 1)
         return replace(
-            self, outputs=self.outputs[:, keep], inputs=self.inputs[:, keep], start_time=float(time[keep][0])
+            self, outputs=self.outputs[:, kept], inputs=self.inputs[:, kept], start_time=self._instant(first)
         )
+
+    def _instant(self, sample: int) -> float:
+        return float(self.start_time + self.sample_time * sample)
 
     def only(self, outputs: Sequence[str]) -> "Record":
         """The record with only the named outputs, in that order."""

@@ -19,6 +19,8 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     from nptdms import TdmsFile
 
     with TdmsFile.open(path) as file:
+        if file.file_status.incomplete_final_segment:
+            raise RecordFileError(f"{path} ends within its last segment: it was cut short, or is still being written")
         channels = [channel for group in file.groups() for channel in group.channels() if len(channel)]
         channels = [channel for channel in channels if channel.dtype.kind in "fiub"]
         check_counts(path, len(channels), sum(map(len, channels)), limits)

@@ -1,5 +1,6 @@
 """WAV: one channel a signal, as a share of full scale where the samples are whole numbers."""
 
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,9 @@ def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """The same; to be called in a process of its own."""
-    rate, samples = wavfile.read(path)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="Reached EOF prematurely")  # a file cut short is no shorter record
+        rate, samples = wavfile.read(path)
     samples = samples.reshape(samples.shape[0], -1)
     check_counts(path, samples.shape[1], samples.size + samples.shape[0], limits)
     if not rate > 0:

@@ -70,7 +70,7 @@ def test_the_spectrum_near_a_mode():
     """A random walk's successor, y_k = 0.9 y_k-1 + e_k: S(ω) ∝ 1 / |1 - 0.9 e^{-iωΔt}|²."""
     noise = lfilter([1.0], [1.0, -0.9], np.random.default_rng(3).standard_normal((60_000, 2)), axis=0)
     omega = np.array([0.5, 3.0, 20.0, 100.0])
-    factors = noise_near(-0.1 + 1j * omega, noise / noise.std(axis=0), 0.02)
+    factors = noise_near(-0.1 + 1j * omega, noise, noise.std(axis=0), 0.02)
     exact = (1 - 0.9**2) / np.abs(1 - 0.9 * np.exp(-0.02j * omega)) ** 2
     # mean of 15 bins and two outputs, or of more
     assert np.abs(factors.mean(axis=0) / exact - 1).max() < 0.4

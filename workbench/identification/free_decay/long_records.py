@@ -24,7 +24,7 @@ from scipy.stats import chi2
 
 from workbench.identification.free_decay.refinement import as_refined, in_coloured_noise, noise_level, search, unshaped
 from workbench.identification.signal.modal_estimates import Identified
-from workbench.identification.signal.projection import Projection
+from workbench.identification.signal.projection import Projection, forget_transforms
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
 from workbench.structure.modes import frozen
@@ -70,7 +70,8 @@ def identify_long(
     search_for, fruitless = _Search(records, false_alarm, budget or Budget()), 0
     for _ in range(LONG.most_rounds):
         before = search_for.poles.size
-        ended = fruitless >= LONG.most_fruitless or search_for.budget.spent("search for further modes")
+        # The first modes are worth the wait.
+        ended = fruitless >= LONG.most_fruitless or (before > 0 and search_for.budget.spent("search for further modes"))
         peaks = np.zeros(0) if ended else search_for.peaks()[: max(most_modes - before, 0)]
         if peaks.size:
             search_for.take_in(peaks)
@@ -196,7 +197,8 @@ class _Search:
         evidence = self.evidence()[np.argsort(np.abs(self.poles))]
         rejected = sorted(self.rejected, key=lambda pair: abs(pair[0]))
         noise = unshaped(np.array([pole for pole, _ in rejected], complex), self.records[0])
-        refined, tried = in_coloured_noise(refined, self.records), frozen([strength for _, strength in rejected])
+        refined = in_coloured_noise(refined, self.records, self.fits)
+        tried = frozen([strength for _, strength in rejected])
         return Identified(refined, frozen(evidence), self.limit, noise, tried, self.budget.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:
@@ -210,13 +212,20 @@ class _Search:
         found = np.zeros(size // 2 + 1, np.float32)
         for fit, weights in zip(self.fits, self.weights, strict=True):
             n = min(lives, len(fit.residual))
-            decay = np.exp(-rate * self.dt * np.arange(n))
-            scale = np.sqrt(2.0 / np.sum(decay**2)) * weights
+            # In single precision, and in place, as these fill the memory.
+            decay = np.exp(-rate * self.dt * np.arange(n, dtype=np.float32))
+            energy = np.expm1(-2.0 * rate * self.dt * n) / np.expm1(-2.0 * rate * self.dt)
+            scale = (np.sqrt(2.0 / energy) * weights).astype(np.float32)
             for first in range(0, weights.size, LONG.at_once):
                 some = slice(first, first + LONG.at_once)
-                left = (fit.residual[:n, some] * scale[some]).T.astype(np.float32) * decay.astype(np.float32)
-                spectrum = rfft(left, size, axis=1, workers=os.cpu_count())
-                found += (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
+                left = np.zeros((scale[some].size, size), np.float32)
+                left[:, :n] = fit.residual[:n, some].T
+                left[:, :n] *= scale[some, None]
+                left[:, :n] *= decay
+                spectrum = rfft(left, axis=1, workers=os.cpu_count())
+                forget_transforms(n)
+                found += np.einsum("jk,jk->k", spectrum.real, spectrum.real)
+                found += np.einsum("jk,jk->k", spectrum.imag, spectrum.imag)
         return found
 
     def _noise_ratio(self, pole: complex) -> float:

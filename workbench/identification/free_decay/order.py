@@ -50,6 +50,7 @@ class OrderSettings:
     most_weak: int = 2
     most_splits: int = 6
     least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
+    resolved: float = 1e-14  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
 
@@ -106,7 +107,10 @@ def identify_within(
     search_time = budget.share(SELECTION.search_share)
     problem, model = _selected(records, most, false_alarm, search_time)
     for _ in range(ORDER.whitened):
-        white = None if search_time.spent("whitening of the noise") else whitened(records, problem.oscillating(model))
+        # While modes are left the residual is no noise.
+        if search_time.unfinished or search_time.spent("whitening of the noise"):
+            break
+        white = whitened(records, problem.oscillating(model))
         if white is None:
             break
         problem, model = _selected(white, most, false_alarm, search_time, records)
@@ -241,6 +245,10 @@ class _FreeDecay:
     def report(self, model: _Model, records: Sequence[Record]) -> Identified:
         """The modes refined in the records as measured: filters cost the first samples, the strongest."""
         poles = model.poles
+        if self.budget.unfinished:  # perhaps before each mode was checked
+            spurious = self._spurious(poles, model)
+            poles = poles[~spurious] if not spurious.all() else poles
+            self.rejected += [(complex(pole), 0.0) for pole in model.poles if pole not in poles]
         refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
         while (lost := self._lost(poles, refined.modes.poles)).any() and not lost.all():
             poles = poles[~lost]
@@ -258,9 +266,12 @@ class _FreeDecay:
         )
 
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
-        """Which modes are no more where they were selected: what else is in a record than modes has drawn them off."""
-        away = np.abs(np.subtract.outer(poles, refined)).min(axis=1)
-        return np.asarray(away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width))
+        """Which modes are no more where they were selected: what else is in a record than modes has drawn them off,
+        or damps them too much to ring."""
+        away = np.abs(np.subtract.outer(poles, refined))
+        damped = (-refined.real > SELECTION.most_damped * np.abs(refined))[away.argmin(axis=1)]
+        away = away.min(axis=1)
+        return np.asarray(damped | (away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width)))
 
     def _fitted(self, poles: np.ndarray, weights: np.ndarray, most_steps: int = FIT.most_steps) -> _Model:
         """Poles after a search, sensors then weighted by the noise found in each record."""
@@ -362,8 +373,9 @@ class _Grid:
         dt, n = self.record.sample_time, residual.shape[0]
         weighted = residual * weights
         found = np.zeros(self.poles.shape)
-        near = self._beside(poles)
+        near = self._beside(poles) & self.allowed
         decays, sums, doubles, ends = self._of_length(n)
+        modes = _Span(np.exp(poles * dt), n)
         for k in range(self.rates.size):
             spectrum = np.fft.rfft(weighted * decays[k][:, None], self.size, axis=0)[self.columns]
             own = (np.abs(spectrum) ** 2).sum(axis=1)
@@ -372,7 +384,7 @@ class _Grid:
             whole = p.copy()
             at = near[k]
             if at.any():
-                dp, dq = self._shared(np.exp(poles * dt), w[at], ends[k, at], n)
+                dp, dq = modes.shared(w[at], ends[k, at])
                 p[at] -= dp
                 q[at] -= dq
             det = p**2 - np.abs(q) ** 2
@@ -390,22 +402,38 @@ class _Grid:
             )
         return near
 
-    @staticmethod
-    def _shared(z: np.ndarray, w: np.ndarray, end: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """The part of the Gram matrix [[p, q], [q*, p]] of (w^t, w*^t), w^n = end, in the span of the modes z."""
-        basis = np.r_[z, z.conj()].conj()
-        gram = _geometric(basis, basis.conj(), n, basis.conj() ** n)
-        first, second = _geometric(basis, w, n, end), _geometric(basis, w.conj(), n, end.conj())
-        solved = np.linalg.solve(gram, np.hstack([first, second]))
-        a, b = np.split(solved, 2, axis=1)
-        return (first.conj() * a).sum(axis=0).real, (first.conj() * b).sum(axis=0)
+
+class _Span:
+    """The span of Re z^t and Im z^t over n samples, z of the modes so far."""
+
+    def __init__(self, z: np.ndarray, n: int) -> None:
+        self.n, self.both = n, np.r_[z, z.conj()]
+        same, turned = np.split(_geometric(self.both, z, n, z**n), 2)
+        gram = np.block([[(turned + same).real, (same + turned).imag], [(same - turned).imag, (turned - same).real]])
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+        kept = values > ORDER.resolved * values.max(initial=0.0)
+        self.to_basis = vectors[:, kept].T * scale / np.sqrt(2.0 * values[kept, None])
+
+    def shared(self, w: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The part of the Gram matrix [[p, q], [q*, p]] of (w^t, w*^t), w^n = end, in this span.
+
+        With c = Q^T w^t, Q a real orthonormal basis, p = Σ |c|² and q = Σ c*².
+        """
+        one, other = np.split(_geometric(self.both, w, self.n, end), 2)
+        along = np.vstack([one + other, -1j * (one - other)])
+        c = (self.to_basis @ along.view(float)).view(complex)
+        return (c.real**2 + c.imag**2).sum(axis=0), (c.conj() ** 2).sum(axis=0)
 
 
 def _geometric(a: np.ndarray, b: np.ndarray, n: int, end: np.ndarray) -> np.ndarray:
     """Σ_{t<n} (a_i b_k)^t, (a.size, b.size), with b^n given as `end`."""
     gap = 1.0 - np.outer(a, b)
-    small = np.abs(gap) < 1e-12
-    return np.where(small, n, (1.0 - np.outer(a**n, end)) / np.where(small, 1.0, gap))
+    whole = np.abs(gap) < 1e-12
+    gap[whole] = 1.0
+    sums = (1.0 - np.outer(a**n, end)) / gap
+    sums[whole] = n
+    return np.asarray(sums)
 
 
 def _squares(residuals: Sequence[np.ndarray]) -> np.ndarray:

@@ -7,12 +7,13 @@ prediction error rises above its level in the samples after. The same is done at
 sample rate, behind a low-pass filter that leaves free decay one, for what is too slow to be seen from sample to sample.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from scipy.linalg.lapack import dgeqrf, dtrtrs
-from scipy.signal import oaconvolve
+from scipy.signal import upfirdn
 from scipy.signal.windows import blackman
 from scipy.stats import chi2
 
@@ -45,6 +46,7 @@ class StartSettings:
 
 START = StartSettings()
 HIGHEST_DEGREE = 8  # of a drift: more oscillates as modes do
+PART = 65_536  # samples that it is fitted to at once
 # Fewer means are too few to learn the rule and to test it.
 SHORTEST = (4 + START.level_memory) * START.order
 UPPER = np.triu(np.ones((START.order + 1, START.order + 1)))
@@ -65,7 +67,7 @@ def decay_start(record: Record) -> float:
     n = record.n_samples
     if not signals.any():
         return float(record.start_time)
-    left = np.cumsum((signals[:, ::-1] ** 2).sum(axis=0))[::-1]
+    left = np.cumsum(np.einsum("jt,jt->t", signals, signals)[::-1])[::-1]
     matters = left >= START.least_left * left[0]
     starts = np.zeros(1, int)
     step = 1
@@ -74,8 +76,11 @@ def decay_start(record: Record) -> float:
     while n // step >= SHORTEST:
         window = blackman(6 * step, sym=False) if step > 1 else np.ones(1)
         window /= window.sum()
-        means = oaconvolve(signals, window[None], mode="valid", axes=1)
-        means = means[:, (means.shape[1] - 1) % step :: step]
+        # Means end with the last sample; zeros before the first put them where every `step`th is.
+        count = (n - window.size) // step + 1
+        before = -(n - 1) % step
+        means = upfirdn(window, np.pad(signals, ((0, 0), (before, 0))), down=step, axis=1)
+        means = means[:, (before + n - 1) // step + 1 - count : (before + n - 1) // step + 1]
         first = n - window.size - step * (means.shape[1] - 1)
         ratio, breaks = _breaks(means, rounding * (window**2).sum())
         broken = first + step * np.flatnonzero(_dying_away(ratio, breaks) if step == 1 else breaks)
@@ -92,13 +97,13 @@ def _scaled(record: Record) -> tuple[np.ndarray, float]:
     rounding to the sensors' steps leaves in them."""
     outputs = record.outputs[:: -(-record.n_outputs // START.most_sensors)]
     end = np.median(outputs[:, -max(record.n_samples // 10, 1) :], axis=1, keepdims=True)
-    about = outputs - end
     # Differences weigh sensors by how they move, not by how they drift.
-    size = np.sqrt((np.diff(about, axis=1) ** 2).mean(axis=1))
+    size = np.array([np.linalg.norm(np.diff(row)) for row in outputs]) / np.sqrt(max(record.n_samples - 1, 1))
     moving = size > 0
     if not moving.any():
         return np.zeros((1, record.n_samples)), 0.0
-    scaled = about[moving] / size[moving, None]
+    scaled = outputs[moving] - end[moving]
+    scaled /= size[moving, None]
     steps = [np.diff(np.unique(row)).min(initial=np.inf) for row in scaled]
     if len(scaled) > START.most_signals:
         _, directions = np.linalg.eigh(scaled @ scaled.T)
@@ -181,13 +186,15 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     nothing = Drift(record, frozen(np.zeros(m)))
     if highest < 1:
         return nothing
-    decay = np.exp(np.outer(record.sample_time * np.arange(n), poles))
-    exponentials = np.hstack([decay.real, decay.imag])
-    slow = legvander(np.linspace(-1.0, 1.0, n), highest)
-    q, r = np.linalg.qr(np.hstack([slow[:, :1], exponentials, slow[:, 1:]]))
-    # Columns of q beyond constant and modes add one degree after the other.
-    along = q.T @ record.outputs.T
-    fixed = 1 + exponentials.shape[1]
+    fixed = 1 + 2 * poles.size
+
+    def columns(at: np.ndarray) -> np.ndarray:
+        decay = np.exp(np.outer(record.sample_time * at, poles))
+        slow = _polynomials(at, n, highest)
+        return np.hstack([slow[:, :1], decay.real, decay.imag, slow[:, 1:]])
+
+    # Columns beyond constant and modes add one degree after the other.
+    r, along = _factored(columns, record.outputs)
     power = (record.outputs**2).sum(axis=1)
     left = power - np.vstack([(along[:fixed] ** 2).sum(axis=0), along[fixed:] ** 2]).cumsum(axis=0)
     left = np.maximum(left, 1e-26 * power + 1e-300)
@@ -197,5 +204,43 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
         return nothing
     kept = fixed + degree
     weights = np.linalg.solve(r[:kept, :kept], along[:kept])[fixed:]
-    drift = (slow[:, 1 : degree + 1] @ weights).T
-    return Drift(replace(record, outputs=record.outputs - drift), frozen(np.ptp(drift, axis=1)))
+    outputs, lowest, topmost = record.outputs.copy(), np.full(m, np.inf), np.full(m, -np.inf)
+    for part in _parts(n):
+        drift = (_polynomials(np.arange(part.start, part.stop), n, degree)[:, 1:] @ weights).T
+        outputs[:, part] -= drift
+        lowest, topmost = (
+            np.minimum(lowest, drift.min(axis=1)),
+            np.maximum(topmost, drift.max(axis=1)),
+        )
+    return Drift(replace(record, outputs=outputs), frozen(topmost - lowest))
+
+
+def without_polynomial(outputs: np.ndarray, degree: int = HIGHEST_DEGREE) -> np.ndarray:
+    """(n_outputs, n_samples) less the polynomial of that degree in time that fits each best."""
+    n = outputs.shape[1]
+    degree = min(degree, n - 1)
+    r, along = _factored(lambda at: _polynomials(at, n, degree), outputs)
+    weights, about = np.linalg.solve(r, along), outputs.copy()
+    for part in _parts(n):
+        about[:, part] -= (_polynomials(np.arange(part.start, part.stop), n, degree) @ weights).T
+    return about
+
+
+def _polynomials(at: np.ndarray, n: int, degree: int) -> np.ndarray:
+    """Legendre polynomials over n samples, at some of them, (n_at, degree + 1)."""
+    return np.asarray(legvander(-1.0 + 2.0 * at / max(n - 1, 1), degree))
+
+
+def _parts(n: int) -> Iterator[slice]:
+    for first in range(0, n, PART):
+        yield slice(first, min(first + PART, n))
+
+
+def _factored(columns: Callable[[np.ndarray], np.ndarray], outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R and Q^T y of columns over time, part by part, as the columns of a long record would fill the memory."""
+    r = np.zeros((0, 0))
+    for part in _parts(outputs.shape[1]):
+        rows = np.hstack([columns(np.arange(part.start, part.stop)), outputs[:, part].T])
+        r = np.asarray(np.linalg.qr(np.vstack([r.reshape(-1, rows.shape[1]), rows]), mode="r"))
+    k = r.shape[1] - len(outputs)
+    return r[:k, :k], r[:k, k:]

@@ -32,7 +32,9 @@ def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
     return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)
 
 
-def in_coloured_noise(refined: Refined, records: Record | Sequence[Record]) -> Refined:
+def in_coloured_noise(
+    refined: Refined, records: Record | Sequence[Record], fits: Sequence[Projection] | None = None
+) -> Refined:
     """The same modes with standard errors that hold in noise of any smooth spectrum.
 
     A mode is disturbed by noise within its own band only. Where output j has noise of spectrum S_j, a least squares fit
@@ -46,18 +48,20 @@ def in_coloured_noise(refined: Refined, records: Record | Sequence[Record]) -> R
     Args:
         refined: of `refine` with a constant in each output, made for white noise.
         records: that it was identified from.
+        fits: of its poles, in any order, one a record; found anew unless given.
     """
     records = [records] if isinstance(records, Record) else list(records)
-    fits = [project(record, refined.modes.poles, True) for record in records]
+    fits = fits or [project(record, refined.modes.poles, True) for record in records]
+    poles = fits[0].poles
     ratios = np.array(
         [
-            noise_near(refined.modes.poles, fit.residual / noise, record.sample_time)
+            noise_near(poles, fit.residual, noise, record.sample_time)
             for record, fit, noise in zip(records, fits, refined.noise, strict=True)
         ]
     )
     if (ratios == 1.0).all():
         return refined
-    found = records, refined.modes.poles, fits, refined.noise
+    found = records, poles, fits, refined.noise
     return as_refined(*found, converged=refined.converged, steps=refined.steps, noise_ratio=ratios)
 
 

@@ -185,7 +185,7 @@ class KnownInputs:
         near, beside, energy, power = [], [], [], []
         for k, rows in enumerate(self.rows):
             left = self._samples(fit.residual[rows] / std[k])
-            near.append(noise_near(fit.poles, left, self.dt))
+            near.append(noise_near(fit.poles, left, np.ones(left.shape[1]), self.dt))
             weights = np.ones((1, std.shape[1])) if self.weights is None else self.weights[rows]
             seen = [self._samples(weight[:, None] * self.fixed[rows]) for weight in weights.T]
             along = [noise_along(fixed, rest, fit.poles.size) for fixed, rest in zip(seen, left.T[:, :, None])]

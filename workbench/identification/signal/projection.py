@@ -21,6 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.fft import rfft
 from scipy.linalg import cho_factor, cho_solve, qr, solve_toeplitz, solve_triangular
 from scipy.signal import lfilter
 from scipy.stats import chi2
@@ -33,6 +34,8 @@ class ProjectionSettings:
     """Constants of projections and of what is said of their noise."""
 
     largest_factored: int = 300_000  # samples by modes up to which Φ is factored at once: 5 MB
+    block: int = 64  # samples whose exponentials are taken one by one where Φ is factored at once
+    many: int = 1_000_000  # samples of a transform whose tables are not kept
     part: int = 2048  # samples of a part of a longer record
     died_away: float = 41.0  # nepers: e^-41 is below the last digit of 1
     summed: float = 1e-14  # round-off of squares that are a difference of sums over the record, as a share of these
@@ -89,9 +92,10 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     """
     if record.n_samples * poles.size > PROJECTION.largest_factored:
         return _project_by_parts(record, poles, offset)
-    # Complex powers cost one exponential a sample and mode; both real columns come from it.
+    # A product a sample and mode costs a tenth of an exponential; both real columns come from it.
     tau = record.sample_time * np.arange(record.n_samples)
-    phi = _columns(np.exp(np.outer(tau, poles)))
+    blocks = np.exp(tau[:: PROJECTION.block, None, None] * poles) * np.exp(tau[: PROJECTION.block, None] * poles)
+    phi = _columns(blocks.reshape(len(blocks) * blocks.shape[1], poles.size)[: tau.size])
     t_phi = tau[:, None] * phi
     columns = np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi
     q, r = qr(columns, mode="economic", check_finite=False)
@@ -225,26 +229,48 @@ def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = Tru
     ]
 
 
-def noise_near(poles: np.ndarray, residual: np.ndarray, sample_time: float) -> np.ndarray:
+def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sample_time: float) -> np.ndarray:
     """κ, the noise about each mode over its mean, (n_outputs, n_modes); 1 for an output whose noise may be white.
 
     Args:
         poles: (n_modes,) of the modes taken out, rad/s.
-        residual: (n_samples, n_outputs) over its standard deviation.
+        residual: (n_samples, n_outputs).
+        noise: (n_outputs,) its standard deviation.
         sample_time: s.
     """
     n, m = residual.shape
-    power = np.abs(np.fft.rfft(residual, axis=0)[1:]) ** 2 / n
-    omega = 2.0 * np.pi / (n * sample_time) * np.arange(1, len(power) + 1)
+    bin_width = 2.0 * np.pi / (n * sample_time)
+    widths = np.maximum(np.abs(poles.real), PROJECTION.least_bins * bin_width)
+    # Each mode took the noise of one bin.
+    taken = _bandwidth_weight(np.subtract.outer(poles.imag, poles.imag) / widths).sum(axis=0)
     factors = np.ones((m, poles.size))
-    coloured = ~white(power, poles.size)
-    for r, pole in enumerate(poles):
-        width = max(abs(pole.real), PROJECTION.least_bins * omega[0])
-        weight = _bandwidth_weight((omega - pole.imag) / width)
-        # Each mode took the noise of one bin.
-        left = max(weight.sum() - _bandwidth_weight((poles.imag - pole.imag) / width).sum(), 1.0)
-        factors[coloured, r] = weight @ power[:, coloured] / left
+    for j in range(m):
+        power = power_of(residual[:, j])[1:]
+        power /= n * float(noise[j]) ** 2
+        if white(power[:, None], poles.size, among=m)[0]:
+            continue
+        for r, (pole, width) in enumerate(zip(poles, widths)):
+            weight = _bandwidth_weight((bin_width * np.arange(1, power.size + 1) - pole.imag) / width)
+            factors[j, r] = weight @ power / max(float(weight.sum()) - taken[r], 1.0)
     return factors
+
+
+def power_of(row: np.ndarray, size: int | None = None) -> np.ndarray:
+    """|·|² of the transform of a row, padded to a length; in the row's precision."""
+    spectrum = rfft(row, size)
+    forget_transforms(row.size)
+    power: np.ndarray = spectrum.real**2
+    power += spectrum.imag**2
+    return power
+
+
+def forget_transforms(n: int) -> None:
+    """After one of n samples, where they are many: the tables of the last sixteen, each as large as the signal, are
+    kept otherwise."""
+    if n > PROJECTION.many:
+        for size in range(1, 17):
+            for kind in (np.float32, np.float64):
+                rfft(np.ones(size, kind))
 
 
 def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.ndarray:
@@ -270,14 +296,22 @@ def _bandwidth_weight(away: np.ndarray) -> np.ndarray:
     return (1.0 + away**2) ** -2.0
 
 
-def white(power: np.ndarray, n_modes: int) -> np.ndarray:
-    """Outputs (n_outputs,) whose spectrum may be flat: its sum runs along a straight line (Bartlett; Kolmogorov)."""
+def white(power: np.ndarray, n_modes: int, *, among: int | None = None) -> np.ndarray:
+    """Outputs (n_outputs,) whose spectrum may be flat: its sum runs along a straight line (Bartlett; Kolmogorov).
+
+    Args:
+        power: (n_bins, n_outputs).
+        n_modes: taken out of it.
+        among: how many outputs are asked about in all; these unless given.
+    """
     bins, m = power.shape
     whole = power.sum(axis=0)
     summed = np.cumsum(power, axis=0) / np.where(whole > 0, whole, 1.0)
     apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
     # The bins that the modes took are not coloured noise.
-    return np.asarray(apart < np.sqrt(0.5 * np.log(2.0 * m / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins)
+    return np.asarray(
+        apart < np.sqrt(0.5 * np.log(2.0 * (among or m) / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins
+    )
 
 
 def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:

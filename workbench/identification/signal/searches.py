@@ -47,7 +47,8 @@ class FitSettings:
 class SelectionSettings:
     """Constants of every selection of modes."""
 
-    search_share: float = 0.6  # of the time, in which modes are searched; the rest is for refinement and errors
+    search_share: float = 0.5  # of the time, in which modes are searched; the rest is for refinement and errors
+    growing: float = 0.6  # of the time left, that a round searches for further modes; unchecked ones may be artefacts
     most_damped: float = 0.3  # damping ratio above which a pole is no mode
     most_growth: float = 0.5  # nepers over a record above which a pole grows: it may be noise that is not white
     same_shape: float = 0.95  # MAC from which on two overlapping poles are one mode, split
@@ -307,6 +308,7 @@ class Stepwise(Generic[Model, Candidate]):
     def forward(self, model: Model) -> Model:
         """With every candidate that the likelihood asks for."""
         weak = splits = 0
+        growing = self.budget.share(SELECTION.growing)
         if self.forgets:
             self.rejected.clear()
         while (
@@ -314,7 +316,7 @@ class Stepwise(Generic[Model, Candidate]):
             and weak < self.most_weak
             and (self.most_splits is None or splits < self.most_splits)
             # The first mode is worth the wait.
-            and not (self.problem.n_modes(model) and self.budget.spent("search for further modes"))
+            and not (self.problem.n_modes(model) and growing.spent("search for further modes"))
         ):
             candidate = self.problem.strongest(model, self.rejected)
             if candidate is None:
@@ -343,6 +345,8 @@ class Stepwise(Generic[Model, Candidate]):
         while self.problem.n_modes(model) and not self.budget.spent("check of each mode"):
             weakest: tuple[float, complex, Model] | None = None
             for pole, without, certainly in self.problem.suspects(model):
+                if self.budget.spent("check of each mode"):
+                    return model
                 gain = self.problem.gain(without, model)
                 out = certainly or gain < self.problem.threshold(model, pole)
                 if out and (weakest is None or gain < weakest[0]):

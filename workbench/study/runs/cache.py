@@ -3,12 +3,19 @@
 import base64
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from workbench.study.runs.whole_file import write_whole
+
+try:
+    import fcntl
+except ImportError:  # Windows has none: runs at once on one folder may there compute a case twice
+    fcntl = None  # type: ignore[assignment]
 
 ARRAY, COMPLEX = "__array__", "__complex__"
 KINDS = "biufc"  # of arrays: booleans, integers, floats, complex numbers
@@ -68,6 +75,37 @@ def read_record(path: Path) -> dict[str, Any] | None:
         return record
     except (OSError, ValueError, KeyError, TypeError):
         return None
+
+
+@contextmanager
+def held(path: Path, wait: bool) -> Iterator[bool]:
+    """Keep other processes from a record while it is made: whether it is held, at once or, with `wait`, in the end.
+
+    A lock of the system on a file beside the record. It goes when its process ends, however it ends, and child
+    processes do not inherit it. Whoever gets it must look first whether the record is there by now. Where no file can
+    be made, nothing can be kept either, and nothing is held back.
+    """
+    beside = path.with_suffix(".lock")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(beside, "ab")
+    except OSError:
+        yield True
+        return
+    with file:
+        try:
+            if fcntl is not None:
+                fcntl.lockf(file, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except (BlockingIOError, PermissionError):
+            yield False
+            return
+        except OSError:  # a file system without locks
+            pass
+        try:
+            yield True
+        finally:
+            with suppress(OSError):
+                beside.unlink()
 
 
 def _sum(text: str) -> str:

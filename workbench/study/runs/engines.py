@@ -14,7 +14,7 @@ import cloudpickle
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-from workbench.study.runs.cache import encoded, read_record, write_record
+from workbench.study.runs.cache import encoded, held, read_record, write_record
 from workbench.study.runs.cases import RESERVED, StudyError
 from workbench.study.runs.fingerprint import is_own
 from workbench.study.runs.versions import own_source
@@ -68,6 +68,14 @@ def work(function: Callable[..., Any], job: Job, running: Path | None = None) ->
     return record
 
 
+def once(function: Callable[..., Any], job: Job, running: Path | None = None, *, wait: bool) -> dict[str, Any] | None:
+    """Work one case unless another run has or does; its result is then awaited and taken, or None without `wait`."""
+    if job.file is None:
+        return work(function, job, running)
+    with held(job.file, wait) as ours:
+        return read_record(job.file) or work(function, job, running) if ours else None
+
+
 def keep(file: Path, record: dict[str, Any]) -> str | None:
     """Put a result away unless it is an error; why it could not be, where the disk refuses."""
     if record["error"] is not None:
@@ -107,30 +115,42 @@ def unpacked(function: bytes) -> Callable[..., Any]:
 
 
 def here(function: Callable[..., Any], jobs: list[Job]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """One after the other, in this process."""
-    for job in jobs:
-        yield job.key, work(function, job)
+    """One after the other, in this process; last those that another run was at."""
+    for wait in (False, True):
+        elsewhere = []
+        for job in jobs:
+            record = once(function, job, wait=wait)
+            if record is None:
+                elsewhere.append(job)
+            else:
+                yield job.key, record
+        jobs = elsewhere
 
 
 def processes(function: Callable[..., Any], jobs: list[Job], workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
     """In processes of this machine, in the order in which they end.
 
     A case whose process dies takes the others' processes with it. Those that were running then are computed again, each
-    on its own; what dies alone has only itself to blame.
+    on its own; what dies alone has only itself to blame. Cases that another run is at come last.
 
     Raises:
         StudyError: processes die before they begin a case.
     """
     waiting, sent = {job.key: job for job in jobs}, packed(function)
+    elsewhere: set[str] = set()
     barren = 0
     with tempfile.TemporaryDirectory(prefix="workbench-") as folder:
         running = Path(folder)
         while waiting:
-            before = len(waiting)
+            before = len(waiting), len(elsewhere)
+            ours = [job for job in waiting.values() if job.key not in elsewhere]
             try:
-                for key, record in _parallel(sent, waiting.values(), workers, running):
-                    del waiting[key]
-                    yield key, record
+                for key, record in _parallel(sent, ours or waiting.values(), workers, running, wait=not ours):
+                    if record is None:
+                        elsewhere.add(key)
+                    else:
+                        del waiting[key]
+                        yield key, record
             except TerminatedWorkerError:
                 for key, record in _already_kept(waiting.values()):
                     del waiting[key]
@@ -141,7 +161,7 @@ def processes(function: Callable[..., Any], jobs: list[Job], workers: int) -> It
                 for job in suspects:
                     del waiting[job.key]
                     yield job.key, _alone(sent, job, running)
-                barren = barren + 1 if len(waiting) == before else 0
+                barren = barren + 1 if (len(waiting), len(elsewhere)) == before else 0
                 if barren == MOST_BARREN:
                     raise StudyError(
                         f"the processes of this run died {barren} times before they began a case: what the function"
@@ -156,25 +176,25 @@ def _already_kept(jobs: Iterable[Job]) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _parallel(
-    function: bytes, jobs: Iterable[Job], workers: int, running: Path
-) -> Iterator[tuple[str, dict[str, Any]]]:
+    function: bytes, jobs: Iterable[Job], workers: int, running: Path, *, wait: bool
+) -> Iterator[tuple[str, dict[str, Any] | None]]:
     with parallel_config(backend="loky", inner_max_num_threads=1):
         pool = Parallel(n_jobs=workers, batch_size=1, return_as="generator_unordered")
-        yield from pool(delayed(_keyed)(function, job, running) for job in list(jobs))
+        yield from pool(delayed(_keyed)(function, job, running, wait) for job in list(jobs))
 
 
-def _keyed(function: bytes, job: Job, running: Path) -> tuple[str, dict[str, Any]]:
-    return job.key, work(unpacked(function), job, running)
+def _keyed(function: bytes, job: Job, running: Path, wait: bool) -> tuple[str, dict[str, Any] | None]:
+    return job.key, once(unpacked(function), job, running, wait=wait)
 
 
 def _alone(function: bytes, job: Job, running: Path) -> dict[str, Any]:
     start = time.perf_counter()
     try:
         # two processes, of which one idles: with one, joblib would work the case in this very process
-        [(_, record)] = _parallel(function, [job], 2, running)
+        [(_, record)] = _parallel(function, [job], 2, running, wait=True)
     except TerminatedWorkerError:
-        return {"result": None, "error": f"died: {DIED}", "trace": None, "seconds": time.perf_counter() - start}
-    return record
+        record = None
+    return record or {"result": None, "error": f"died: {DIED}", "trace": None, "seconds": time.perf_counter() - start}
 
 
 def cluster(function: Callable[..., Any], jobs: list[Job], address: str) -> Iterator[tuple[str, dict[str, Any]]]:

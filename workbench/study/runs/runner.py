@@ -31,8 +31,9 @@ def run(
 
     A result is kept under a name made of the function (its code and all that reaches), the versions of what computes,
     the case and its seed, so that a second run works only what is new, changed, failed, or was not finished. What a
-    case raises is kept beside the results of the others. Equal cases are computed once. A file counts with what
-    it holds only where a case names it as a `Path`.
+    case raises is kept beside the results of the others. Equal cases are computed once; of runs at once on one cache,
+    also in other processes, each takes what another has or awaits it. A file counts with what it holds only where a
+    case names it as a `Path`.
 
     Args:
         cases: dicts of plain parameters; `grid` and `samples` make them.

@@ -1,0 +1,51 @@
+"""Stepwise selection on a problem that has no end: what was taken in is checked all the same."""
+
+from time import thread_time
+
+from workbench.identification.signal.searches import Budget, Stepwise
+
+
+class Endless:
+    """Every candidate seems to be a mode, and takes a hundredth of a second; none is one."""
+
+    def __init__(self):
+        self.checked = 0
+
+    def n_modes(self, model):
+        return len(model)
+
+    def strongest(self, model, rejected):
+        until = thread_time() + 0.01
+        while thread_time() < until:
+            pass
+        return complex(len(model) + 1)
+
+    def pole_of(self, candidate):
+        return candidate
+
+    def extended(self, model, candidate):
+        return (*model, candidate)
+
+    def gain(self, smaller, larger):
+        return 100.0
+
+    def threshold(self, model, pole):
+        return 10.0
+
+    def splits(self, model, trial):
+        return False
+
+    def settled(self, model):
+        return model
+
+    def suspects(self, model):
+        self.checked += 1
+        for pole in model:
+            yield pole, tuple(p for p in model if p != pole), True
+
+
+def test_a_search_without_end_leaves_time_to_check_each_mode():
+    problem, budget = Endless(), Budget(0.3)
+    found = Stepwise(problem, 10_000, 2, 6, forgets=False, budget=budget).select(())
+    assert problem.checked > 0 and len(found) <= 1, "modes that are none are gone"
+    assert budget.unfinished[0] == "search for further modes"
