@@ -73,7 +73,7 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
         (("check", "late", "low"), "was fitted, so it is no test"),
         (("predict", "late", "nothing.csv"), "neither a file nor a record of the case, which are low"),
         (("check", "late", "friday.csv", "--log", "friday.csv"), "friday.csv is no log of tests"),
-        (("predict", "late", "friday.csv", "--draws", "3"), "greater than or equal to 40"),
+        (("predict", "late", "friday.csv", "--draws", "3"), "need 40 draws or more"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(run, case, arguments, said):

@@ -81,8 +81,9 @@ def predicted(
     report: Callable[[str, float], None],
 ) -> "Prediction":
     """The prediction of a record by the corrected rig, with bands by its uncertainty."""
-    from workbench.robust.prediction import predict
+    from workbench.robust.prediction import check_draws, predict
 
+    check_draws(draws)  # before the diagnosis
     possible, noise = possible_rig(case, verdict, workers=workers, report=lambda what, done: report(what, 0.7 * done))
     return predict(
         possible, record, noise_std=noise, draws=draws, seed=seed,

@@ -12,7 +12,7 @@ RecordName = Annotated[
     str, typer.Argument(metavar="RECORD", help="File with a column for each input, or a record of the case by name.")
 ]
 Rate = Annotated[float | None, typer.Option(help="Sampling rate, where the file has no time axis.")]
-Draws = Annotated[int, typer.Option(min=40, help="Samples of the uncertain model from which the bands are computed.")]
+Draws = Annotated[int, typer.Option(min=1, help="Samples of the uncertain model from which the bands are computed.")]
 Seed = Annotated[int, typer.Option(help="Seed of the samples and of the noise.")]
 
 

@@ -199,10 +199,19 @@ def _with_noise(rig: Rig, noise: Floats) -> Rig:
     return replace(rig, sensors=sensors)
 
 
-def _draws(wanted: int, n_outputs: int, n_samples: int) -> int:
-    """How many draws: as wanted, or as many as can be held at a time."""
+def check_draws(wanted: int) -> None:
+    """Refuse too few draws for the ends of a band.
+
+    Raises:
+        ValueError: saying how many it takes.
+    """
     if wanted < LEAST_DRAWS:
         raise ValueError(f"bands of {100 * LEVEL:g} % need {LEAST_DRAWS} draws or more; got {wanted}")
+
+
+def _draws(wanted: int, n_outputs: int, n_samples: int) -> int:
+    """How many draws: as wanted, or as many as can be held at a time."""
+    check_draws(wanted)
     most = MOST_NUMBERS // (n_outputs * n_samples)
     if most < LEAST_DRAWS:
         raise ValueError(
