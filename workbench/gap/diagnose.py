@@ -248,10 +248,7 @@ def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
 
 def _notes(found: Attribution, outcome: str, budget: Budget, seconds: float | None) -> tuple[str, ...]:
     seen = "The nearest set explains the records it was fitted to, but not those it has not seen."
-    cut = (
-        f"The search ended after {seconds:g} s of processor time with the best that it had; others may be likelier."
-        " Allow more time by `seconds`."
-    )
+    cut = f"The search ended after {seconds} s of processor time with the best that it had; more by `seconds`."
     notes = (
         *([cut] if found.is_cut else []),
         *([seen] if outcome != found.outcome else []),

@@ -50,7 +50,7 @@ class OrderSettings:
     most_weak: int = 2
     most_splits: int = 6
     least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
-    resolved: float = 1e-14  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
+    resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
 
