@@ -34,7 +34,6 @@ class ProjectionSettings:
     """Constants of projections and of what is said of their noise."""
 
     largest_factored: int = 300_000  # samples by modes up to which Φ is factored at once: 5 MB
-    block: int = 64  # samples whose exponentials are taken one by one where Φ is factored at once
     many: int = 1_000_000  # samples of a transform whose tables are not kept
     part: int = 2048  # samples of a part of a longer record
     died_away: float = 41.0  # nepers: e^-41 is below the last digit of 1
@@ -92,10 +91,9 @@ def project(record: Record, poles: np.ndarray, offset: bool) -> Projection:
     """
     if record.n_samples * poles.size > PROJECTION.largest_factored:
         return _project_by_parts(record, poles, offset)
-    # A product a sample and mode costs a tenth of an exponential; both real columns come from it.
+    # Complex powers cost one exponential a sample and mode; both real columns come from it.
     tau = record.sample_time * np.arange(record.n_samples)
-    blocks = np.exp(tau[:: PROJECTION.block, None, None] * poles) * np.exp(tau[: PROJECTION.block, None] * poles)
-    phi = _columns(blocks.reshape(len(blocks) * blocks.shape[1], poles.size)[: tau.size])
+    phi = _columns(np.exp(np.outer(tau, poles)))
     t_phi = tau[:, None] * phi
     columns = np.hstack([phi, np.ones((len(phi), 1))]) if offset else phi
     q, r = qr(columns, mode="economic", check_finite=False)
