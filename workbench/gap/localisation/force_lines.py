@@ -347,9 +347,10 @@ def lines_of(rig: Rig, model: SampledModel, residuals: Sequence[np.ndarray], sam
 def _folds(rig: Rig, sample_time: float) -> list[int]:
     """By how many times the sample rate the frequencies of forces differ that are folded onto lines: -1, 1, -2, ...
 
-    As far up as there are modes, where accelerations are read, and as the sensors can tell apart; displacements and
-    velocities hardly follow a force so quick.
+    As far up as there are modes, where these reach beyond the sample rate, accelerations are read, and the sensors can
+    tell them apart; displacements and velocities hardly follow a force so quick.
     """
     _, orders = reading_of(rig)
-    folds = min(int(rig.modes.omega[-1] * sample_time / np.pi), (len(orders) - 1) // 2) if (orders == 2).any() else 0
+    top = int(rig.modes.omega[-1] * sample_time / np.pi)
+    folds = min(top, (len(orders) - 1) // 2) if top > 1 and (orders == 2).any() else 0
     return [(-1) ** k * ((k + 1) // 2) for k in range(1, folds + 1)]
