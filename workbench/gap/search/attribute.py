@@ -82,9 +82,7 @@ class Attribution:
         """The same without an effect: the others are fitted anew, with intervals of their own."""
         search = self.search
         others = [e for e in self.best.effects if e is not effect and e not in self.seen]
-        data = search.data.stepped(SELECTION.fine)
-        best = fit(search.rig, others, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
-        best = with_intervals(search.rig, best, search.data, search.workers, logged=self.logged)
+        best = with_intervals(search.rig, _anew(search, others), search.data, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=noise_of(search, best))
 
@@ -254,6 +252,12 @@ def attribute(
     )
 
 
+def _anew(search: Search, effects: Sequence[Effect]) -> Fit:
+    """The effects fitted to all records, from where they are near."""
+    data = search.data.stepped(SELECTION.fine)
+    return fit(search.rig, effects, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
+
+
 def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
     """The fit without effects of which no number stands out of its deviation, or with such a one as a limiting case.
 
@@ -262,15 +266,12 @@ def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: flo
     """
     data, rig = search.data.stepped(SELECTION.fine), search.rig
 
-    def again(effects: Sequence[Effect]) -> Fit:
-        return fit(rig, effects, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
-
     for effect in best.effects:
         if effect in seen or effect.stands_out(rig):
             continue
         others = [e for e in best.effects if e is not effect and e not in seen]
         here = cost_of(rig, best.effects, data)
-        simpler = [again(others), *(again((*others, form)) for form in simpler_forms(effect, rig))]
+        simpler = [_anew(search, s) for s in (others, *((*others, form) for form in simpler_forms(effect, rig)))]
         for fewer in sorted(simpler, key=lambda f: f.n_parameters):
             if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
                 fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)

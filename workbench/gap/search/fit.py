@@ -42,14 +42,6 @@ class Fit:
     covariance: np.ndarray | None = None
     stepping: np.ndarray | float = 0.0
 
-    def only(self, rig: Rig, kept: Sequence[Effect]) -> "Fit":
-        """The fit with some of its effects left out, and the covariance of the others."""
-        there = [e in kept for e in self.effects]  # effects are equal by identity
-        if self.covariance is None:
-            return replace(self, effects=tuple(kept))
-        rows = [j for j, (i, _) in enumerate(parameters_of(rig, self.effects)) if there[i]]
-        return replace(self, effects=tuple(kept), covariance=self.covariance[np.ix_(rows, rows)])
-
     @property
     def labels(self) -> tuple[str, ...]:
         return tuple(effect.label for effect in self.effects)

@@ -474,7 +474,7 @@ class Stepwise:
             return step
         sets = list(with_one_simpler(step.effects, self.search.rig))
         limits = self._fitted(sets, step, self._slopes(step)) if sets else []
-        alike = [s for s in map(self._whole, limits) if self._is_alike(s, step)]
+        alike = [s for s in self.search.workers.map(self._whole, limits) if self._is_alike(s, step)]
         return self._in_limit(min(alike, key=lambda s: s.fit.cost)) if alike else step
 
     def _is_alike(self, step: Step, best: Step) -> bool:
