@@ -134,6 +134,15 @@ def test_point_laws_against_an_adaptive_integrator(element, force, size):
     assert errors[1] < 1e-4 * np.abs(peer).max() and errors[1] < 0.25 * errors[0]
 
 
+def test_friction_that_all_but_jumps_against_an_adaptive_integrator():
+    """At four substeps a sample: even ones leave ten times as much where it turns."""
+    r = rig((CoulombFriction(4.0, 0.1, 0.002),))
+    shape, inputs = r.modes.phi(4.0)[0], drive(120, 0.3)
+    peer = continuous(r, inputs, lambda t, q, v: shape * -0.1 * np.tanh(shape @ v / 0.002))
+    error = simulate(r, inputs, sample_time=DT, substeps=4).outputs[0] - peer
+    assert np.sqrt((error**2).mean()) < 1e-4 * np.abs(peer).max()
+
+
 def test_bouc_wen_against_an_adaptive_integrator():
     k, limit = 0.5, 0.2
     r = rig((BoucWen(4.0, k, limit),))

@@ -13,7 +13,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
 from workbench.gap.search.jointly import fit_jointly
-from workbench.gap.search.plain import common_as_errors, in_place_of_errors
+from workbench.gap.search.plain import common_as_errors, in_place_of_errors, one_late
 from workbench.gap.search.search import Search
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_dirty
@@ -95,3 +95,15 @@ def test_hidden_effects_that_errors_could_stand_in_for_are_named(seed, kinds, di
     case, label = make_trial(seed, kinds=kinds, dirt=dirt, size=size)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1)
     assert score_dirty(verdict.to_json(), label, domain=case.rig.modes.domain)["named"]
+
+
+@pytest.mark.parametrize(
+    ("late", "alone"),
+    [({"d2": 0.5}, "d2"), ({"d2": 0.5, "d4": -0.004}, "d2"), ({"d2": 0.5, "d4": 0.2}, None), ({"d2": -0.5}, None)],
+)
+def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
+    prior = NominalPrior(delay=0.3, sample_time=0.01)
+    errors = nominal_errors(hinged_rig(n_modes=4), prior, {f"delay_{name}": delay for name, delay in late.items()})
+    found = one_late(errors)
+    assert (found and found.target) == alone
+    assert found is None or found.values["delay"] == pytest.approx(0.005)

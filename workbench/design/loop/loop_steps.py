@@ -10,7 +10,7 @@ from numba import njit
 
 from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import ONSET
-from workbench.rig.stepping import FAST, LANES, advance, at_rest, drifted_propagators, whole_lanes, yield_update
+from workbench.rig.stepping import FAST, LANES, PARTS, advance, at_rest, drifted_propagators, whole_lanes, yield_update
 
 # As `loop_record` and `_commands` describe them.
 StructureArrays = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
@@ -126,7 +126,7 @@ def loop_record(
     omega, damping, coupling, stretching, drag_shapes, shapes = whole_lanes(
         omega, damping, coupling, stretching, drag_shapes, shapes
     )
-    linear, drives, motion, points, work = at_rest(LANES * (omega.size // LANES), n_el)
+    linear, finely, drives, motion, points, work, kept = at_rest(LANES * (omega.size // LANES), n_el)
     modal, (q, v, _), (point, _, w_old, _) = drives[0], motion, points
     for r in range(n_modes):
         q[r], v[r] = start[0, r], start[1, r]
@@ -147,7 +147,9 @@ def loop_record(
             w_old[i] += shapes[i, r] * q[r]
     for k in range(n_samples):
         if k == 0 or stiffening != 0.0:
-            drifted_propagators(omega, damping, h, 1.0 + stiffening * (k + 0.5) * dt, shapes, linear)
+            stiffness = 1.0 + stiffening * (k + 0.5) * dt
+            drifted_propagators(omega, damping, h, stiffness, shapes, linear)
+            drifted_propagators(omega, damping, h / PARTS, stiffness, shapes, finely)
         # --- read
         for j in range(ny):
             y = truth[j, k * n_sub]
@@ -206,7 +208,7 @@ def loop_record(
                 f_out[j, k] += force / n_sub
                 for r in range(n_modes):
                     modal[r] += into[r, j] * force
-            advance(linear, (modal, modal), elements, along, motion, points, work)
+            advance(linear, finely, (modal, modal), elements, along, motion, points, work, kept)
             for j in range(ny):
                 y = 0.0
                 for r in range(n_modes):

@@ -156,15 +156,20 @@ def _on_their_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect
 def _with_one_late(search: Search, found: Fit) -> Fit:
     """The fit with a delay as the effect that it is where one of several sensors is late alone."""
     late = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
-    if late is None or len(late.values) < PLAIN.several:
+    delay = None if late is None else one_late(late)
+    if delay is None:
         return found
-    delays = {name.removeprefix("delay_"): float(value) for name, value in late.values.items()}
-    off = [name for name, delay in delays.items() if abs(delay) > PLAIN.punctual]
-    if len(off) != 1 or delays[off[0]] < 0:
-        return found
-    delay = Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * late.target.sample_time})
     alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(SELECTION.fine))
     return alone if search.explains(alone) else found
+
+
+def one_late(errors: Effect) -> Effect | None:
+    """The delay of one of several sensors, where errors of the nominal model say that it alone is late."""
+    delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
+    off = [name for name, delay in delays.items() if abs(delay) > PLAIN.punctual]
+    if len(delays) < PLAIN.several or len(off) != 1 or delays[off[0]] < 0:
+        return None
+    return Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * errors.target.sample_time})
 
 
 def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect, ...], step: Step) -> Fit | None:

@@ -22,7 +22,7 @@ from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
-from workbench.gap.search.plain import COMMON, in_place_of_errors
+from workbench.gap.search.plain import COMMON, in_place_of_errors, one_late
 from workbench.gap.search.search import Decision, Search, in_one_valley, most_informative, spread_over_kinds
 from workbench.gap.search.selection import one_more
 from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, STEPWISE
@@ -170,7 +170,14 @@ class Stepwise:
             if beside is None:
                 return None
             fitted = fit_jointly(beside, step.effects, fitted.errors)
-        return None if fitted.fit.cost < STEPWISE.too_white else self._go_on(beside, step, fitted)
+        if fitted.fit.cost < STEPWISE.too_white:
+            return None
+        # so loud a noise takes most effects for its own; where one says as much, there is none
+        found = None if step.effects or self.search.logged else self._in_place_of_inputs(plain)
+        if found is not None:
+            self.steps.append(found)
+            return None
+        return self._go_on(beside, step, fitted)
 
     def _go_on(self, search: Search, step: Step, fitted: Step) -> Step:
         """The step as it was fitted in another search, which goes on in that."""
@@ -257,6 +264,21 @@ class Stepwise:
     def _with_one_more(self, step: Step) -> Step | None:
         """The best set with one more effect, where it takes most of what is left."""
         self.is_tried = True
+        tried = self._with_each(step)
+        if not tried:
+            return None
+        sided = self._on_the_other_side(step, tried)
+        if sided is not None:
+            self.steps[-1] = sided
+            return self._with_one_more(sided)
+        best = self._best_of(tried, step)
+        if not self._is_worth(best, step):
+            return None
+        self.is_beyond = self.search.clustered(best.effects)
+        return None if self.is_beyond else best
+
+    def _with_each(self, step: Step) -> list[Step]:
+        """The likeliest sets with one more effect, fitted to the most telling records."""
         quick, first = most_informative(self.search.data, step.fit.cost_by_channel)
         self.search = search = replace(self.search, quick=quick, first=first)
         search.report("another effect beside small errors of the model", 0.5 + 0.1 * len(step.effects))
@@ -268,7 +290,7 @@ class Stepwise:
         evidence = Evidence.of(rig, search.data, workers=search.workers, bent=True)
         ahead = one_more(beside, step.effects, evidence)
         if not ahead or ahead[0].cost > (1.0 - STEPWISE.ahead) * left:
-            return None
+            return []
         promising, as_good = (left - share * (left - ahead[0].cost) for share in (STEPWISE.promising, STEPWISE.as_good))
         chosen: list[tuple[Effect, ...]] = []
         for candidate in ahead:
@@ -276,16 +298,14 @@ class Stepwise:
             if candidate.cost <= promising and alike < (2 if candidate.cost <= as_good else 1):
                 chosen.append(candidate.effects)
         chosen = [*chosen[: STEPWISE.candidates], *wider_sets(step.effects)]
-        tried = self._fitted(chosen, step, self._slopes(step))
-        sided = self._on_the_other_side(step, tried)
-        if sided is not None:
-            self.steps[-1] = sided
-            return self._with_one_more(sided)
-        best = self._best_of(tried, step)
-        if not self._is_worth(best, step):
-            return None
-        self.is_beyond = search.clustered(best.effects)
-        return None if self.is_beyond else best
+        return self._fitted(chosen, step, self._slopes(step))
+
+    def _in_place_of_inputs(self, step: Step) -> Step | None:
+        """The step with one more effect that leaves only noise of the sensors, as noise of the inputs never does."""
+        near = [s for s in self._with_each(step) if s.fit.cost < PLAIN.near and not self._is_timing(s)]
+        near = sorted(near, key=lambda s: s.fit.cost)[: STEPWISE.finalists]
+        found = [s for s in map(self._whole, near) if self.explains(s) and s.is_plausible and self._is_worth(s, step)]
+        return self._simplest_of(sorted(found, key=lambda s: s.fit.cost)) if found else None
 
     def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
         """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
@@ -535,7 +555,7 @@ class Stepwise:
         return found
 
     def _promoted(self, step: Step) -> Step:
-        """The set with errors too large to be small, and common to all, as effects of their own."""
+        """The set with errors too large to be small and common to all, and one sensor late alone, as effects."""
         values = step.errors.values
         damping = float(np.mean([v for n, v in values.items() if group_of(n) == "damping"] or [0.0]))
         stiffness = values.get("stiffness_0", 0.0) - values.get("mass_0", 0.0)
@@ -547,6 +567,10 @@ class Stepwise:
         if abs(stiffness) > most["modulus_error"] and MODULUS_ERROR not in named:
             added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
             reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
+        late = one_late(step.errors)
+        if late is not None and late.kind not in named:
+            added.append(late)
+            reset.update({n: 0.0 for n in values if group_of(n) == "delay"})
         if not added:
             return step
         return fit_jointly(self.search, (*step.effects, *added), replace(step.errors, values=reset), rounds=2)
