@@ -19,9 +19,7 @@ SAMPLE_TIME, N_SAMPLES, FINE, NOISE = 0.01, 800, 50, 1e-4
 def nominal(quantity):
     """A mass on a rail with viscous friction alone."""
     shapes = PointShapes(np.full((2, 1), MASS**-0.5))
-    modes = Modes(
-        omega=[0.0], damping=[[VISCOUS / MASS]], shapes=shapes, domain=NamedPoints(("drive", "carriage"))
-    )
+    modes = Modes(omega=[0.0], damping=[[VISCOUS / MASS]], shapes=shapes, domain=NamedPoints(("drive", "carriage")))
     return Rig(modes, (Actuator("drive", "drive"),), (Sensor("carriage", "carriage", quantity, noise_std=NOISE),))
 
 

@@ -19,9 +19,9 @@ LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = r
 CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
 SETTLED = 1e-10  # of a force: what is left between it and its law
 FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
-# finer substeps of one in which friction turns: a force that all but jumps is far from straight over one. On a frame, at
-# four substeps a sample, they leave a thirteenth of the power of the error. Stops, whose force has a corner only, gain
-# nothing: errors at the corner and in contact all but cancel, as long as the substeps are even
+# finer substeps of one in which friction turns: a force that all but jumps is far from straight over one. On a frame,
+# at four substeps a sample, they leave a thirteenth of the power of the error. Stops, whose force has a corner only,
+# gain nothing: errors at the corner and in contact all but cancel, as long as the substeps are even
 PARTS = 8
 LANES = 8  # modes that are worked on at once; a number of them that is no multiple is rounded up, with modes at rest
 
@@ -632,7 +632,8 @@ def step_record(
 def make_stepper(law: Callable[[float, float, Floats], float]) -> Callable[..., None]:
     """`step_record` with force(w, v, parameters) = `law` for the elements of kind USER, compiled for it."""
     scope = dict(globals(), user_law=njit(nogil=True)(law))
-    for name in ("element_force", "solve_element", "solve_pair", "solve_in_turn", "_advance_once", "advance", "step_record"):
+    solvers = ("element_force", "solve_element", "solve_pair", "solve_in_turn")
+    for name in (*solvers, "_advance_once", "advance", "step_record"):
         compiled = globals()[name]
         options = {key: value for key, value in compiled.targetoptions.items() if key != "nopython"}
         scope[name] = njit(**options)(FunctionType(compiled.py_func.__code__, scope, name))

@@ -97,7 +97,5 @@ def hold_trials(
 def verdict_on(folder: Path) -> dict[str, Any]:
     """The verdict on a case folder, as JSON, by one process, which has the time of two."""
     case = read_case(folder)
-    verdict = diagnose(
-        case.rig, case.fit, validation=case.validation, name=case.name, workers=1, seconds=2.0 * SECONDS
-    )
+    verdict = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=1, seconds=2.0 * SECONDS)
     return verdict.to_json()
