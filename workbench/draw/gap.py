@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workbench.arrays import Floats
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, GREY, new_figure, plain_ticks
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import Effect, apply_all, label_in_words
 from workbench.gap.localisation.evidence import Evidence
@@ -92,8 +92,10 @@ def plot_where(verdict: Verdict) -> Figure:
     axes[1, 0].set(title="by sensor", ylabel="share of the gap [%]")
     order = np.argsort(where.input_levels)
     axes[1, 1].plot(where.input_levels[order], where.record_gaps[order], "o-", color=COLOURS[1])
+    axes[1, 1].margins(0.15)
     for i in order:
-        axes[1, 1].annotate(f" {where.record_names[i]}", (where.input_levels[i], where.record_gaps[i]), fontsize=8)
+        at = (where.input_levels[i], where.record_gaps[i])
+        axes[1, 1].annotate(where.record_names[i], at, (0, 6), textcoords="offset points", ha="center", fontsize=8)
     axes[1, 1].set(title="by record and level", xlabel="input level [N rms]", ylabel="gap", xscale="log", yscale="log")
     axes[2, 0].imshow(100 * where.time_shares, aspect="auto", cmap="Blues", vmin=0.0, extent=(0, 8, len(order), 0))
     axes[2, 0].set(title="by time: darker is more of the record's gap", xlabel="eighth of the record")
@@ -101,7 +103,7 @@ def plot_where(verdict: Verdict) -> Figure:
     axes[2, 0].set_yticks(np.arange(len(order)) + 0.5, where.record_names)
     axes[2, 0].grid(False)
     _plot_places(axes[2, 1], verdict)
-    return figure
+    return plain_ticks(figure)
 
 
 def _plot_places(ax: Axes, verdict: Verdict) -> None:

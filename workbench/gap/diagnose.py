@@ -158,7 +158,7 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
     after = _left_of(rig, effects, unseen, settle)
     for effect in named:
         rest = [e for e in effects if e is not effect]
-        if _acts(rig, effects, rest, unseen) < PAID * after:
+        if _acts(rig, effects, rest, unseen, settle) < PAID * after:
             continue
         # beside others that are fitted anew; first as they are, which shows of most effects that they count
         if _left_of(rig, rest, unseen, settle) < CLEAR * after:
@@ -173,11 +173,17 @@ def _left_of(rig: Rig, effects: Sequence[Effect], unseen: Sequence[Record], sett
     return sum(mean_square(apply_all(rig, effects), record, settle) for record in unseen)
 
 
-def _acts(rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], unseen: Sequence[Record]) -> float:
+def _acts(
+    rig: Rig, effects: Sequence[Effect], others: Sequence[Effect], unseen: Sequence[Record], settle: float
+) -> float:
     """Mean square by which the readings of records differ between two sets of effects, in the same measure."""
     one, other = apply_all(rig, effects), apply_all(rig, others)
-    apart = [(predict(one, r) - predict(other, r)) / scale_of(r.outputs) for r in unseen]
-    return float(sum((each**2).mean() for each in apart))
+    apart = 0.0
+    for record in unseen:
+        lead = round(settle / record.sample_time)
+        moved = (predict(one, record) - predict(other, record))[:, lead:] / scale_of(record.outputs[:, lead:])
+        apart += float((moved**2).mean())
+    return apart
 
 
 def _outcome(

@@ -53,6 +53,7 @@ class Attribution:
         ahead: the likeliest of every kind alone, fitted to predictions one sample ahead.
         evidence: of the nominal rig.
         search: what was searched in, the records with the noise of rounded sensors among it.
+        weighed: the records as the best set was fitted to them, beside noise of the logged inputs where there is some.
         noise: (n_outputs,) standard deviation of each sensor's noise as it was found, in its unit.
         logged: noise of the logged inputs, as a share of their rms, as what is left shows it.
         seen: effects that show in the readings themselves, which no fit alters.
@@ -68,6 +69,7 @@ class Attribution:
     ahead: tuple[Fit, ...]
     evidence: Evidence
     search: Search
+    weighed: FitData
     noise: np.ndarray
     logged: float
     seen: tuple[Effect, ...] = ()
@@ -82,7 +84,8 @@ class Attribution:
         """The same without an effect: the others are fitted anew, with intervals of their own."""
         search = self.search
         others = [e for e in self.best.effects if e is not effect and e not in self.seen]
-        best = with_intervals(search.rig, _anew(search, others), search.data, search.workers, logged=self.logged)
+        best = _anew(search, others, self.weighed)
+        best = with_intervals(search.rig, best, self.weighed, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))
         return replace(self, best=best, noise=noise_of(search, best))
 
@@ -245,6 +248,7 @@ def attribute(
         ahead=tuple(ahead),
         evidence=found.nominal,
         search=search,
+        weighed=within.data,
         noise=noise,
         logged=logged,
         seen=seen,
@@ -252,10 +256,10 @@ def attribute(
     )
 
 
-def _anew(search: Search, effects: Sequence[Effect]) -> Fit:
+def _anew(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
     """The effects fitted to all records, from where they are near."""
-    data = search.data.stepped(SELECTION.fine)
-    return fit(search.rig, effects, data, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
+    finely = data.stepped(SELECTION.fine)
+    return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
 
 
 def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: float) -> Fit:
@@ -271,7 +275,8 @@ def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: flo
             continue
         others = [e for e in best.effects if e is not effect and e not in seen]
         here = cost_of(rig, best.effects, data)
-        simpler = [_anew(search, s) for s in (others, *((*others, form) for form in simpler_forms(effect, rig)))]
+        sets = (others, *((*others, form) for form in simpler_forms(effect, rig)))
+        simpler = [_anew(search, each, search.data) for each in sets]
         for fewer in sorted(simpler, key=lambda f: f.n_parameters):
             if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
                 fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)
