@@ -34,6 +34,15 @@ def test_a_free_decay_is_shown_and_identified_by_the_command_it_offers(run, tmp_
     assert found.exit_code == 0 and "40.0" in found.output
 
 
+def test_a_ring_down_that_is_far_from_over_is_one(run, tmp_path):
+    """At the end it is still a third of what it was."""
+    time = np.arange(4000) / 500.0
+    rings = np.exp(-0.002 * 2 * np.pi * 12.3 * time) * np.sin(2 * np.pi * 12.3 * time)
+    noisy = rings + 0.01 * np.random.default_rng(0).normal(size=time.size)
+    path = write(tmp_path / "ring.csv", ["t", "a1", "a2"], [time, noisy, 0.4 * rings])
+    assert "--ambient" not in run("look", path, "--page", tmp_path / "p.html").output
+
+
 def test_an_input_is_known_by_its_name_and_steady_motion_is_ambient(run, tmp_path):
     rng = np.random.default_rng(1)
     force, moves = rng.standard_normal((2, N))

@@ -19,7 +19,7 @@ from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.spectra import plot_distortion
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, GREY, in_units, new_figure
 from workbench.draw.surface import (
     plot_point_modes,
     plot_scattered_modes,
@@ -62,7 +62,7 @@ def _(result: Record) -> Figure:
     for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
         colour = COLOURS[1] if i < result.n_inputs else COLOURS[0]
         ax.plot(result.time, values, color=colour, linewidth=0.9)
-        ax.set_ylabel(channel.name + (f"\n[{channel.unit}]" if channel.unit else ""))
+        ax.set_ylabel(in_units(channel.name, channel.unit), fontsize=8)
     axes[0, 0].set_title(result.name)
     axes[-1, 0].set_xlabel("time [s]")
     return figure

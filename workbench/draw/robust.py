@@ -3,7 +3,7 @@
 import numpy as np
 from matplotlib.figure import Figure
 
-from workbench.draw.style import COLOURS, GREY, new_figure, plain_ticks
+from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
 from workbench.records.record import Record
 from workbench.robust.prediction import LEVEL, Prediction, amplitudes
 from workbench.robust.proof import SETTLED, interval
@@ -76,7 +76,7 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
         band = {"color": BAND, "alpha": 0.3, "linewidth": 0, "label": f"{100 * LEVEL:g} % band"}
         left.fill_between(prediction.time, prediction.lower[j], prediction.upper[j], **band)
         left.plot(prediction.time, prediction.median[j], color=BAND, linewidth=0.8, label="predicted")
-        left.set_ylabel(channel.name + (f"\n[{channel.unit}]" if channel.unit else ""))
+        left.set_ylabel(in_units(channel.name, channel.unit))
         low, high = prediction.spectrum_lower[j, 1:], prediction.spectrum_upper[j, 1:]
         least = 1e-3 * high[high > 0].min() if (high > 0).any() else 1e-300
         right.fill_between(f, np.maximum(low, least), np.maximum(high, least), **band)

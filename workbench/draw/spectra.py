@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import coherence, csd, welch
 
-from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.draw.style import COLOURS, GREY, in_units, new_figure
 from workbench.identification.signal.distortion import Distortion
 from workbench.records.record import Record
 from workbench.records.transfer_functions import TransferFunctions
@@ -30,7 +30,7 @@ def plot_spectra(record: Record) -> Figure:
         if power[1:].max(initial=0.0) > 0:
             ax.semilogy(lines[1:], power[1:], color=COLOURS[1] if i < record.n_inputs else COLOURS[0], linewidth=0.9)
             ax.set_ylim(bottom=max(ax.get_ylim()[0], SHOWN * power[1:].max()))
-        ax.set_ylabel(f"{channel.name}\n[{f'({channel.unit})²/Hz' if channel.unit else '1/Hz'}]")
+        ax.set_ylabel(in_units(channel.name, f"({channel.unit})^2/Hz" if channel.unit else "1/Hz"), fontsize=8)
     axes[0, 0].set_title("power spectral density")
     axes[-1, 0].set_xlabel("frequency [Hz]")
     return figure

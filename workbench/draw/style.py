@@ -41,6 +41,11 @@ def new_figure(
     return figure, figure.subplots(rows, cols, **options)
 
 
+def in_units(name: str, unit: str) -> str:
+    """The label of an axis: a name, and its unit below."""
+    return f"{name}\n[{unit.replace('^2', '²').replace('^3', '³')}]" if unit else name
+
+
 def plain_ticks(figure: Figure) -> Figure:
     """The figure with plain numbers on its logarithmic axes, 0.1, 1, 20 rather than 2×10⁰, where they are few."""
     for ax in figure.axes:

@@ -21,6 +21,7 @@ from workbench.study.pages.page import PageContent, block
 HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strongest at [Hz]")
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
 DECAYED = 0.1  # rms of the last tenth over the largest of any tenth, below which a record is a free decay
+FALLING = 6  # tenths, each quieter than the one before: by chance in one stationary record of 720
 LINES = 4096  # samples of a segment of the spectrum
 PEAKS = 4  # shown of each channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of its surroundings; these as a part of the lines
@@ -150,10 +151,11 @@ def _strongest(lines: np.ndarray, power: np.ndarray) -> Sequence[float]:
 
 
 def _decays(record: Record) -> bool:
-    """Whether the outputs die away towards the end."""
+    """Whether the outputs die away towards the end, or are quieter and quieter."""
     about = record.outputs - record.outputs[:, -max(record.n_samples // 10, 1) :].mean(axis=1, keepdims=True)
     tenths = [float((part**2).mean()) for part in np.array_split(about, 10, axis=1) if part.size]
-    return tenths[-1] < DECAYED**2 * max(tenths)
+    falling = tenths[int(np.argmax(tenths)) :]
+    return tenths[-1] < DECAYED**2 * max(tenths) or (len(falling) >= FALLING and bool(np.all(np.diff(falling) < 0)))
 
 
 def _command(path: Path, options: Sequence[str]) -> str:
