@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import CubicSpring
+from workbench.rig.elements import CoulombFriction, CubicSpring
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.rig.simulate import simulate
@@ -64,6 +64,19 @@ def test_a_rate_limited_force_is_read_between_samples(rig, samples, hold):
     expected = np.roll(fine, samples, axis=1)[:, ::FINE]
     error = np.abs(read - expected)[:, 2:-1].max(axis=1) / np.abs(expected).max(axis=1)
     assert (error < 1e-3).all(), error
+
+
+@pytest.mark.parametrize("share", [-1e-6, 1e-6])
+def test_a_sensor_hardly_late_reads_what_a_prompt_one_does(rig, share):
+    """Beside friction that turns within the sample; before it, the force of an actuator held at the last sample."""
+    inputs = np.random.default_rng(2).standard_normal((1, 200)).repeat(4, axis=1)
+    rubbing = replace(rig, elements=(CoulombFriction(0.7, 0.2, 1e-3),))
+    late = replace(rubbing, sensors=tuple(replace(s, delay=share * 0.002) for s in rig.sensors))
+    read, prompt = (simulate(r, inputs, sample_time=0.002).outputs for r in (late, rubbing))
+    error = np.abs(read - prompt)
+    if share > 0:
+        error[2, ::4] = 0.0  # held inputs jump there
+    assert (error.max(axis=1) < 1e-4 * np.abs(prompt).max(axis=1)).all()
 
 
 def test_a_sensor_late_by_whole_samples_is_shifted(rig):

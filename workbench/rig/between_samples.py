@@ -1,5 +1,6 @@
 """Motion between the samples, by exact modes: what a sensor that is late reads."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,13 +47,15 @@ class BetweenSamples:
     q'' + c q' + ω² q = p_0 + (p_1 - p_0) t / Δt in [0, Δt] and steps of force within it that are known, p_0 and p_1
     such that q and q' come out at both ends as they are. So it is exact for inputs held over each sample, delayed or
     lagged too, and of second order for forces that follow laws. p_0 and p_1 are linear in the motion at both ends, so a
-    reading at any time is a weighted sum of that.
+    reading at any time is a weighted sum of that. An acceleration has the forces at both ends as they are, straight
+    between, in their place: of a force that turns within the interval these tell its mean alone.
 
     Attributes:
         omega, damping: (n_modes,) of each mode alone.
         series: (3 n_modes, n_samples) displacements, velocities, and forces beside those of stiffness and damping.
         arrivals: (2 n_modes, n_samples - 1) displacements and velocities where each interval ends, less what steps of
             force within it bring about.
+        changes: (n_modes, n_samples) of the forces over each interval, but for the jumps of those that are held.
         steps: of the forces within each interval.
         ends: (2, 5, n_modes) p_0 and p_1, of displacement, velocity and force where an interval begins, displacement
             and velocity where it ends.
@@ -64,6 +67,7 @@ class BetweenSamples:
     damping: Floats
     series: Floats
     arrivals: Floats
+    changes: Floats
     steps: tuple[Step, ...]
     ends: Floats
     sample_time: float
@@ -80,7 +84,7 @@ class BetweenSamples:
         sample_time: float,
         *,
         steps: tuple[Step, ...] = (),
-        held: bool = False,
+        held: Floats | float = 0.0,
     ) -> "BetweenSamples":
         """From displacements, velocities and forces (n_modes, n_samples) at the samples.
 
@@ -88,7 +92,7 @@ class BetweenSamples:
             stiffness: (n_modes, 1) or (n_modes, n_samples).
             damping: (n_modes, n_modes).
             steps: by which they change within each interval.
-            held: whether the forces stay as they are from sample to sample but for these; then they are exact so.
+            held: (n_modes, n_samples) of the forces, what stays as it is from sample to sample but for these.
         """
         omega, own = np.sqrt(stiffness.mean(axis=1)), np.diag(damping).copy()
         # what a mode alone does not have counts as a force
@@ -97,14 +101,16 @@ class BetweenSamples:
             beside = beside - (stiffness - omega[:, None] ** 2) * displacement
         if coupled.any():
             beside = beside - coupled @ velocity
-        ends = _held(omega.size) if held else _ends(omega, own, sample_time)
+        changes = np.diff(beside - held, axis=1, append=0.0)
+        changes[:, -1] = 0.0  # after the last sample its force is held
+        ends = _ends(omega, own, sample_time) if changes.any() else _held(omega.size)
         rests = not (displacement[:, 0].any() or velocity[:, 0].any())
         series = np.concatenate([displacement, velocity, beside])
         arrivals = series[: 2 * omega.size, 1:].copy()
         for step in steps:
             added = step.answer(omega, own, sample_time)
             arrivals -= np.concatenate([row[:, None] * step.forces[:, :-1] for row in added[:2]])
-        return cls(omega, own, series, arrivals, steps, ends, sample_time, rests)
+        return cls(omega, own, series, arrivals, changes, steps, ends, sample_time, rests)
 
     def earlier(self, order: int, shapes: Floats, delays: Floats) -> Floats:
         """What each sensor reads its delay before each sample, (n_sensors, n_samples), zero before a start at rest.
@@ -118,8 +124,7 @@ class BetweenSamples:
         whole = [int(np.ceil(round(samples, 9))) for samples in back]
         # a span of next to nothing would be divided by
         within = [self.sample_time * round(n - samples, 9) for n, samples in zip(whole, back, strict=True)]
-        rows = np.array([self._rows(order, time) for time in within])
-        read = self._read(shapes, rows)
+        read = self._read(order, shapes, within)
         for step in self.steps:
             for j in (j for j, time in enumerate(within) if time > step.late):
                 answer = step.answer(self.omega, self.damping, within[j])
@@ -130,16 +135,17 @@ class BetweenSamples:
             ahead = max(-n, 0)
             found[j, max(n, 0) : n_samples - ahead] = read[j, ahead : max(n_samples - n, 0)]
             for k in range(ahead):  # beyond the last sample its force is held
-                there = self._rows(order, within[j] + self.sample_time * (k + 1))
-                found[j, k - ahead] = self._read(shapes[j : j + 1], there[None], slice(-1, None))[0, 0]
+                time = within[j] + self.sample_time * (k + 1)
+                found[j, k - ahead] = self._read(order, shapes[j : j + 1], [time], slice(-1, None))[0, 0]
             for k in range(0 if self.rests else min(n, n_samples)):  # the first interval drawn on backwards
-                there = self._rows(order, within[j] + self.sample_time * (k - n))
-                found[j, k] = self._read(shapes[j : j + 1], there[None], slice(0, 2))[0, 0]
+                time = within[j] + self.sample_time * (k - n)
+                found[j, k] = self._read(order, shapes[j : j + 1], [time], slice(0, 2))[0, 0]
         return found
 
-    def _read(self, shapes: Floats, rows: Floats, samples: slice = slice(None)) -> Floats:
-        """Readings (n_sensors, n_samples) in each interval, by rows (n_sensors, 4, n_modes) of q, q', p_0 and p_1."""
+    def _read(self, order: int, shapes: Floats, times: Sequence[float], samples: slice = slice(None)) -> Floats:
+        """Readings (n_sensors, n_samples) in each interval, each sensor at its own time after the interval begins."""
         n_modes, series, arrivals = self.omega.size, self.series[:, samples], self.arrivals[:, samples]
+        rows = np.array([self._rows(order, time) for time in times])
 
         def weights(ends: Floats) -> Floats:
             by_motion = np.einsum("jfm,fsm->jsm", rows[:, 2:], ends)
@@ -152,18 +158,18 @@ class BetweenSamples:
         read[:, :-1] += by_motion[:, 3 * n_modes :] @ arrivals[:, : series.shape[1] - 1]
         # after the last sample its force is held
         read[:, -1] = weights(_held(n_modes))[:, : 3 * n_modes] @ series[:, -1]
+        if order == 2:
+            shares = np.array(times)[:, None] / self.sample_time
+            read += shapes @ series[2 * n_modes :] + shares * (shapes @ self.changes[:, samples])
         return read
 
     def _rows(self, order: int, time: float) -> Floats:
-        """(4, n_modes): what is read at a time after the beginning of an interval, of q, q', p_0 and p_1."""
+        """(4, n_modes): what is read at a time after the beginning of an interval, of q, q', p_0 and p_1.
+
+        Of an acceleration without the forces themselves.
+        """
         motion = _propagators(self.omega, self.damping, self.sample_time, time)
-        if order < 2:
-            row: Floats = motion[order]
-            return row
-        share = time / self.sample_time
-        rows: Floats = -(self.omega**2) * motion[0] - self.damping * motion[1]
-        rows[2] += 1.0 - share
-        rows[3] += share
+        rows: Floats = motion[order] if order < 2 else -(self.omega**2) * motion[0] - self.damping * motion[1]
         return rows
 
 

@@ -79,7 +79,7 @@ class Motion:
         stiffness: (n_modes, 1) of each mode, or (n_modes, n_samples) where it changes.
         damping: (n_modes, n_modes).
         steps: by which forces change within each interval.
-        held: whether the forces stay as they are from sample to sample but for these.
+        held: (n_modes, n_samples) of the forces, what stays as it is from sample to sample but for these.
         finer: what moves again, with so many times as many samples, where forces change within an interval otherwise.
     """
 
@@ -89,7 +89,7 @@ class Motion:
     stiffness: Floats
     damping: Floats
     steps: tuple[Step, ...] = ()
-    held: bool = False
+    held: Floats | float = 0.0
     finer: "tuple[int, Callable[[], Motion]] | None" = None
 
     def between_samples(self, sample_time: float) -> BetweenSamples:
@@ -114,7 +114,9 @@ class Motion:
         stiffness = self.stiffness[:, lead:] if self.stiffness.shape[1] > 1 else self.stiffness
         q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
         steps = tuple(replace(step, forces=step.forces[:, lead:]) for step in self.steps)
-        later = replace(self, displacement=q, velocity=v, forces=forces, stiffness=stiffness, steps=steps)
+        held = self.held[:, lead:] if isinstance(self.held, np.ndarray) else self.held
+        motion = {"displacement": q, "velocity": v, "forces": forces, "held": held}
+        later = replace(self, **motion, stiffness=stiffness, steps=steps)
         if self.finer is None:
             return later
         times, move_again = self.finer
@@ -291,6 +293,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         response += held_response(system, constant, participation, sample_time)[0]
         acting += constant
     on_modes = participation @ acting
+    held = on_modes.copy() if input_hold == "zero" else 0.0
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
         if not isinstance(element, PeriodicForce):
@@ -300,7 +303,6 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
         on_modes += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
-    held = input_hold == "zero" and modes.proportional and not any(isinstance(e, PeriodicForce) for e in rig.elements)
     return Motion(q, v, on_modes, modes.omega[:, None] ** 2, modes.damping, steps, held)
 
 
@@ -335,7 +337,10 @@ def _move_in_steps(rig: Rig, inputs: np.ndarray, sample_time: float, substeps: i
     bias = np.array([[actuator.bias] for actuator in rig.actuators])
     acting = at_samples[: len(rig.actuators)] - bias
     steps = _steps_within(rig, inputs, acting, participation, sample_time) if input_hold == "zero" else ()
-    found = Motion(q, v, participation @ at_samples + f, stiffness, np.diag(np.diag(modes.damping)), steps)
+    n_inputs = len(rig.actuators)
+    held = participation[:, :n_inputs] @ at_samples[:n_inputs] if input_hold == "zero" else 0.0
+    damping = np.diag(np.diag(modes.damping))
+    found = Motion(q, v, participation @ at_samples + f, stiffness, damping, steps, held)
     if substeps == 1 or not any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators):
         return found
     return replace(found, finer=(substeps, lambda: _move_finely(rig, inputs, sample_time, substeps, input_hold)))

@@ -55,8 +55,10 @@ class Follower:
         forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
         shape = np.zeros(n) if at is None else modes.phi_at(at)
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
-        found = force_filter(sampled_model(modes, rig.sensors, noise, sample_time), patterns, variances, 0.0)
-        gain = np.linalg.solve(found.innovation, found.h @ found.covariance[:, : 2 * n]).T
+        model = sampled_model(modes, rig.sensors, noise, sample_time)
+        found = force_filter(model, patterns, variances, 0.0)
+        # what an error says of the forces until the next sample is put into the state at this one
+        gain = np.linalg.solve(model.transition, found.gain[: 2 * n])
         whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))
         return cls(gain.reshape(2, n, -1).copy(), whitening, rig.sensors)
 

@@ -310,7 +310,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
     stated = effect.stated(nominal)
     units = {p.name: p.unit for p in effect.parameters(nominal) if p.name in stated}
     numbers = [
-        " ".join((name.replace("_", " "), _with_deviation(effect.values[name], effect.deviations.get(name, 0.0)), unit))
+        " ".join((name.replace("_", " "), _with_deviation(stated[name], effect.deviations.get(name, 0.0)), unit))
         for name, unit in units.items()
         if name not in COORDINATES
     ]

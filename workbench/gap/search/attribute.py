@@ -210,7 +210,7 @@ def attribute(
         ahead = one_more(search, (), evidence, screened)
         report("one effect, on whole records", 0.3)
         singles = _alone(search, start, ahead)
-        alone = _without_a_second(search, start, singles)
+        alone, singles = _without_a_second(search, start, singles)
         decision = unless_another(search, alone, evidence) if alone else None
         decision = decision or _beside_one_sensor(search, start, evidence)
         decision = decision or _with_a_second(search, start, singles, ahead, screened, evidence, tolerance)
@@ -358,22 +358,24 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
     return decide_on_random(search, evidence)[0] if _of_one_sensor(start) else None
 
 
-def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> Decision | None:
-    """What needs no second effect; None where nothing alone explains the records."""
+def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> tuple[Decision | None, list[Fit]]:
+    """What needs no second effect, None where nothing alone explains the records; and the singles where they fit best."""
     good = [f for f in singles if search.significant(f, start.cost)]
     if search.explains(start) and not good:
-        return Decision("none", start)
+        return Decision("none", start), singles
     ended = _ended(search, good[:4])
     explaining = [f for f in ended if search.explains(f)]
     if not explaining:
         near = [f for f in ended[:2] if search.near(f, RANDOM.near)]
-        explaining = [f for f in search.side_by_side(relocated, near) if search.explains(f)]
+        moved = search.side_by_side(relocated, near)
+        explaining = [f for f in moved if search.explains(f)]
+        singles = sorted((*moved, *singles), key=lambda f: f.cost)
     if explaining:
         best, rivals = ranked(search, [simplest(search, f) for f in explaining])
-        return Decision("explained", best, rivals=rivals)
+        return Decision("explained", best, rivals=rivals), singles
     if search.explains(start):
-        return Decision("none", start)
-    return None
+        return Decision("none", start), singles
+    return None, singles
 
 
 def _ended(search: Search, fits: Sequence[Fit]) -> list[Fit]:
@@ -452,7 +454,7 @@ def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: 
         return replace(candidate, cost=float(by_channel.mean()), cost_by_channel=by_channel)
 
     promising = [f for f in map(heard, singles) if louder.explains(f) or louder.near(f, ATTRIBUTION.very_near)]
-    decision = _without_a_second(louder, heard(start), promising) if promising else None
+    decision = _without_a_second(louder, heard(start), promising)[0] if promising else None
     if decision is None or decision.outcome != "explained":
         return None
     return decision._replace(noise=noise)
