@@ -115,8 +115,7 @@ class Motion:
         q, v, forces = (array[:, lead:] for array in (self.displacement, self.velocity, self.forces))
         steps = tuple(replace(step, forces=step.forces[:, lead:]) for step in self.steps)
         held = self.held[:, lead:] if isinstance(self.held, np.ndarray) else self.held
-        motion = {"displacement": q, "velocity": v, "forces": forces, "held": held}
-        later = replace(self, **motion, stiffness=stiffness, steps=steps)
+        later = Motion(q, v, forces, stiffness, self.damping, steps, held, self.finer)
         if self.finer is None:
             return later
         times, move_again = self.finer

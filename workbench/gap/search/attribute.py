@@ -359,7 +359,7 @@ def _beside_one_sensor(search: Search, start: Fit, evidence: Evidence) -> Decisi
 
 
 def _without_a_second(search: Search, start: Fit, singles: list[Fit]) -> tuple[Decision | None, list[Fit]]:
-    """What needs no second effect, None where nothing alone explains the records; and the singles where they fit best."""
+    """What needs no second effect, None where nothing alone explains the records; and singles, where they fit best."""
     good = [f for f in singles if search.significant(f, start.cost)]
     if search.explains(start) and not good:
         return Decision("none", start), singles
