@@ -71,6 +71,10 @@ class FitData:
         """The same yardstick with other substeps."""
         return replace(self, substeps=substeps)
 
+    def finely(self, substeps: int) -> "FitData":
+        """The same yardstick with at least so many substeps."""
+        return self.stepped(max(substeps, self.substeps))
+
     def with_noise(self, noise: np.ndarray) -> "FitData":
         """The same yardstick with other standard deviations of the sensors' noise (n_outputs,)."""
         return replace(self, noise=noise)

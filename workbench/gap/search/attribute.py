@@ -258,7 +258,7 @@ def attribute(
 
 def _anew(search: Search, effects: Sequence[Effect], data: FitData) -> Fit:
     """The effects fitted to all records, from where they are near."""
-    finely = data.stepped(SELECTION.fine)
+    finely = data.finely(SELECTION.fine)
     return fit(search.rig, effects, finely, iterations=ATTRIBUTION.together, workers=search.workers, chord=True)
 
 
@@ -268,7 +268,7 @@ def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: flo
     Where the records need it all the same, they tell two of its numbers together alone: friction far below its
     smoothing speed is a damper, a hysteretic spring that always slides is friction.
     """
-    data, rig = search.data.stepped(SELECTION.fine), search.rig
+    data, rig = search.data.finely(SELECTION.fine), search.rig
 
     for effect in best.effects:
         if effect in seen or effect.stands_out(rig):

@@ -18,10 +18,10 @@ from workbench.structure.domain import Between, Domain, Interval, Rectangle, Whe
 def finished(search: Search, candidate: Fit) -> Fit:
     """The same set on all records with finer substeps, to the end; as it is where they bring it no nearer."""
     if candidate.falling == 0 and not search.explains(candidate):
-        finely = cost_of(search.rig, candidate.effects, search.data.stepped(SELECTION.fine))
+        finely = cost_of(search.rig, candidate.effects, search.data.finely(SELECTION.fine))
         if finely - 1.0 > FINISH.no_nearer * (candidate.cost - 1.0):
             return _by_finest_steps(search, candidate)
-    ended = fit(search.rig, candidate.effects, search.data.stepped(SELECTION.fine), iterations=25, tolerance=1e-7)
+    ended = fit(search.rig, candidate.effects, search.data.finely(SELECTION.fine), iterations=25, tolerance=1e-7)
     return _by_finest_steps(search, ended)
 
 
@@ -55,11 +55,19 @@ def widened(search: Search, found: Fit) -> Fit:
     sets = list(wider_sets(found.effects))
     if not sets:
         return found
-    data = search.data.stepped(SELECTION.fine)
+    data = search.data.finely(SELECTION.fine)
     cost = cost_of(search.rig, found.effects, data)
+
+    def anew(effects: Sequence[Effect]) -> Fit:
+        return fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=True)
+
     for effects in sets:
-        trial = fit(search.rig, effects, data, iterations=FINISH.widening, workers=search.workers, chord=True)
-        if search.tells_apart(trial.cost, cost, trial.n_parameters - found.n_parameters):
+        trial = anew(effects)
+        extra = trial.n_parameters - found.n_parameters
+        # what the fit anew of all other numbers brings, it brings to the plain form too
+        if search.tells_apart(trial.cost, cost, extra) and search.tells_apart(
+            trial.cost, anew(found.effects).cost, extra
+        ):
             return trial
     return found
 
@@ -167,7 +175,7 @@ def simplest(search: Search, candidate: Fit) -> Fit:
     def tried(effects: tuple[Effect, ...]) -> Fit | None:
         if promise(fit(search.rig, effects, search.quick, iterations=FINISH.at_first)) > FINISH.too_far * here:
             return None
-        trial = fit(search.rig, effects, search.data.stepped(SELECTION.fine), iterations=12, tolerance=1e-7)
+        trial = fit(search.rig, effects, search.data.finely(SELECTION.fine), iterations=12, tolerance=1e-7)
         return trial if search.explains(trial) and not _pays(search, candidate, trial) else None
 
     simpler = next(filter(None, search.workers.map(tried, _simpler_sets(search, candidate))), None)

@@ -89,17 +89,16 @@ def fit_jointly(
         to_the_end: until no step lowers the cost, by fine steps of time where a law needs them.
     """
     rounds = JOINT.rounds if rounds is None else rounds
-    substeps = SELECTION.fine if to_the_end else 4
+    whole, before = search.data.finely(SELECTION.fine) if to_the_end else search.data, np.inf
     if to_the_end:
         errors = replace(errors, target=replace(errors.target, waves=JOINT.last_waves))
     if known is None:
         errors = opened(search, errors)
-    whole, before = search.data.stepped(substeps), np.inf
     i = counted = 0
     while counted < rounds and i < JOINT.most_rounds:
         # the two most telling records lead the way
         quickly = known is not None or (i == 0 and not to_the_end)
-        data = search.quick.stepped(substeps) if quickly else whole
+        data = search.quick.stepped(whole.substeps) if quickly else whole
         left = data.residual(apply_all(search.rig, (*effects, errors)))
         with np.errstate(over="ignore"):  # of a motion that runs away
             level = max(float(left @ left) / left.size, 1.0)
@@ -121,12 +120,14 @@ def fit_jointly(
         )
         *effects, errors = found.effects
         errors = _resized(errors)
-    return measured(search, replace(found, effects=(*effects, errors if to_the_end else _closed(errors))), substeps)
+    return measured(
+        search, replace(found, effects=(*effects, errors if to_the_end else _closed(errors))), whole.substeps
+    )
 
 
-def measured(search: Search, found: Fit, substeps: int = 4) -> Step:
-    """Effects and errors, the errors last, as they leave the records of a search."""
-    whole, rig = search.data.stepped(substeps), apply_all(search.rig, found.effects)
+def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
+    """Effects and errors, the errors last, as they leave the records of a search, by its substeps unless others are."""
+    whole, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
     if search.logged:
         by_channel = whole.by_channel(whole.residual(rig))
         of_noise = np.ones_like(by_channel)

@@ -119,7 +119,7 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) 
     """
     quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.plainly), list(sets))
     near = [f for f in quickly if f.cost < PLAIN.near and not _is_worse(search, f, step, search.quick)]
-    whole, best = search.data.stepped(SELECTION.fine), None
+    whole, best = search.data.finely(SELECTION.fine), None
     for candidate in sorted(near, key=lambda f: f.n_parameters):
         if best is not None and _labels(best) <= _labels(candidate):
             continue
@@ -159,7 +159,7 @@ def _with_one_late(search: Search, found: Fit) -> Fit:
     delay = None if late is None else one_late(late)
     if delay is None:
         return found
-    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.stepped(SELECTION.fine))
+    alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.finely(SELECTION.fine))
     return alone if search.explains(alone) else found
 
 
@@ -186,7 +186,7 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
     if found is None:
         return None
     rest = [e for e in found.effects if e.kind in COMMON or any(e.label == other.label for other in given)]
-    without = fit(search.rig, rest, search.data.stepped(SELECTION.fine), iterations=PLAIN.plainly)
+    without = fit(search.rig, rest, search.data.finely(SELECTION.fine), iterations=PLAIN.plainly)
     extra = found.n_parameters - without.n_parameters
     worth = without.cost - found.cost > SEARCH.significant and search.surely_better(found, without.cost, extra)
     return found if worth else None

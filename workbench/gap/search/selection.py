@@ -141,12 +141,12 @@ def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
     rig = apply_all(search.rig, effects)
     if is_stepped(rig) and not search.held and search.data.follower is None:
         for loose in SELECTION.continuation:
-            data = search.data.following(rig, loose).stepped(SELECTION.fine)
+            data = search.data.following(rig, loose).finely(SELECTION.fine)
             held = fit(search.rig, effects, data, iterations=8, tolerance=1e-4)
             effects = held.effects
             if (
                 held.cost > SELECTION.promising
-                or cost_of(search.rig, effects, search.data.stepped(SELECTION.fine)) < SELECTION.at_hand
+                or cost_of(search.rig, effects, search.data.finely(SELECTION.fine)) < SELECTION.at_hand
             ):
                 break
     return whole(search, effects, iterations)
@@ -154,5 +154,5 @@ def followed(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fi
 
 def whole(search: Search, effects: tuple[Effect, ...], iterations: int) -> Fit:
     """The set fitted to whole records."""
-    data = search.data.stepped(SELECTION.fine)
+    data = search.data.finely(SELECTION.fine)
     return fit(search.rig, effects, data, held=search.held, iterations=iterations)

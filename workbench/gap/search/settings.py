@@ -230,6 +230,8 @@ class StepwiseSettings:
     no_gap: float = 0.15
     # likewise, that errors of the model alone leave in trials that hide nothing: under 0.02 in 40 of them
     spotless: float = 0.05
+    # likewise, that substeps twice as fine may move the readings by; where it is more, the search goes on by finer ones
+    stepping: float = 0.05
     excluded: float = 1e-3  # probability below which another set that explains the records is no rival
     # share of the nominal gap's power from which on a fit that began one sample ahead may have gone astray
     astray: float = 0.02

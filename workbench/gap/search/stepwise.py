@@ -25,7 +25,8 @@ from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_s
 from workbench.gap.search.plain import COMMON, in_place_of_errors, one_late
 from workbench.gap.search.search import Decision, Search, in_one_valley, most_informative, spread_over_kinds
 from workbench.gap.search.selection import one_more
-from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, STEPWISE
+from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
+from workbench.rig.simulate import is_stepped
 
 TIMING = {"sensor_delay": "delay", "sensor_lag": "time_constant"}  # kinds, and the time that a sensor is late by
 
@@ -44,6 +45,7 @@ class Stepwise:
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
         is_beyond: whether effects crowd about one place, as they do where a law is beyond the catalogue.
         is_tried: whether an effect has been tried beside noise of the logged inputs, which may stand for it.
+        is_finer: whether it goes on by finer substeps than it began with.
         is_run: whether effects have been added as long as that pays.
     """
 
@@ -65,6 +67,7 @@ class Stepwise:
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
         self.is_tried = False
+        self.is_finer = False
         self.is_run = False
         self.plain: Fit | None = None
         self.is_beyond = False
@@ -107,6 +110,7 @@ class Stepwise:
             return self.is_enough
         self.steps.append(best)
         self._with_input_noise(best)
+        self.steps.append(self._finely(self.last))
         return True
 
     def run(self) -> None:
@@ -126,7 +130,7 @@ class Stepwise:
             self._with_input_noise(step)
             if heard and not self.search.logged:  # what stood beside a noise that is none stands anew
                 self.steps[-1] = self._chosen_again(replace(self.last, others=step.others))
-            self.steps.append(self._without_needless(self.last))
+            self.steps.append(self._finely(self._without_needless(self.last)))
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
                 break
         limit = self._in_limit(self.last)
@@ -149,6 +153,31 @@ class Stepwise:
     def _is_spotless(self) -> bool:
         """Whether what the last set leaves above the noise is less than any effect would."""
         return self.last.excess(self.last.noise_power) < STEPWISE.spotless * float(self.last.noise_power.mean())
+
+    def _finely(self, step: Step) -> Step:
+        """The step by substeps that leave nothing of their own, where all but the noise is explained.
+
+        The search goes on by them: what coarser ones leave calls for another effect.
+        """
+        rig, noise = apply_all(self.search.rig, step.fit.effects), step.noise_power
+        near = step.excess(noise) < STEPWISE.further * self._gap
+        if not (step.effects and near and is_stepped(rig)) or self.explains(step):
+            return step
+        data, substeps = self.search.data, self.search.data.substeps
+        left = data.residual(rig)
+        while substeps < FINISH.finest:
+            finer = data.stepped(2 * substeps).residual(rig)
+            moved, left = finer - left, finer
+            if float(moved @ moved) < STEPWISE.stepping * moved.size:
+                break
+            substeps *= 2
+        if substeps == data.substeps:
+            return step
+        self.is_finer = True
+        self.search, self.at_first = (
+            replace(each, data=each.data.stepped(substeps)) for each in (self.search, self.at_first)
+        )
+        return replace(fit_jointly(self.search, step.effects, step.errors, rounds=2), others=step.others)
 
     def _with_input_noise(self, step: Step) -> Step | None:
         """The step beside noise of the logged inputs, where that makes what it leaves all but white; None elsewhere.
@@ -223,7 +252,7 @@ class Stepwise:
 
     def decision(self) -> Decision:
         """What the effects of the last set explain."""
-        beside = self.search if self.search.logged else None
+        beside = self.search if self.search.logged or self.is_finer else None
         if self.plain is not None:
             return Decision("explained", self.plain, noise=self.search.data.noise, beside=beside)
         effects, left = self.last.effects, self.unexplained
