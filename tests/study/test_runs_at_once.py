@@ -24,8 +24,12 @@ def function(at, pause, log):
 
 if __name__ == "__main__":
     folder, n, pause, workers = sys.argv[1:]
+    def told(text, share):
+        with open(folder + "/told", "a") as file:
+            file.write(text + "\\n")
+
     found = study.run(study.grid(at=range(int(n)), pause=[float(pause)], log=[folder + "/log"]), function,
-        cache=folder + "/cache", workers=int(workers))
+        cache=folder + "/cache", workers=int(workers), report=told)
     print([row["third"] for row in found])
 """
 
@@ -37,13 +41,14 @@ def started(tmp_path, n, pause, workers):
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
 
 
-@pytest.mark.parametrize(("n", "pause", "workers"), [(8, 0.5, 1), (12, 0.5, 2)])
+@pytest.mark.parametrize(("n", "pause", "workers"), [(9, 0.2, 1), (13, 0.2, 2)])
 def test_runs_at_once_share_their_cases(tmp_path, n, pause, workers):
     runs = [started(tmp_path, n, pause, workers) for _ in range(2)]
     assert [run.communicate()[0].strip() for run in runs] == [str([at / 3 for at in range(n)])] * 2
     lines = [line.split() for line in (tmp_path / "log").read_text().splitlines()]
     assert Counter(int(at) for at, *_ in lines) == Counter(range(n)), "each case once"
     assert not list((tmp_path / "cache").rglob("*.lock"))
+    assert "waiting for what another run is at: " in (tmp_path / "told").read_text()
 
 
 def test_a_run_that_is_killed_holds_nobody_up(tmp_path):

@@ -114,9 +114,13 @@ def unpacked(function: bytes) -> Callable[..., Any]:
     return found
 
 
-def here(function: Callable[..., Any], jobs: list[Job]) -> Iterator[tuple[str, dict[str, Any]]]:
-    """One after the other, in this process; last those that another run was at."""
+def here(
+    function: Callable[..., Any], jobs: list[Job], awaiting: Callable[[int], None]
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """One after the other, in this process; last those that another run was at, how many of them is told."""
     for wait in (False, True):
+        if wait and jobs:
+            awaiting(len(jobs))
         elsewhere = []
         for job in jobs:
             record = once(function, job, wait=wait)
@@ -127,11 +131,13 @@ def here(function: Callable[..., Any], jobs: list[Job]) -> Iterator[tuple[str, d
         jobs = elsewhere
 
 
-def processes(function: Callable[..., Any], jobs: list[Job], workers: int) -> Iterator[tuple[str, dict[str, Any]]]:
+def processes(
+    function: Callable[..., Any], jobs: list[Job], workers: int, awaiting: Callable[[int], None]
+) -> Iterator[tuple[str, dict[str, Any]]]:
     """In processes of this machine, in the order in which they end.
 
     A case whose process dies takes the others' processes with it. Those that were running then are computed again, each
-    on its own; what dies alone has only itself to blame. Cases that another run is at come last.
+    on its own; what dies alone has only itself to blame. Cases that another run is at come last, how many is told.
 
     Raises:
         StudyError: processes die before they begin a case.
@@ -144,6 +150,8 @@ def processes(function: Callable[..., Any], jobs: list[Job], workers: int) -> It
         while waiting:
             before = len(waiting), len(elsewhere)
             ours = [job for job in waiting.values() if job.key not in elsewhere]
+            if not ours:
+                awaiting(len(waiting))
             try:
                 for key, record in _parallel(sent, ours or waiting.values(), workers, running, wait=not ours):
                     if record is None:

@@ -43,7 +43,7 @@ def run(
         workers: processes; one for each core unless given. With one, cases are computed in this process.
         scheduler: address of a Dask scheduler, such as tcp://10.0.0.5:8786, whose workers take the cases instead.
         seed: root of the seeds.
-        report: called with what is done, and the share of it, after each case.
+        report: called with what is done, or what other run is waited for, and the share of it.
 
     Raises:
         StudyError: no cases; a case or function whose result could not be distinguished from another's; a cluster
@@ -66,7 +66,12 @@ def run(
     }
     _report(report, len(records), len(set(keys)))
     unkept: list[str] = []
-    for key, record in _computed(function, list(jobs.values()), workers, scheduler):
+
+    def awaiting(n: int) -> None:
+        if report is not None:
+            report(f"waiting for what another run is at: {n} of the cases", len(records) / len(set(keys)))
+
+    for key, record in _computed(function, list(jobs.values()), workers, scheduler, awaiting):
         records[key] = record
         if folder is not None and scheduler:
             record["unkept"] = keep(_file(folder, key), record)
@@ -87,14 +92,20 @@ def run(
 
 
 def _computed(
-    function: Callable[..., Any], jobs: list[Job], workers: int | None, scheduler: str | None
+    function: Callable[..., Any],
+    jobs: list[Job],
+    workers: int | None,
+    scheduler: str | None,
+    awaiting: Callable[[int], None],
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     if not jobs:
         return iter(())
     if scheduler:
         return cluster(function, jobs, scheduler)
     workers = min(workers or joblib.cpu_count(), len(jobs))
-    return here(function, jobs) if workers == 1 else processes(function, jobs, workers)
+    if workers == 1:
+        return here(function, jobs, awaiting)
+    return processes(function, jobs, workers, awaiting)
 
 
 def _seeds(cases: Sequence[Mapping[str, Any]], function: Callable[..., Any], root: int) -> list[int | None]:
