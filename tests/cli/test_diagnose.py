@@ -76,3 +76,7 @@ def test_a_nominal_model_is_learnt_from_a_record_at_low_level(run, tmp_path, mon
     predicted = simulate(found, high.inputs, sample_time=dt).outputs
     assert np.std(predicted - high.outputs) < 0.05 * np.std(high.outputs)
     assert "not both" in run("diagnose", tmp_path, *options).output
+    options = (*options, "--quantity", "displacement", "--driving-point")
+    assert "INPUT,OUTPUT" in run("diagnose", *options, "F1").output
+    assert "driving_point is (input, output)" in run("diagnose", *options, "F1,nowhere").output
+    assert "the search has begun" in run("diagnose", *options, f"F1,{real.rig.sensors[0].name}").output

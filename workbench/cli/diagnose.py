@@ -26,6 +26,10 @@ def diagnose(
     quantity: Annotated[
         str, typer.Option(help="With --nominal: of outputs that state none: displacement, velocity, acceleration.")
     ] = "",
+    driving_point: Annotated[
+        str,
+        typer.Option(metavar="INPUT,OUTPUT", help="With --nominal: an input and the output at its place, for scale."),
+    ] = "",
     json_path: JsonPath = None,
     page: PagePath = None,
     free_nominal: Annotated[
@@ -61,7 +65,14 @@ def diagnose(
     if nominal is not None:
         if not records:
             raise ValueError("--nominal needs at least one record to diagnose: give --records")
-        found = measured_case(nominal, records, validate or (), inputs=names_in(inputs), quantity=quantity)
+        found = measured_case(
+            nominal,
+            records,
+            validate or (),
+            inputs=names_in(inputs),
+            quantity=quantity,
+            driving_point=names_in(driving_point),
+        )
     elif case is not None:
         found = read_case(case)
     check_kept_apart(found.fit, found.validation)

@@ -148,7 +148,8 @@ def _of_residues(
     if pair is None and masses is None:
         warnings.warn(
             "no output stands where an input acts, so the shapes have no scale: responses to these inputs are right,"
-            " those to masses, springs or forces elsewhere are not; give driving_point= or modal_masses=",
+            " those to masses, springs or forces elsewhere are not; name an input and the output at its place as the"
+            " driving point (driving_point, --driving-point), or give modal_masses",
             stacklevel=4,
         )
     rows = {channel.name: (channel, i) for i, channel in enumerate((*into, *out), start=-len(into))}

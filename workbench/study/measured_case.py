@@ -19,6 +19,7 @@ def measured_case(
     *,
     inputs: tuple[str, ...] = (),
     quantity: str = "",
+    driving_point: tuple[str, ...] = (),
 ) -> Case:
     """The case whose nominal rig is identified from one driven record.
 
@@ -28,9 +29,11 @@ def measured_case(
         validation: files that only measure how far the gap shrinks.
         inputs: names of the input channels, where the files do not say.
         quantity: of outputs whose files state none: "displacement", "velocity" or "acceleration".
+        driving_point: an input and the output at its place, which scale the shapes; those of one name or place unless
+            given.
 
     Raises:
-        ValueError: no inputs, outputs of no known quantity, files of other channels.
+        ValueError: no inputs, outputs of no known quantity, files of other channels, a driving point of other names.
     """
 
     def read(path: Path) -> Record:
@@ -44,5 +47,8 @@ def measured_case(
     unknown = [channel.name for channel in low.output_channels if channel.quantity not in MEASURED]
     if unknown:
         raise ValueError(f"{nominal}: the quantity of {', '.join(unknown)} is not stated; give --quantity acceleration")
-    rig = rig_from(identify_driven([low]))
+    if len(driving_point) not in (0, 2):
+        raise ValueError(f"--driving-point is INPUT,OUTPUT; got {','.join(driving_point)}")
+    pair = (driving_point[0], driving_point[1]) if driving_point else None
+    rig = rig_from(identify_driven([low]), driving_point=pair)
     return Case(nominal.stem, rig, tuple(map(read, records)), tuple(map(read, validation)))

@@ -8,6 +8,7 @@ import pytest
 
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import kind_named
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.report.budget import budget_of
 
@@ -67,3 +68,17 @@ def test_errors_that_no_careful_model_has_are_not_called_small(hinged_rig, recor
     assert ("small errors of the model" in sentence) is small and (
         "errors of the model, not small" in sentence
     ) != small
+
+
+def test_effects_of_one_kind_have_shares_of_their_own(hinged_rig, record_of):
+    """Two masses: what each takes away stands beside its place, and all shares sum to one."""
+    rig, rng = hinged_rig(3), np.random.default_rng(5)
+    masses = [
+        Effect(kind_named("point_mass"), None, {"at": at, "mass": mass}) for at, mass in ((0.4, 0.05), (1.5, 0.01))
+    ]
+    record = record_of(apply_all(rig, masses), np.repeat(rng.normal(size=40), 10)[None], rng, name="high")
+    budget = budget_of(rig, masses, None, (record,), noise_found=np.full(4, 1e-5))
+    assert list(budget.effects) == ["point_mass[x = 0.4]", "point_mass[x = 1.5]"]
+    assert budget.effects["point_mass[x = 0.4]"] > 2.0 * budget.effects["point_mass[x = 1.5]"] > 0.0
+    assert sum(budget.effects.values()) + budget.unexplained + budget.noise == pytest.approx(1.0)
+    assert budget.to_json()["effects"] == {"point_mass": pytest.approx(sum(budget.effects.values()), abs=1e-5)}

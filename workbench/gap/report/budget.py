@@ -15,6 +15,7 @@ from workbench.gap.report.shrinkage import scale_of
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
+from workbench.structure.domain import Domain
 
 REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
 IN_PERCENT = ("stiffness", "mass", "frequency", "damping")
@@ -30,8 +31,8 @@ class Budget:
     """Shares of the mean square of the nominal residual, which sum to one.
 
     Attributes:
-        effects: share that each named effect takes away, by label, in the order in which they count; a figure that
-            differs from record to record stands among them, as "stiffness_record_to_record".
+        effects: share that each named effect takes away, by label (`labels_of`), in the order in which they count; a
+            figure that differs from record to record stands among them, as "stiffness_record_to_record".
         nominal: share that small errors of the nominal model take away beyond them, and that noise of the logged inputs
             leaves.
         unexplained: share that is left and is not noise.
@@ -116,7 +117,7 @@ def budget_of(
         real = apply_all(rig, chosen)
         return np.array([mean_square(real, record, settle) for record in records])
 
-    labels, causes = [effect.label for effect in effects], list(effects)
+    labels, causes = labels_of(effects, rig.modes.domain), list(effects)
     alike, between = (None, None) if errors is None else parted(errors)
     if between is not None:
         labels.append(label_of(between.target.figure))
@@ -153,6 +154,15 @@ def budget_of(
         noise_found=tuple(noise_found.tolist()),
         sensors=tuple(s.name for s in rig.sensors),
     )
+
+
+def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
+    """What each effect is called in a budget; those of one kind, which differ in their places alone, by these too."""
+    labels = [effect.label for effect in effects]
+    return [
+        f"{label}[{domain.text(effect.at)}]" if labels.count(label) > 1 and effect.at is not None else label
+        for effect, label in zip(effects, labels, strict=True)
+    ]
 
 
 def mean_square(rig: Rig, record: Record, settle: float) -> float:

@@ -11,7 +11,7 @@ from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.where import Where
-from workbench.gap.report.budget import Budget
+from workbench.gap.report.budget import Budget, labels_of
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
 from workbench.gap.report.record_to_record import RecordToRecord
@@ -141,9 +141,13 @@ class Verdict:
 
     def _share_of(self, effect: Effect) -> float:
         """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
-        shares = self.budget.effects
-        if effect.label in shares:
-            return shares[effect.label]
+        shares, named = self.budget.effects, [e for e in self.effects if not e.kind.first]
+        label = next(
+            (label for e, label in zip(named, labels_of(named, self.nominal.modes.domain), strict=True) if e is effect),
+            effect.label,
+        )
+        if label in shares:
+            return shares[label]
         return sum(share for label, share in shares.items() if label.split("[")[0] == effect.kind.name)
 
     @property
