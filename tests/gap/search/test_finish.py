@@ -30,9 +30,9 @@ def rig(hinged_rig):
 def search(rig, record_of):
     """A search in a record of what the rig really is."""
 
-    def make(real, workers: int = 1, level: float = 1.0) -> Search:
+    def make(real, workers: int = 1, level: float = 1.0, steps: int = 100) -> Search:
         rng = np.random.default_rng(0)
-        command = level * np.repeat(rng.normal(size=100), 10)[None]
+        command = level * np.repeat(rng.normal(size=steps), 10)[None]
         data = FitData((record_of(real, command, rng, substeps=8),), np.full(4, NOISE))
         quick, nominal = data.stepped(2), data.by_channel(data.residual(rig))
         return Search(rig, data, quick, quick, CATALOGUE, lambda text, share: None, Workers(workers), nominal)
@@ -54,6 +54,15 @@ def test_a_hysteretic_spring_that_yields_is_no_plain_one(rig, search):
     start = Effect(BOUC_WEN, None, {"at": 0.6, "stiffness": 28.0, "yield_displacement": 0.025})
     found = finished(one, fit(one.rig, (start,), one.data))
     assert one.explains(found) and simplest(one, found) is found
+
+
+@pytest.mark.parametrize(("better", "told"), [(0.004, "actuator_gain[F]"), (0.02, "actuator_hysteresis[F]")])
+def test_a_wider_law_is_told_for_more_than_a_trifle(rig, search, better, told):
+    """Of 20,000 values in coloured noise a width of next to nothing gains a likelihood ratio of e^40."""
+    gain, hysteresis = kind_named("actuator_gain"), kind_named("actuator_hysteresis")
+    one = search(gain.apply(rig, "F", {"gain": 0.93}), steps=500)
+    wide = fit(one.rig, (Effect(hysteresis, "F", {"share": 0.07, "width": 1e-9}),), one.data)
+    assert simplest(one, replace(wide, cost=wide.cost - better)).labels == (told,)
 
 
 def test_a_fit_on_its_way_to_more_than_is_of_use_stays_where_it_is(rig, search, monkeypatch):

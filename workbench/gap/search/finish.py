@@ -164,8 +164,7 @@ def plainest(search: Search, fits: Sequence[Fit], *, worth: float = 0.0) -> list
 
 
 def _pays(search: Search, candidate: Fit, simpler: Fit) -> bool:
-    extra = max(candidate.n_parameters - simpler.n_parameters, 1)
-    return search.surely_better(candidate, simpler.cost, extra)
+    return search.tells_apart(candidate.cost, simpler.cost, max(candidate.n_parameters - simpler.n_parameters, 1))
 
 
 def simplest(search: Search, candidate: Fit) -> Fit:
