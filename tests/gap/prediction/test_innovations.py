@@ -2,13 +2,18 @@
 
 import gc
 import weakref
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect
+from workbench.gap.prediction.innovations import LOOSE, Follower
 from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.unmodelled_force import sampled_model
 from workbench.gap.search.fit import cost_of
+from workbench.records.record import Channel, Record
 
 
 def test_exchanged_sensors_do_not_make_the_correction_run_away(hinged_rig, record_of):
@@ -26,6 +31,26 @@ def test_exchanged_sensors_do_not_make_the_correction_run_away(hinged_rig, recor
         data = FitData((record,), noise).following(rig)
         assert cost_of(rig, (), data) > 100.0
         assert cost_of(rig, (there,), data) < 1.5
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
+def test_errors_beside_the_forces_that_are_believed_are_white(hinged_rig, quantity):
+    """An accelerometer reads the force of this interval, which the motion until the next sample then has in it."""
+    rig, rng, dt, noise = hinged_rig(4), np.random.default_rng(1), 0.01, np.full(4, 1e-5)
+    rig = replace(rig, sensors=tuple(replace(s, quantity=quantity) for s in rig.sensors))
+    model, middle = sampled_model(rig.modes, rig.sensors, noise, dt), (np.arange(50) + 0.5) / 50 * rig.modes.length
+    forces = LOOSE * np.sqrt(np.mean(rig.modes.phi(middle) ** 2, axis=0))[:, None] * rng.normal(size=(4, 20_000))
+    state, outputs = np.zeros(8), np.empty((4, 20_000))
+    for k in range(20_000):
+        outputs[:, k] = model.output @ state + model.feedthrough @ forces[:, k]
+        state = model.transition @ state + model.growth @ forces[:, k]
+    outputs += noise[:, None] * rng.normal(size=outputs.shape)
+    channels = tuple(Channel(s.name, s.quantity) for s in rig.sensors)
+    record = Record(dt, outputs, channels, np.zeros((1, 20_000)), (Channel("F", "force"),))
+    errors = Follower.of(rig, noise, 1.0, dt).errors(rig, record, 1)[:, 1000:]
+    np.testing.assert_allclose(np.cov(errors), np.eye(4), atol=0.05)
+    for lag in (1, 2, 5):
+        assert np.abs(errors[:, lag:] @ errors[:, :-lag].T / errors.shape[1]).max() < 0.04
 
 
 def test_records_and_motions_are_let_go(hinged_rig, record_of):
