@@ -24,7 +24,7 @@ from workbench.robust.redesign import redesign
 from workbench.trials.controlled import control_plant
 from workbench.trials.make import find_trial_with_plant
 
-PLANTS, SEED = 30, 20301
+PLANTS, SEED = 30, 20305
 DIRT = ("clean", "offset")
 LAWS = ("imsc", "coupled")
 CONTROLLED, DAMPING = 2, 0.35
