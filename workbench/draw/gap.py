@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from workbench.arrays import Floats
-from workbench.draw.style import COLOURS, GREY, new_figure, plain_ticks
+from workbench.draw.style import COLOURS, GREY, in_units, new_figure, plain_ticks
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.effect import Effect, apply_all, label_in_words
 from workbench.gap.localisation.evidence import Evidence
@@ -39,7 +39,7 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure
         for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
             ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style)
         ax.set_title(f"record {record.name}, sensor {channel.name}")
-        ax.set_ylabel(f"{channel.quantity} [{channel.unit}]" if channel.unit else channel.quantity)
+        ax.set_ylabel(in_units(channel.quantity, channel.unit))
         ax.legend(loc="upper right", ncols=3)
     axes[-1, 0].set_xlabel("time [s]")
     return figure

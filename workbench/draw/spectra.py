@@ -105,7 +105,7 @@ def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
         column[0].set_title(found.name)
         column[-1].set_xlabel("frequency [Hz]")
     for ax, channel in zip(axes[:, 0], rows, strict=True):
-        ax.set_ylabel(channel.name + (f"\n[{channel.unit} rms]" if channel.unit else ""))
+        ax.set_ylabel(in_units(channel.name, channel.unit and f"{channel.unit} rms"))
     lowest = min(float(np.median(found.noise[found.noise > 0])) for found in distortions if (found.noise > 0).any())
     for ax in axes.flat:
         ax.set_ylim(bottom=max(ax.get_ylim()[0], 0.05 * lowest))

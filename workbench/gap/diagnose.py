@@ -13,11 +13,11 @@ from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
 from workbench.gap.prediction.deadline import Deadline
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.report.budget import Budget, budget_of, mean_square, power_of_inputs
+from workbench.gap.report.budget import Budget, budget_of, mean_square, power_in, power_of_inputs
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.record_to_record import with_held_out
-from workbench.gap.report.shrinkage import Shrinkage, measure, scale_of
+from workbench.gap.report.shrinkage import Shrinkage, measure
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, baseline
@@ -178,12 +178,7 @@ def _acts(
 ) -> float:
     """Mean square by which the readings of records differ between two sets of effects, in the same measure."""
     one, other = apply_all(rig, effects), apply_all(rig, others)
-    apart = 0.0
-    for record in unseen:
-        lead = round(settle / record.sample_time)
-        moved = (predict(one, record) - predict(other, record))[:, lead:] / scale_of(record.outputs[:, lead:])
-        apart += float((moved**2).mean())
-    return apart
+    return sum(power_in(record, predict(one, record) - predict(other, record), settle) for record in unseen)
 
 
 def _outcome(

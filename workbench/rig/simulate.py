@@ -292,7 +292,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         response += held_response(system, constant, participation, sample_time)[0]
         acting += constant
     on_modes = participation @ acting
-    held = on_modes.copy() if input_hold == "zero" else 0.0
+    held = on_modes if input_hold == "zero" else 0.0
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
         if not isinstance(element, PeriodicForce):
@@ -300,7 +300,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
         shape = modes.phi_at(element.at)
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
         response += sinusoid_response(system, shape, omega, phasor, sample_time, n_samples)
-        on_modes += np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
+        on_modes = on_modes + np.outer(shape, (phasor * np.exp(1j * omega * time)).imag)
     q, v = modal_motion(system, response)
     return Motion(q, v, on_modes, modes.omega[:, None] ** 2, modes.damping, steps, held)
 

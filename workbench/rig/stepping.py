@@ -23,6 +23,15 @@ FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
 # at four substeps a sample, they leave a thirteenth of the power of the error. Stops, whose force has a corner only,
 # gain nothing: errors at the corner and in contact all but cancel, as long as the substeps are even
 PARTS = 8
+# What `advance` takes, as it describes them.
+Linear = tuple[Floats, Floats, Floats]
+Drives = tuple[Floats, Floats]
+Elements = tuple[Integers, Floats, Floats]
+Along = tuple[float, Floats, Floats, Floats, Floats, Floats]
+Moving = tuple[Floats, Floats, Floats]
+Points = tuple[Floats, Floats, Floats, Floats]
+Work = tuple[Floats, Floats, Floats, Floats, Floats, Floats]
+Kept = tuple[Floats, Floats, Floats, Floats]
 LANES = 8  # modes that are worked on at once; a number of them that is no multiple is rounded up, with modes at rest
 
 
@@ -302,16 +311,14 @@ def spread_forces(
 
 
 @njit(cache=True, nogil=True, fastmath=FAST)
-def drifted_propagators(
-    omega: Floats, c: Floats, h: float, factor: float, shapes: Floats, linear: tuple[Floats, Floats, Floats]
-) -> None:
-    """Fill propagators (2, 4, n_modes) at `factor` times the stiffness, and the reactions of the elements to them.
+def _reactions(omega: Floats, c: Floats, h: float, shapes: Floats, linear: Linear) -> None:
+    """Fill propagators (2, 4, n_modes) over a substep, and the reactions of the elements to them.
 
     The reactions, two of (n_elements, n_elements), are displacement and velocity of element i after a substep by a
     force of element j that has risen to one at its end.
     """
     e, aw, av = linear
-    propagators(omega * math.sqrt(max(factor, 1e-6)), c, h, e)
+    propagators(omega, c, h, e)
     for i in range(shapes.shape[0]):
         for j in range(shapes.shape[0]):
             aw[i, j] = 0.0
@@ -321,16 +328,31 @@ def drifted_propagators(
                 av[i, j] += shapes[i, r] * e[1, 3, r] * shapes[j, r]
 
 
+@njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
+def _rubs(kinds: Integers) -> bool:
+    """Whether there is friction."""
+    for i in range(kinds.size):
+        if kinds[i] == FRICTION:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, fastmath=FAST)
+def drifted_propagators(
+    omega: Floats, c: Floats, h: float, factor: float, elements: Elements, linear: Linear, finely: Linear
+) -> None:
+    """Fill `linear` of a substep at `factor` times the stiffness, and `finely` where friction may turn."""
+    kinds, shapes, _ = elements
+    drifted = omega * math.sqrt(max(factor, 1e-6))
+    _reactions(drifted, c, h, shapes, linear)
+    if _rubs(kinds):
+        _reactions(drifted, c, h / PARTS, shapes, finely)
+
+
 # Neither called nor counting references to its arrays: either would cost as much as the work of a substep.
 @njit(cache=True, nogil=True, fastmath=FAST, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def _advance_once(
-    linear: tuple[Floats, Floats, Floats],
-    drives: tuple[Floats, Floats],
-    elements: tuple[Integers, Floats, Floats],
-    along: tuple[float, Floats, Floats, Floats, Floats, Floats],
-    motion: tuple[Floats, Floats, Floats],
-    points: tuple[Floats, Floats, Floats, Floats],
-    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
+    linear: Linear, drives: Drives, elements: Elements, along: Along, motion: Moving, points: Points, work: Work
 ) -> None:
     """As `advance`, whether friction turns or not."""
     e, aw, av = linear
@@ -418,21 +440,21 @@ def _turns(kinds: Integers, parameters: Floats, rates: Floats) -> bool:
 
 @njit(cache=True, nogil=True, forceinline=True, _nrt=False)  # type: ignore[call-overload, untyped-decorator]
 def advance(
-    linear: tuple[Floats, Floats, Floats],
-    finely: tuple[Floats, Floats, Floats],
-    drives: tuple[Floats, Floats],
-    elements: tuple[Integers, Floats, Floats],
-    along: tuple[float, Floats, Floats, Floats, Floats, Floats],
-    motion: tuple[Floats, Floats, Floats],
-    points: tuple[Floats, Floats, Floats, Floats],
-    work: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
-    kept: tuple[Floats, Floats, Floats, Floats],
+    linear: Linear,
+    finely: Linear,
+    drives: Drives,
+    elements: Elements,
+    along: Along,
+    motion: Moving,
+    points: Points,
+    work: Work,
+    kept: Kept,
 ) -> None:
     """Advance the modes, a whole number of LANES, and the elements of a rig by a substep.
 
     Args:
-        linear: propagators and reactions, as `drifted_propagators` fills them.
-        finely: the same of a substep PARTS times finer, taken where friction turns.
+        linear, finely: propagators and reactions, as `drifted_propagators` fills them; those of a substep PARTS times
+            finer are taken where friction turns.
         drives: modal forces (n_modes,) at the start and the end, straight between.
         elements: kinds (n_elements,), shapes (n_elements, n_modes) and parameters (n_elements, 3) of those at points.
         along: of what acts all along, as `spread_forces` takes it.
@@ -448,10 +470,7 @@ def advance(
     point, earlier, w, z = points
     spread = work[5]
     modes_kept, points_kept, rates, parts_of = kept
-    rubs = False
-    for i in range(kinds.size):
-        rubs |= kinds[i] == FRICTION
-    if not rubs:
+    if not _rubs(kinds):
         _advance_once(linear, drives, elements, along, motion, points, work)
         return
     for r in range(q.size):
@@ -477,17 +496,7 @@ def advance(
 
 
 @njit(cache=True, nogil=True)
-def at_rest(
-    n: int, n_elements: int
-) -> tuple[
-    tuple[Floats, Floats, Floats],
-    tuple[Floats, Floats, Floats],
-    tuple[Floats, Floats],
-    tuple[Floats, Floats, Floats],
-    tuple[Floats, Floats, Floats, Floats],
-    tuple[Floats, Floats, Floats, Floats, Floats, Floats],
-    tuple[Floats, Floats, Floats, Floats],
-]:
+def at_rest(n: int, n_elements: int) -> tuple[Linear, Linear, Drives, Moving, Points, Work, Kept]:
     """Arrays that `advance` takes: linear, finely, drives, motion, points, work, kept."""
     linear = np.empty((2, 4, n)), np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
     finely = np.empty((2, 4, n)), np.zeros((n_elements, n_elements)), np.zeros((n_elements, n_elements))
@@ -587,9 +596,7 @@ def step_record(
     along = stretch, stretching, drag_shapes, drag_weights, np.empty(drag_weights.size), coupling
     for k in range(n_samples):
         if k == 0 or rate != 0.0:
-            stiffness = 1.0 + rate * (k + 0.5) * dt
-            drifted_propagators(omega, c, h, stiffness, shapes, linear)
-            drifted_propagators(omega, c, h / PARTS, stiffness, shapes, finely)
+            drifted_propagators(omega, c, h, 1.0 + rate * (k + 0.5) * dt, elements, linear, finely)
         if measured.size == 0:
             for r in range(n_modes):
                 q_out[r, k] = q[r]

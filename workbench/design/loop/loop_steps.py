@@ -10,7 +10,7 @@ from numba import njit
 
 from workbench.arrays import Floats, Integers
 from workbench.design.estimation.digital import ONSET
-from workbench.rig.stepping import FAST, LANES, PARTS, advance, at_rest, drifted_propagators, whole_lanes, yield_update
+from workbench.rig.stepping import FAST, LANES, advance, at_rest, drifted_propagators, whole_lanes, yield_update
 
 # As `loop_record` and `_commands` describe them.
 StructureArrays = tuple[Floats, Floats, Floats, float, float, Floats, Floats, Floats]
@@ -147,9 +147,7 @@ def loop_record(
             w_old[i] += shapes[i, r] * q[r]
     for k in range(n_samples):
         if k == 0 or stiffening != 0.0:
-            stiffness = 1.0 + stiffening * (k + 0.5) * dt
-            drifted_propagators(omega, damping, h, stiffness, shapes, linear)
-            drifted_propagators(omega, damping, h / PARTS, stiffness, shapes, finely)
+            drifted_propagators(omega, damping, h, 1.0 + stiffening * (k + 0.5) * dt, elements, linear, finely)
         # --- read
         for j in range(ny):
             y = truth[j, k * n_sub]

@@ -167,12 +167,15 @@ def labels_of(effects: Sequence[Effect], domain: Domain) -> list[str]:
 
 def mean_square(rig: Rig, record: Record, settle: float) -> float:
     """Mean square of what a rig leaves of a record, each sensor by the standard deviation of its readings."""
-    lead = round(settle / record.sample_time)
-    measured = record.outputs[:, lead:]
     with np.errstate(over="ignore", invalid="ignore"):  # one effect of two that balance each other may run away
-        predicted = predict(rig, record)[:, lead:]
-        left = (((measured - predicted) / scale_of(measured)) ** 2).mean()
-    return float(left) if left < RUNAWAY else RUNAWAY
+        left = power_in(record, record.outputs - predict(rig, record), settle)
+    return left if left < RUNAWAY else RUNAWAY
+
+
+def power_in(record: Record, readings: np.ndarray, settle: float) -> float:
+    """Mean square of readings (n_outputs, n_samples), each sensor by the standard deviation of a record's."""
+    lead = round(settle / record.sample_time)
+    return float(((readings[:, lead:] / scale_of(record.outputs[:, lead:])) ** 2).mean())
 
 
 def _noise_power(record: Record, noise: np.ndarray, settle: float) -> float:

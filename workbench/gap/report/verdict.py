@@ -142,10 +142,8 @@ class Verdict:
     def _share_of(self, effect: Effect) -> float:
         """Share of the gap that an effect causes; of all sensors together where it stands for all of them."""
         shares, named = self.budget.effects, [e for e in self.effects if not e.kind.first]
-        label = next(
-            (label for e, label in zip(named, labels_of(named, self.nominal.modes.domain), strict=True) if e is effect),
-            effect.label,
-        )
+        labels = dict(zip(named, labels_of(named, self.nominal.modes.domain), strict=True))
+        label = labels.get(effect, effect.label)
         if label in shares:
             return shares[label]
         return sum(share for label, share in shares.items() if label.split("[")[0] == effect.kind.name)
