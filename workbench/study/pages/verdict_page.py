@@ -160,5 +160,6 @@ def _could_show(verdict: Verdict) -> str:
     if alike:
         one, other = map(label_in_words, alike[0][:2])
         text += f"; at small strength they cannot distinguish {one} from {other}"
-        text += f", nor {len(alike) - 1} pairs more" if len(alike) > 1 else ""
+        more = len(alike) - 1
+        text += f", nor {more} more {'pair' if more == 1 else 'pairs'}" if more else ""
     return text + "."
