@@ -1,5 +1,7 @@
 """Filter and smoother of an unmodelled force, beside Gaussian distributions of all samples at once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
@@ -11,9 +13,11 @@ from workbench.gap.prediction.unmodelled_force import (
     innovations,
     log_likelihood,
     sampled_model,
+    smoothed_covariance,
     smoothed_states,
     whiten,
 )
+from workbench.rig.simulate import simulate
 
 DT, SAMPLES = 0.01, 40
 NOISE = np.array([1e-4, 3e-4, 2e-4, 1e-4])
@@ -90,6 +94,38 @@ def test_the_smoother_tells_the_mean_of_all_states_given_all_readings(kalman, jo
     mean = (joint[0] @ np.linalg.solve(joint[1], residual.T.ravel())).reshape(SAMPLES, -1).T
     found = smoothed_states(kalman, residual)
     assert (np.abs(found - mean).max(axis=1) < 1e-5 * np.abs(mean).max(axis=1)).all()
+
+
+def test_the_smoothers_covariance_is_that_of_all_states_given_all_readings(kalman, joint):
+    size, middle = len(kalman.a), SAMPLES // 2
+    there = slice(middle * size, (middle + 1) * size)
+    own = kalman.covariance  # of what is not known before the first reading, and then of all that drives it
+    for _ in range(middle):
+        own = kalman.a @ own @ kalman.a.T + np.diag([*np.zeros(size - 1), 0.04])
+    expected = own - joint[0][there] @ np.linalg.solve(joint[1], joint[0][there].T)
+    found, expected = np.diag(smoothed_covariance(kalman)), np.diag(expected)
+    assert found[-1] == pytest.approx(expected[-1], rel=0.01)
+    assert (found < 1.001 * expected).all()  # the modes ring longer than these readings, and more tell more
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_sensors_that_are_late_or_early_read_the_forces_of_their_interval(hinged_rig, stages):
+    rig = hinged_rig(n_modes=3)
+    delays = (0.3 * DT, -0.4 * DT, 0.8 * DT, 0.0)
+    rig = replace(rig, sensors=tuple(replace(s, delay=d) for s, d in zip(rig.sensors, delays, strict=True)))
+    at = rig.actuators[0].at
+    force = np.random.default_rng(3).normal(size=(1, SAMPLES))
+    expected = simulate(replace(rig, actuators=rig.actuators[:1]), force, sample_time=DT).outputs
+    kalman = force_filter(
+        sampled_model(rig.modes, rig.sensors, NOISE, DT), rig.modes.phi(at).T, np.ones(1), 0.0, stages
+    )
+    n, state, read = 2 * rig.modes.n_modes, np.zeros(len(kalman.a)), []
+    for k in range(SAMPLES):
+        state[n] = force[0, k]
+        read.append(kalman.h @ state)
+        state = kalman.a @ state
+    found = np.array(read).T[:, :-1]
+    assert np.abs(found - expected[:, :-1]).max() < 1e-9 * np.abs(expected).max()
 
 
 def test_states_are_driven_from_rest():

@@ -9,12 +9,14 @@ from scipy.signal import lfilter
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE, kind_named
 from workbench.gap.effects.effect import Effect
+from workbench.gap.effects.nominal import nominal_errors
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.beside_random import looks_random, random_beside
+from workbench.gap.search.beside_random import looks_random, random_beside, random_beside_errors
 from workbench.gap.search.fit import Fit
+from workbench.gap.search.jointly import measured
 from workbench.gap.search.search import Search
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import AirDrag, CoulombFriction, OneSidedStop
@@ -80,6 +82,25 @@ def test_what_a_right_law_leaves_beside_a_random_force_is_its_linear_answer(rig,
     whole = weak.outputs - simulate(told, weak.inputs, sample_time=0.01).outputs
     error = [np.sqrt(np.mean((r - truth) ** 2) / np.mean(truth**2)) for r in (left, whole)]
     assert error[0] < 0.02 < 0.1 < error[1]
+
+
+def test_it_is_found_beside_small_errors_of_the_model(rig, records):
+    """A model 1 % off in stiffness and a sensor that is late leave far more than the noise."""
+    late = (replace(rig.sensors[0], delay=0.003), *rig.sensors[1:])
+    real = replace(kind_named("modulus_error").apply(rig, None, {"factor": 1.01}), sensors=late)
+    told, made = replace(rig, actuators=rig.actuators[:1]), records(real, 0.05)
+    data = FitData(tuple(made), np.array([s.noise_std for s in rig.sensors]))
+    nominal = data.by_channel(data.residual(told))
+    search = Search(told, data, data, data, CATALOGUE, lambda text, share: None, ALONE, nominal)
+    step = measured(search, Fit((nominal_errors(told, search.prior),), 0.0, nominal, 0, "nothing"))
+    assert not looks_random(evidence(told, made))
+    assert random_beside_errors(search, step) is None
+    found = random_beside_errors(search, step, surely=False)
+    wind = found.best.effects[-1]
+    assert wind.label == "random_disturbance"
+    assert wind.values["at"] == pytest.approx(1.3, abs=3.0 * wind.deviations["at"])
+    assert wind.values["rms"] == pytest.approx(0.05, abs=3.0 * wind.deviations["rms"])
+    assert wind.deviations["rms"] < 0.005
 
 
 @pytest.mark.slow

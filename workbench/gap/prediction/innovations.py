@@ -55,7 +55,7 @@ class Follower:
         forces = loose * force * np.sqrt(np.mean(modes.phi(along) ** 2, axis=0))
         shape = np.zeros(n) if at is None else modes.phi_at(at)
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
-        model = sampled_model(modes, rig.sensors, noise, sample_time)
+        model = sampled_model(modes, _at_once(rig).sensors, noise, sample_time)
         found = force_filter(model, patterns, variances, 0.0)
         # what an error says of the forces until the next sample is put into the state at this one
         gain = np.linalg.solve(model.transition, found.gain[: 2 * n])
@@ -77,7 +77,7 @@ class Follower:
         answer to it. That of a rig without laws is measured less predicted.
         """
         errors = self._followed(rig, record, substeps)
-        model = sampled_model(rig.modes, rig.sensors, np.ones(len(rig.sensors)), record.sample_time)
+        model = sampled_model(rig.modes, _at_once(rig).sensors, np.ones(len(rig.sensors)), record.sample_time)
         gain = self._gain_for(rig, record.sample_time).reshape(-1, errors.shape[0])
         # every correction goes on to be a motion
         return errors + model.output @ driven(model.transition, model.transition @ gain @ errors)[:, :-1]

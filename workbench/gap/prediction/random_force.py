@@ -14,6 +14,7 @@ from workbench.gap.prediction.unmodelled_force import (
     force_filter,
     log_likelihood,
     sampled_model,
+    smoothed_covariance,
     smoothed_states,
     whiten,
 )
@@ -58,7 +59,9 @@ class RandomForceFit:
         memory, stages: colour of the force; see `force_filter`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
         chi2_by_record: (n_records,) mean squares of the whitened residual.
+        left: mean square of what the smoothed force leaves of whole records, in units of the noise.
         rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records show.
+        hidden_rms: of what the process has beyond that, N.
         follows: largest share of the force that the inputs and the motion of its record account for.
         tonal: least share of the force of a record that its mean and one sinusoid account for.
     """
@@ -70,32 +73,37 @@ class RandomForceFit:
     stages: int
     cost: float
     chi2_by_record: np.ndarray
+    left: float
     rms_by_record: np.ndarray
+    hidden_rms: float
     follows: float
     tonal: float
 
     @property
-    def seen_rms(self) -> tuple[float, float]:
-        """Rms over all records of the force that acted, N, and the standard deviation of that, from their scatter."""
-        power = self.rms_by_record**2
-        rms = float(np.sqrt(power.mean()))
-        scatter = float(power.std(ddof=1)) if power.size > 1 else float(power[0])
-        return rms, scatter / (2.0 * rms * np.sqrt(power.size))
+    def acting_rms(self) -> tuple[float, float]:
+        """Rms over all records of the force that acted, N, and the standard deviation of that.
+
+        From the scatter between records; what they do not show is guessed by the colour, so that none of it or twice as
+        much may be there.
+        """
+        seen, hidden = self.rms_by_record**2, self.hidden_rms**2
+        rms = float(np.sqrt(seen.mean() + hidden))
+        scatter = float(seen.std(ddof=1)) if seen.size > 1 else float(seen[0])
+        return rms, float(np.hypot(scatter / np.sqrt(seen.size), hidden / np.sqrt(3.0))) / (2.0 * rms)
 
     @property
     def holds(self) -> bool:
         """Whether the force is the same in every record, whatever the level, follows nothing that the rig does, and is
         no constant or single tone, which could be predicted.
         """
-        return self.holds_within(RANDOM_FORCE.whitened)
+        return self.is_steady and bool(np.abs(self.chi2_by_record - 1.0).max() < RANDOM_FORCE.whitened)
 
-    def holds_within(self, whitened: float) -> bool:
-        """The same, where the whitened residual of each record may be so far from unit power."""
+    @property
+    def is_steady(self) -> bool:
+        """Whether the force is the same in every record, follows nothing and is no tone, whatever else is left."""
         spread = np.ptp(self.rms_by_record) / self.rms_by_record.mean()
-        white = np.abs(self.chi2_by_record - 1.0).max() < whitened
-        return bool(
-            spread < RANDOM_FORCE.level_spread and white and self.follows < RANDOM_FORCE.follows and self.tonal < TONAL
-        )
+        steady = spread < RANDOM_FORCE.level_spread
+        return bool(steady and self.follows < RANDOM_FORCE.follows and self.tonal < TONAL)
 
 
 def fit_random_force(
@@ -150,7 +158,9 @@ def fit_random_force(
     kalman = filter_at(at, log_rms, memory, stages)
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
-    forces = [smoothed_states(kalman, r)[2 * rig.modes.n_modes] for r in residuals]
+    both = [(r, smoothed_states(kalman, r)) for r in residuals]
+    force = 2 * rig.modes.n_modes
+    forces = [x[force] for _, x in both]
     return RandomForceFit(
         at=at,
         rms=float(np.exp(log_rms)),
@@ -163,7 +173,9 @@ def fit_random_force(
         stages=stages,
         cost=float((found.fun - noise_part) / n_values),
         chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
+        left=float(np.sum([(((r - kalman.h @ x) / data.noise[:, None]) ** 2).sum() for r, x in both])) / n_values,
         rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
+        hidden_rms=float(np.sqrt(max(smoothed_covariance(kalman)[force, force], 0.0))),
         follows=max(
             followed(force, record.inputs, rig.modes.phi_at(at) @ np.array([m.displacement, m.velocity]))
             for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)

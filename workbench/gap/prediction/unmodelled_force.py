@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
-from scipy.linalg import expm, solve_triangular
+from scipy.linalg import expm, solve_discrete_lyapunov, solve_triangular
 
 from workbench.arrays import Floats
 from workbench.rig.sensors import MEASURED, Sensor
@@ -28,6 +28,7 @@ class SampledModel:
         transition: (2n, 2n) of the state (q, q').
         growth: (2n, n) response of the state to modal forces held over the interval.
         output: (n_sensors, 2n) and feedthrough (n_sensors, n) of modal forces.
+        before: (n_sensors, n) likewise of those of the interval before, which sensors that are late still read.
         noise_variance: (n_sensors,).
     """
 
@@ -35,6 +36,7 @@ class SampledModel:
     growth: np.ndarray
     output: np.ndarray
     feedthrough: np.ndarray
+    before: np.ndarray
     noise_variance: np.ndarray
 
 
@@ -46,7 +48,10 @@ def _tethered(modes: Modes, sample_time: float) -> Modes:
 
 
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
-    """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,)."""
+    """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,).
+
+    A delay counts as far as a sample, a sensor ahead likewise.
+    """
     n = modes.n_modes
     own = _tethered(modes, sample_time).state_matrix
     a = np.zeros((3 * n, 3 * n))
@@ -54,7 +59,7 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
     a[n : 2 * n, 2 * n :] = np.eye(n)
     step = expm(a * sample_time)
     output = np.zeros((len(sensors), 2 * n))
-    feedthrough = np.zeros((len(sensors), n))
+    feedthrough, before = np.zeros((2, len(sensors), n))
     for j, sensor in enumerate(sensors):
         derivative, order = MEASURED[sensor.quantity]
         shape = sensor.gain * modes.phi_at(sensor.at, derivative, direction=sensor.direction)
@@ -63,7 +68,12 @@ def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, 
         else:
             output[j] = shape @ own[n:]
             feedthrough[j] = shape
-    return SampledModel(step[: 2 * n, : 2 * n], step[: 2 * n, 2 * n :], output, feedthrough, noise**2)
+        if sensor.delay:
+            shifted = np.r_[output[j], feedthrough[j]] @ expm(-sensor.delay * a)
+            output[j], feedthrough[j] = shifted[: 2 * n], shifted[2 * n :]
+            if sensor.delay > 0:
+                before[j], feedthrough[j] = feedthrough[j], 0.0
+    return SampledModel(step[: 2 * n, : 2 * n], step[: 2 * n, 2 * n :], output, feedthrough, before, noise**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,14 +103,19 @@ def force_filter(
     stages in a row make the force smoother, as a band limit does.
     """
     n_state, m = model.transition.shape[0], patterns.shape[1]
-    size = n_state + stages * m
+    forces = n_state + stages * m
+    late = m if model.before.any() else 0
+    size = forces + late
     a = np.zeros((size, size))
     a[:n_state, :n_state] = model.transition
     a[:n_state, n_state : n_state + m] = model.growth @ patterns
-    a[n_state:, n_state:] = memory * np.eye(stages * m) + np.eye(stages * m, k=m)
-    h = np.hstack([model.output, model.feedthrough @ patterns, np.zeros((model.output.shape[0], (stages - 1) * m))])
+    a[n_state:forces, n_state:forces] = memory * np.eye(stages * m) + np.eye(stages * m, k=m)
+    a[forces:, n_state : n_state + late] = np.eye(late)
+    h = np.zeros((model.output.shape[0], size))
+    h[:, :n_state], h[:, n_state : n_state + m] = model.output, model.feedthrough @ patterns
+    h[:, forces:] = (model.before @ patterns)[:, :late]
     q = np.zeros_like(a)
-    q[-m:, -m:] = np.diag(variances)
+    q[forces - m : forces, forces - m : forces] = np.diag(variances)
     return _steady(a, h, q, model.noise_variance)
 
 
@@ -141,7 +156,7 @@ def wandering_force_filter(
         transition = transition @ transition
     transition = transition / scale[:, None] * scale
     noise = 0.5 * (noise + noise.T) / scale[:, None] / scale
-    h = np.hstack([model.output, model.feedthrough @ shape[:, None]])
+    h = np.hstack([model.output, (model.feedthrough + model.before) @ shape[:, None]])
     return _steady(transition, h, noise, model.noise_variance)
 
 
@@ -236,3 +251,15 @@ def smoothed_states(filter_: ForceFilter, residual: Floats) -> Floats:
     predicted = driven(filter_.a, filter_.gain @ e)[:, :-1]
     adjoint = driven(closed.T, weighted[:, ::-1])[:, :0:-1]
     return predicted + filter_.covariance @ adjoint
+
+
+def smoothed_covariance(filter_: ForceFilter) -> Floats:
+    """Covariance (n_states, n_states) of the error of smoothed states, far from the ends of a record.
+
+    P - P Λ P, with Λ the covariance of the adjoint: Λ = (A - K H)ᵀ Λ (A - K H) + Hᵀ S⁻¹ H.
+    """
+    h, p = filter_.h, filter_.covariance
+    closed = filter_.a - filter_.gain @ h
+    adjoint = solve_discrete_lyapunov(closed.T, h.T @ np.linalg.solve(filter_.innovation, h))
+    smoothed: Floats = p - p @ adjoint @ p
+    return smoothed

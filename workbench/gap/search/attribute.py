@@ -19,7 +19,7 @@ from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
-from workbench.gap.search.beside_random import decide_on_random, random_beside
+from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
 from workbench.gap.search.finish import finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
@@ -404,6 +404,8 @@ def _with_a_second(
     if alone is not None:
         return alone
     random = None if beside.is_enough or search.is_over else random_beside(search, singles)
+    if random is None and not (beside.is_enough or search.is_over):
+        random = random_beside_errors(search, beside.last)
     if random is not None:
         return random
     if beside.is_enough or beside.by_singles():
@@ -434,6 +436,8 @@ def _with_a_second(
     decision = beside.decision()
     at_end = decision.outcome in ("explained", "none") or search.is_over
     random = None if at_end else random_beside(search, pairs.found[:1])
+    if random is None and not at_end:
+        random = random_beside_errors(search, beside.steps[0], surely=False)
     return random or decision
 
 

@@ -8,16 +8,15 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
-from workbench.gap.effects.nominal import nominal_errors
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
 from workbench.gap.search.finish import finished, plainest, ranked, simplest
 from workbench.gap.search.fit import Fit, cost_of, fit
-from workbench.gap.search.jointly import on_their_sides
+from workbench.gap.search.jointly import Step, fit_jointly
 from workbench.gap.search.search import Decision, Search, spread_over_kinds
 from workbench.gap.search.selection import on_whole_records, one_more
-from workbench.gap.search.settings import RANDOM, SEARCH
+from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, NamedPoints
@@ -66,10 +65,6 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]
     found = _likeliest(search, tried)
-    if found is None:
-        errors = on_their_sides(beside, nominal_errors(search.rig, search.prior))
-        off = with_random(search, fit(search.rig, (errors,), beside.data, iterations=RANDOM.together))
-        found = Decision("explained", *off) if off[1].holds_within(RANDOM.whitened_beside) else None
     return found, [each[0] for each in tried]
 
 
@@ -84,6 +79,40 @@ def random_beside(search: Search, found: Sequence[Fit]) -> Decision | None:
             heard = replace(given, cost_by_channel=unclipped.data.by_channel(unclipped.data.residual(evidence.rig)))
             tried.append(with_random(unclipped, heard, evidence))
     return _likeliest(search, tried)
+
+
+def random_beside_errors(search: Search, step: Step, *, surely: bool = True) -> Decision | None:
+    """A random disturbance beside errors of the nominal model, and effects; None where none holds.
+
+    The errors are fitted to what the filter of the force leaves, and that to what they do, in turns. What is left may
+    be more than noise, by a trifle of the gap: no model is exact.
+
+    Args:
+        step: effects and errors to start from, which were fitted without it.
+        surely: what is there to start from must look random already.
+    """
+    evidence = _beside(search, step.fit)
+    if surely and not looks_random(evidence):
+        return None
+    found, random = _random_beside(search, step.fit, evidence)
+    for _ in range(RANDOM.turns):
+        before = random.cost
+        beside = search.through(
+            model_filter(evidence.model, evidence.rig, random), _follower(search, search.rig, random)
+        )
+        step = fit_jointly(beside, step.effects, step.errors)
+        evidence = _beside(search, step.fit)
+        found, random = _random_beside(search, step.fit, evidence)
+        if random.cost > (1.0 - RANDOM.settled) * before:
+            break
+    whole = float(search.data.by_channel(search.data.residual(evidence.rig)).mean())
+    closed = random.left - 1.0 < STEPWISE.explained * whole
+    return Decision("explained", found, random) if closed and random.is_steady and looks_random(evidence) else None
+
+
+def _beside(search: Search, given: Fit) -> Evidence:
+    """What the records say beside given effects, laws on the measured motion."""
+    return _by_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, given.effects)))
 
 
 def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
@@ -142,8 +171,7 @@ def with_random(search: Search, given: Fit, evidence: Evidence | None = None) ->
         evidence: of the rig with the given effects, where it is at hand.
     """
     if evidence is None:
-        evidence = search.evidence_of(apply_all(search.rig, given.effects))
-        evidence = _by_laws_on_measured_motion(search, evidence)
+        evidence = _beside(search, given)
     found = _random_beside(search, given, evidence)
     if given.effects and not found[1].holds and search.near(found[0], RANDOM.near):
         follower = _follower(search, evidence.rig, found[1])
@@ -177,9 +205,14 @@ def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit,
     most = RANDOM.points if isinstance(domain, NamedPoints) else RANDOM.starts
     places = [where for where in evidence.peaks if not isinstance(where, Between)][:most]
     found = fit_random_force(evidence.rig, search.data, evidence.residuals, places, evidence.data.force_rms)
-    rms, rms_std = found.seen_rms
-    spread = dict(zip(domain.coordinates, found.at_std, strict=True))
-    effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, {**spread, "rms": rms_std})
+    rms, rms_std = found.acting_rms
+    # no surer than what is left is white, nor than two good models of one structure are alike
+    level = np.sqrt(max(float(found.chi2_by_record.mean()), 1.0))
+    least = INTERVALS.alike * domain.size if found.at_std else 0.0
+    at_std = (max(float(level * std), least) for std in found.at_std)
+    spread = dict(zip(domain.coordinates, at_std, strict=True))
+    deviations = {**spread, "rms": max(float(level * rms_std), INTERVALS.alike * rms)}
+    effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
     combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted, "maximum likelihood")
     return combined, found

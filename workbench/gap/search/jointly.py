@@ -128,7 +128,7 @@ def fit_jointly(
 def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
     """Effects and errors, the errors last, as they leave the records of a search, by its substeps unless others are."""
     whole, rig = search.data.stepped(substeps or search.data.substeps), apply_all(search.rig, found.effects)
-    if search.logged:
+    if whole.whiteners:
         by_channel = whole.by_channel(whole.residual(rig))
         of_noise = np.ones_like(by_channel)
         step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)

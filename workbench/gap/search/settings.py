@@ -98,8 +98,8 @@ class RandomSettings:
     finalists: int = 4  # effects beside it that are fitted to whole records
     tried: int = 3  # of them, those fitted with it
     likeliest_sets: int = 2  # of other effects, that a random force is tried beside
-    whitened_beside: float = 0.2  # of unit power: what small errors of the model leave after a fit of them
-    together: int = 6  # iterations of errors of the nominal model beside it
+    turns: int = 4  # of it and errors of the nominal model, each beside the other, at most
+    settled: float = 0.02  # of what is left: a turn that takes away less is the last
     # of the unmodelled force's level over records: most forces of the rig's own follow the inputs' level
     spread: float = 0.5
     # of the first elastic frequency: sensors of rates hardly see a force below, and its estimate drifts
