@@ -14,10 +14,10 @@ PLACES = {7: (0.0, 0.0, 0.5), 9: (1.0, 0.5, 0.5)}
 SHAPES = np.array([[0.5, -1.0], [2.0, 0.25]])  # of nodes 7 and 9 along z
 
 
-def write_55(path, *, masses=MASSES, analysis=2):
+def write_55(path, *, masses=MASSES, analysis=2, places=PLACES, shapes=SHAPES, also=(), **changed):
     file = pyuff.UFF(str(path))
     nodes = np.array([*PLACES])
-    x, y, z = np.array([*PLACES.values()]).T
+    x, y, z = np.array([*places.values()]).T
     blank = np.zeros(2, int)
     file.write_sets(
         {"type": 2411, "node_nums": nodes, "def_cs": blank, "disp_cs": blank, "color": blank, "x": x, "y": y, "z": z},
@@ -29,9 +29,9 @@ def write_55(path, *, masses=MASSES, analysis=2):
             "analysis_type": analysis, "data_ch": 2, "spec_data_type": 8, "data_type": 2, "n_data_per_node": 3,
             "load_case": 1, "mode_n": r + 1, "freq": FREQUENCIES[r], "modal_m": masses[r],
             "modal_damp_vis": DAMPING[r], "modal_damp_his": 0.0, "node_nums": nodes,
-            "r1": np.zeros(2), "r2": np.zeros(2), "r3": SHAPES[:, r],
+            "r1": np.zeros(2), "r2": np.zeros(2), "r3": shapes[:, r], **changed,
         }  # fmt: skip
-        file.write_sets(entry, "add")
+        file.write_sets([*also, entry], "add")
     return path
 
 
@@ -65,6 +65,44 @@ def test_universal_files_of_modes_are_read_and_scaled(tmp_path, write):
     np.testing.assert_allclose(modes.phi(["9"], direction="z"), SHAPES[1:] / np.sqrt(MASSES), rtol=1e-5)
 
 
+def test_a_universal_file_is_read_in_the_units_that_it_states(tmp_path):
+    """In mm, N and t: 2 kg are 0.002 t, and a shape that turns by 0.1 rad a millimetre turns by 100 rad a metre."""
+    units = {"type": 164, "units_code": 9, "temp_mode": 1, "length": 1000.0, "force": 1.0, "temp": 1.0,
+             "temp_offset": 0.0}  # fmt: skip
+    millimetres = {node: tuple(1000.0 * v for v in place) for node, place in PLACES.items()}
+    turning = {"n_data_per_node": 6, "data_ch": 3, "r4": np.full(2, 0.1), "r5": np.zeros(2), "r6": np.zeros(2)}
+    path = write_55(tmp_path / "m.unv", masses=0.001 * MASSES, places=millimetres, also=[units], **turning)
+    modes = read_modes(path)
+    np.testing.assert_allclose(modes.domain.positions[::2], [*PLACES.values()])
+    np.testing.assert_allclose(modes.phi(["7z", "9z"]), SHAPES / np.sqrt(MASSES), rtol=1e-5)
+    np.testing.assert_allclose(modes.phi(["7rx"])[0], 100.0 / np.sqrt(MASSES), rtol=1e-5)
+
+
+def test_only_displacements_of_a_universal_file_are_shapes(tmp_path):
+    path = write_55(tmp_path / "m.unv")
+    for r in range(2):  # the reactions of each mode, as a finite-element program writes them beside its shape
+        reactions = {**pyuff.UFF(str(path)).read_sets(1 + r), "spec_data_type": 9}
+        pyuff.UFF(str(path)).write_sets(reactions, "add")
+    np.testing.assert_allclose(read_modes(path).frequencies_hz, FREQUENCIES, rtol=1e-5)
+    with pytest.raises(RecordFileError, match="holds no displacements of normal modes at nodes"):
+        read_modes(write_55(tmp_path / "forces.unv", spec_data_type=9))
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        ({"shapes": SHAPES * (1 + 0.2j), "r1": np.zeros(2) * 1j, "r2": np.zeros(2) * 1j, "data_type": 5},
+         "its shapes are complex"),
+        ({"shapes": np.where(SHAPES == 2.0, np.nan, SHAPES)}, "shapes must be finite; of mode 1 row 2 is nan"),
+        ({"also": [{"type": 15, "node_nums": [9], "def_cs": [0], "disp_cs": [0], "color": [0], "x": [1.0], "y": [0.5],
+                    "z": [0.6]}]}, "node 9 stands at two places"),
+    ],
+)  # fmt: skip
+def test_what_a_universal_file_contradicts_is_refused(tmp_path, changed, message):
+    with pytest.raises(RecordFileError, match=message):
+        read_modes(write_55(tmp_path / "m.unv", **changed))
+
+
 def arrays(**more):
     return {"shapes": SHAPES, "frequencies_hz": FREQUENCIES, **more}
 
@@ -88,6 +126,13 @@ def test_arrays_are_read_from_every_format(tmp_path, ending):
     np.testing.assert_allclose(modes.phi(["1", "2"]), SHAPES / np.sqrt(MASSES))
     np.testing.assert_allclose(modes.zeta, 0.03)
     assert modes.domain.distance("1", "2") == pytest.approx(np.hypot(1.0, 0.5))
+
+
+@pytest.mark.parametrize("kind", ["S", object])
+def test_names_of_points_are_read_from_hdf5(tmp_path, kind):
+    text = {"names": np.array(["top", "low"]).astype(kind), "directions": np.array(["x", "y"]).astype(kind)}
+    domain = read_modes(write_arrays(tmp_path / "m.h5", arrays(**text))).domain
+    assert domain.names == ("top", "low") and domain.directions == ("x", "y")
 
 
 def test_names_of_points_are_kept_and_modes_put_in_order(tmp_path):
@@ -119,6 +164,10 @@ def test_shapes_that_are_stated_as_mass_normalised_and_are_not_are_refused_with_
     [
         ({"shapes": SHAPES}, "needs `shapes`.*it holds shapes"),
         (arrays(shapes=SHAPES * 1j), "complex"),
+        (arrays(shapes=SHAPES * np.nan), "m.npz: shapes must be finite; of mode 1 row 1 is nan"),
+        (arrays(frequencies_hz=np.array(["3 Hz", "8 Hz"])), "m.npz: could not convert string to float"),
+        (arrays(damping_ratios=np.array([0.5, 2.0])), "must be finite and below 1; of mode 2 it is 2: .* not per cent"),
+        (arrays(modal_mass=np.array([1.0, -2.0])), "modal_mass must be positive, kg; of mode 2 it is -2"),
         (arrays(frequencies_hz=np.ones(3)), r"with 3 modes; it is \(2, 2\)"),
         (arrays(names=np.array(["a"])), "2 rows of shapes need as many points; it names 1"),
         (arrays(names=np.array(["a", "a"])), "'a' twice"),

@@ -20,18 +20,21 @@ def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The datasets of numbers in the file itself, sizes known first, and its header; for a process of its own."""
+    """The numbers and texts in the file itself, sizes known first, and its header; for a process of its own."""
     with h5py.File(path, "r") as file:
         names = [name for name in file if isinstance(file.get(name, getlink=True), h5py.HardLink)]
         found = {name: file[name] for name in names if isinstance(file[name], h5py.Dataset)}
-        found = {name: dataset for name, dataset in found.items() if _is_numeric(dataset)}
+        found = {name: dataset for name, dataset in found.items() if _is_read(dataset)}
         check_counts(path, len(found), sum(map(_numbers, found.values())), limits)
         for name, dataset in found.items():
             if dataset.is_virtual or dataset.external:
                 raise RecordFileError(
                     f"{path}, dataset {name!r} keeps its values in another file; write them into this"
                 )
-        arrays = {name: np.asarray(dataset[()]) for name, dataset in found.items()}
+        arrays = {
+            name: np.array(dataset.asstr(errors="replace")[()], str) if _is_text(dataset) else np.asarray(dataset[()])
+            for name, dataset in found.items()
+        }
         header = file.attrs.get(HEADER)
     return arrays if header is None else arrays | {HEADER: np.array(str(header))}
 
@@ -41,9 +44,14 @@ def is_hdf5(path: Path) -> bool:
     return bool(h5py.is_hdf5(path))
 
 
-def _is_numeric(dataset: Any) -> bool:
-    """Numbers, and no text that MATLAB keeps as such."""
-    return dataset.dtype.base.kind in "fiubc" and dataset.attrs.get("MATLAB_class", b"double") not in (b"char", b"cell")
+def _is_text(dataset: Any) -> bool:
+    return h5py.check_string_dtype(dataset.dtype) is not None
+
+
+def _is_read(dataset: Any) -> bool:
+    """Texts, and numbers that are no text of MATLAB's."""
+    numeric = dataset.dtype.base.kind in "fiubc"
+    return _is_text(dataset) or (numeric and dataset.attrs.get("MATLAB_class") not in (b"char", b"cell"))
 
 
 def _numbers(dataset: Any) -> int:

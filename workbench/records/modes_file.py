@@ -34,7 +34,8 @@ def read_modes(
 ) -> Modes:
     """The mass-normalised modes that a file holds, at named points.
 
-    Universal files (.uff, .unv): data sets 55 or 2414 at nodes, with coordinates of 15 or 2411. NPZ, MAT and HDF5:
+    Universal files (.uff, .unv): displacements of data sets 55 or 2414 at nodes, with coordinates of 15 or 2411, in the
+    units of 164; m, N and kg where it is missing. NPZ, MAT and HDF5:
     `shapes` (n_points, n_modes), `frequencies_hz` or `omega` (n_modes,), and where known `damping_ratios` (n_modes,),
     `modal_mass` (n_modes,), `names`, `nodes` and `directions` (n_points,), `positions` (n_points, 3) in m, and
     `mass_matrix` (n_points, n_points), by which the shapes are then scaled and checked. Without it and `modal_mass`
@@ -46,8 +47,9 @@ def read_modes(
 
     Raises:
         RecordFileError: naming the file and what would be right: no modal mass, or another one than the mass matrix
-            gives, modes that are not orthogonal, shapes and frequencies that do not fit one another, complex shapes, an
-            array that is named nearly like a modal mass or a mass matrix.
+            gives, modes that are not orthogonal, shapes and frequencies that do not fit one another, complex shapes,
+            numbers that are not finite, damping in per cent, an array that is named nearly like a modal mass or a mass
+            matrix.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -67,7 +69,12 @@ def read_modes(
     except Exception as error:  # every reader of another's file has its own ways to fail
         raise unreadable(path, error) from error
     given = {"modal_mass": modal_mass, "damping_ratios": damping_ratios}
-    return _modes_of(path, {**arrays, **{k: np.asarray(v, float) for k, v in given.items() if v is not None}})
+    try:
+        return _modes_of(path, {**arrays, **{k: np.asarray(v, float) for k, v in given.items() if v is not None}})
+    except RecordFileError:
+        raise
+    except ValueError as error:  # what `Modes` and `NamedPoints` refuse, and text where numbers belong
+        raise RecordFileError(f"{path}: {error}") from error
 
 
 def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
@@ -92,15 +99,25 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
         )
     omega = frequencies if given == "omega" else 2.0 * np.pi * frequencies
     shapes = np.asarray(arrays["shapes"])
-    if np.iscomplexobj(shapes):
+    if np.iscomplexobj(shapes) and shapes.imag.any():  # some programs write real shapes as complex numbers
         raise RecordFileError(f"{path}: its shapes are complex; give the real normal modes")
     if shapes.ndim != 2 or shapes.shape[1] != omega.size:
         raise RecordFileError(
             f"{path}: shapes must have shape (n_points, n_modes) with {omega.size} modes; it is {shapes.shape}"
         )
+    shapes = shapes.real.astype(float)
+    if not np.isfinite(shapes).all():
+        i, r = np.argwhere(~np.isfinite(shapes))[0]
+        raise RecordFileError(f"{path}: shapes must be finite; of mode {r + 1} row {i + 1} is {shapes[i, r]}")
     zeta = _one_a_mode(path, "damping_ratios", arrays.get("damping_ratios", 0.0), omega.size)
+    if not (np.abs(zeta) < 1).all():
+        r = int(np.argmin(np.abs(zeta) < 1))
+        raise RecordFileError(
+            f"{path}: damping_ratios must be finite and below 1; of mode {r + 1} it is {zeta[r]:.6g}: give ratios, not"
+            " per cent"
+        )
     order = np.argsort(omega, kind="stable")
-    shapes = np.array(_scaled(path, shapes.astype(float), arrays)[:, order])
+    shapes = np.array(_scaled(path, shapes, arrays)[:, order])
     shapes.flags.writeable = False
     return Modes(
         omega=omega[order],
@@ -147,6 +164,9 @@ def _scaled(path: Path, shapes: np.ndarray, arrays: Mapping[str, np.ndarray]) ->
         masses = _one_a_mode(path, "modal_mass", arrays["modal_mass"], n_modes)
     else:
         return shapes
+    if (masses < 0).any():
+        r = int(np.argmax(masses < 0))
+        raise RecordFileError(f"{path}: modal_mass must be positive, kg; of mode {r + 1} it is {masses[r]:.6g}")
     if not (masses > 0).all():
         r = int(np.argmin(masses > 0))
         raise RecordFileError(
@@ -180,7 +200,4 @@ def _points(path: Path, n: int, arrays: Mapping[str, np.ndarray]) -> NamedPoints
         names = tuple(f"{i + 1}" for i in range(n))
     if len(names) != n:
         raise RecordFileError(f"{path}: {n} rows of shapes need as many points; it names {len(names)}")
-    try:
-        return NamedPoints(names, arrays.get("positions"), directions, nodes)
-    except ValueError as error:
-        raise RecordFileError(f"{path}: {error}") from error
+    return NamedPoints(names, arrays.get("positions"), directions, nodes)
