@@ -136,6 +136,7 @@ def test_thirty_thousand_degrees_of_freedom_take_no_longer_than_twice_arpack():
         (np.eye(3), np.diag([1.0, -1.0, 1.0]), "stiffness matrix is not positive"),
         (np.eye(2), np.eye(3), r"shape \(2, 2\)"),
         (np.eye(3), np.diag([1.0, np.nan, 1.0]), "not finite"),
+        (np.eye(3), (1.0 + 0.02j) * np.eye(3), r"stiffness matrix is complex.*loss factor.*ModalDamping"),
     ],
 )
 def test_matrices_that_are_no_structure_are_refused(mass, stiffness, message):
@@ -155,6 +156,16 @@ def test_what_cannot_be_attached_is_refused_with_the_remedy():
             model.attached([part])
     with pytest.raises(ValueError, match="from 1 to 3 modes"):
         model.modes(4)
+
+
+def test_what_is_no_matrix_number_of_modes_or_coordinate_is_named():
+    model = row_of_masses()[0]
+    with pytest.raises(ValueError, match=r"damping matrix has shape \(\); .* given as ModalDamping\(ratio\)"):
+        FiniteElements(model.mass, model.stiffness, nodes=model.nodes, damping=0.01)
+    with pytest.raises(ValueError, match=r"nodes are coordinates .* or NamedPoints, .*; got an array \(3,\) of <U1"):
+        FiniteElements(model.mass, model.stiffness, nodes=["a", "b", "c"])
+    with pytest.raises(TypeError, match="as an integer"):
+        model.modes(2.0)
 
 
 def test_a_lumped_model_has_as_many_modes_as_it_has_masses():

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import index
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -80,7 +81,7 @@ class FiniteElements:
         Raises:
             ValueError: more modes than degrees of freedom that have mass, or matrices that are not positive.
         """
-        n = len(self.nodes.names)
+        n, n_modes = len(self.nodes.names), index(n_modes)
         if not 1 <= n_modes <= n:
             raise ValueError(f"from 1 to {n} modes can be asked of {n} degrees of freedom; got {n_modes}")
         if _negative_pivots(self.mass):
@@ -229,9 +230,18 @@ def _negative_pivots(matrix: csc_array) -> int:
 
 
 def _symmetric(name: str, matrix: Matrix, n: int) -> csc_array:
-    found = csc_array(matrix, dtype=float)
-    if found.shape != (n, n):
-        raise ValueError(f"the {name} matrix has shape {found.shape}; {n} degrees of freedom need ({n}, {n})")
+    if np.shape(matrix) != (n, n):
+        ratio = "; a damping ratio is given as ModalDamping(ratio)" if name == "damping" else ""
+        raise ValueError(
+            f"the {name} matrix has shape {np.shape(matrix)}; {n} degrees of freedom need ({n}, {n}){ratio}"
+        )
+    found = csc_array(matrix)
+    if np.iscomplexobj(found.data) and found.data.imag.any():
+        raise ValueError(
+            f"the {name} matrix is complex: give its real part; a loss factor η of the whole structure is, near a"
+            " resonance, damping=ModalDamping(η / 2)"
+        )
+    found = csc_array(found.real, dtype=float)
     if not np.isfinite(found.data).all():
         raise ValueError(f"the {name} matrix holds numbers that are not finite")
     largest = float(np.abs(found.data).max(initial=0.0))
@@ -259,9 +269,13 @@ def _outer_sum(parts: list[tuple[np.ndarray, float]], n: int) -> csc_array:
 
 
 def _points(coordinates: ArrayLike, directions: tuple[str, ...]) -> NamedPoints:
-    positions = np.asarray(coordinates, float)
-    if positions.ndim != 2 or positions.shape[1] != 3:
-        raise ValueError(f"coordinates of nodes are (n_nodes, 3), m; got {positions.shape}")
+    given = np.asarray(coordinates)
+    if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
+        raise ValueError(
+            "nodes are coordinates (n_nodes, 3), m, or NamedPoints, which take names; got an array"
+            f" {given.shape} of {given.dtype}"
+        )
+    positions = given.astype(float)
     nodes = [str(i + 1) for i in range(positions.shape[0])]
     return NamedPoints(
         tuple(node + direction for node in nodes for direction in directions),

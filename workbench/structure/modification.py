@@ -1,7 +1,9 @@
 """Modes of a structure with something attached, from its modes alone."""
 
+from typing import Any
+
 import numpy as np
-from scipy.linalg import eigh
+from scipy.linalg import LinAlgError, eigh
 
 from workbench.structure.domain import Between, NamedPoints
 from workbench.structure.modes import Modes
@@ -50,8 +52,7 @@ def attach(
                 shapes = _moved(modes, part, derivative)
                 target += value * shapes.T @ shapes
     if any(isinstance(part, PointMass | PointSpring) for part in attachments):
-        eigenvalues, vectors = eigh(stiffness, mass)
-        _check_stable(eigenvalues)
+        eigenvalues, vectors = _eigen(stiffness, mass)
         vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
         omega = np.sqrt(np.maximum(eigenvalues, 0.0))
         if modes.proportional:
@@ -140,8 +141,7 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
         value = part.mass if isinstance(part, PointMass) else part.stiffness
         target = mass if isinstance(part, PointMass) else stiffness
         target += value * shapes.T @ shapes
-    eigenvalues, vectors = eigh(stiffness, mass, subset_by_index=[0, kept - 1])
-    _check_stable(eigenvalues)
+    eigenvalues, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
     vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
     omega = np.sqrt(np.maximum(eigenvalues, 0.0))
     through = basis @ vectors
@@ -164,6 +164,11 @@ def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
     return modes.phi_at(part.at, derivative)[None, :]
 
 
-def _check_stable(eigenvalues: np.ndarray) -> None:
+def _eigen(stiffness: np.ndarray, mass: np.ndarray, **which: Any) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        eigenvalues, vectors = eigh(stiffness, mass, **which)
+    except LinAlgError as error:
+        raise ValueError("more mass is taken away than there is: a negative one is too large") from error
     if eigenvalues[0] < -ROUNDING * eigenvalues[-1]:
         raise ValueError("the structure is unstable with these springs: one of negative stiffness is too strong")
+    return eigenvalues, vectors

@@ -97,8 +97,22 @@ class AtPlace:
         object.__setattr__(self, "at", same_place(self.at))
 
 
+class _Attached(AtPlace):
+    """A part of a structure, whose figures are finite.
+
+    Raises:
+        ValueError: one that is not.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name, value in vars(self).items():
+            if name != "at" and not np.isfinite(value):
+                raise ValueError(f"the {name.replace('_', ' ')} of a {type(self).__name__} must be finite; got {value}")
+
+
 @dataclass(frozen=True)
-class PointMass(AtPlace):
+class PointMass(_Attached):
     """A rigid body attached at a point: mass (kg) and rotary inertia (kg m²) about that point."""
 
     at: Where
@@ -107,7 +121,7 @@ class PointMass(AtPlace):
 
 
 @dataclass(frozen=True)
-class PointSpring(AtPlace):
+class PointSpring(_Attached):
     """A linear spring from a point to ground: against translation (N/m) and rotation (N m/rad)."""
 
     at: Where
@@ -116,7 +130,7 @@ class PointSpring(AtPlace):
 
 
 @dataclass(frozen=True)
-class PointDamper(AtPlace):
+class PointDamper(_Attached):
     """A viscous damper from a point to ground: against translation (N s/m) and rotation (N m s/rad)."""
 
     at: Where
