@@ -45,6 +45,42 @@ def test_standard_errors_are_those_of_repeated_measurements():
     assert 0.85 < (np.abs(score) < 1.96).mean() <= 1.0
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.4])
+def test_modes_that_the_start_has_twice_are_told_apart_by_their_shapes(angle):
+    """A tower as stiff in x as in y at the start. As ω ∝ √k, three modes each way give std(k) / k = 2 σ / √3."""
+    chain = 100.0 * (2.0 * np.eye(3) - np.eye(3, k=1) - np.eye(3, k=-1))
+    chain[-1, -1] = 100.0
+    points = NamedPoints(tuple(f"{i}{d}" for d in "xy" for i in range(3)))
+
+    def tower(p):
+        return FiniteElements(np.eye(6), np.kron(np.diag(p), chain), nodes=points).modes(6)
+
+    truth = np.array([0.9, 0.97 if angle == 0.0 else 0.9])
+    modes = tower(truth)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    shapes = modes.phi(points.names) @ np.kron(np.eye(3), turn)
+    found = update_model(
+        tower, [1.0, 1.0], omega=modes.omega, omega_std=1e-3 * modes.omega, shapes=shapes, places=points.names
+    )
+    np.testing.assert_allclose(found.parameters, truth, rtol=1e-6)
+    wider = np.sqrt(np.diag(np.linalg.inv((turn**2).T @ turn**2)))  # each ω² is then a mean of both stiffnesses
+    np.testing.assert_allclose(found.std / truth, 2e-3 / np.sqrt(3.0) * wider, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        ({"omega": [3.0, np.nan, 8.0, 9.0]}, "omega must be positive and finite; got .*nan"),
+        ({"omega_std": np.ones(3)}, r"omega_std is one number, or one a mode, \(4,\); got \(3,\)"),
+        ({"shapes": np.ones(6)}, r"shapes must be finite, .* with 4 measured frequencies; got \(6,\)"),
+        ({"build": lambda p: None}, "build must return modes, .* got NoneType"),
+    ],
+)
+def test_what_does_not_fit_is_named(changed, message):
+    with pytest.raises(ValueError, match=message):
+        update_model(**{"build": row_of_masses, "start": [80.0, 30.0], **measured(0, 1e-3), **changed})
+
+
 def test_what_cannot_be_told_is_refused():
     with pytest.raises(ValueError, match="cannot determine 5 parameters"):
         update_model(row_of_masses, np.ones(5), **measured(0, 1e-3))

@@ -37,6 +37,16 @@ class ModePairing(Printed):
         return f"{counted(len(rows), 'mode')} paired", headings, rows, remarks
 
 
+def repeated_modes(omega: np.ndarray, repeated: float = 1e-3) -> np.ndarray:
+    """Which modes are repeated: (n_modes,) the same number for those whose frequencies follow within `repeated`.
+
+    Args:
+        omega: (n_modes,) frequencies, not decreasing.
+        repeated: largest relative step of frequency from one mode to the next.
+    """
+    return np.cumsum(np.r_[False, np.diff(omega) > repeated * np.maximum(omega[1:], 1e-300)])
+
+
 def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, repeated: float = 1e-3) -> np.ndarray:
     """Modal assurance criterion in which repeated modes of the second set count as the subspace that they span.
 
@@ -52,7 +62,7 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, re
     Returns:
         (n_first, n_second), between 0 and 1.
     """
-    cluster = np.cumsum(np.r_[False, np.diff(omega) > repeated * np.maximum(omega[1:], 1e-300)])
+    cluster = repeated_modes(omega, repeated)
     agreement = mac(first, second)
     for each in np.unique(cluster):
         members = np.flatnonzero(cluster == each)

@@ -1,7 +1,8 @@
 """Model updating: chosen parameters of a model, with standard errors, from measured frequencies and shapes.
 
 Friswell & Mottershead, Finite Element Model Updating in Structural Dynamics (1995), chapter 8: weighted least squares
-on frequencies, modes paired by their shapes at every step.
+on frequencies, modes paired by their shapes at every step. Repeated modes have no derivatives one by one: a measured
+shape is compared with the span of them, and its frequency with Rayleigh's quotient of its projection there.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import least_squares, linear_sum_assignment
 
-from workbench.identification.shapes.mode_pairing import subspace_mac
+from workbench.identification.shapes.mode_pairing import repeated_modes, subspace_mac
 from workbench.identification.signal.modal_estimates import rounded
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, frozen, mac
 from workbench.structure.printed import Printed, counted
 
 
@@ -22,6 +23,8 @@ class UpdatingSettings:
     """Constants of model updating."""
 
     least_mac: float = 0.5  # below it a measured mode is no mode of the model
+    # of frequency, between modes that count as repeated: small imperfections mix closer ones
+    repeated: float = 0.01
     step: float = 1e-4  # of the logarithm of a parameter, for central differences
     # smallest singular value of the scaled Jacobian over the largest: parameters that do the same
     indistinct: float = 1e-6
@@ -98,32 +101,49 @@ def update_model(
         places: where they were measured, as the model's `Modes.phi` takes places.
 
     Raises:
-        ValueError: more parameters than frequencies, a measured mode that no mode of the model resembles, parameters
-            that the measurements cannot distinguish.
+        ValueError: numbers that are not positive, sizes that do not fit, more parameters than frequencies, a `build`
+            that returns no modes, a measured mode that no mode of the model resembles, parameters that the measurements
+            cannot distinguish.
     """
-    first, target = np.asarray(start, float), np.asarray(omega, float)
-    deviation, measured = np.broadcast_to(np.asarray(omega_std, float), target.shape), np.asarray(shapes)
+    first, target = np.atleast_1d(np.asarray(start, float)), np.asarray(omega, float)
+    deviation, measured = np.asarray(omega_std, float), np.asarray(shapes)
+    for name, values in (("start", first), ("omega", target), ("omega_std", deviation)):
+        if not (np.isfinite(values) & (values > 0)).all():
+            raise ValueError(f"{name} must be positive and finite; got {values}")
+    if deviation.shape not in ((), target.shape):
+        raise ValueError(f"omega_std is one number, or one a mode, {target.shape}; got {deviation.shape}")
     if first.size > target.size:
         raise ValueError(f"{target.size} measured frequencies cannot determine {first.size} parameters; choose fewer")
-    if not (first > 0).all() or not (deviation > 0).all():
-        raise ValueError("parameters to start from and standard errors must be positive")
-    if measured.shape[1] != target.size:
-        raise ValueError(f"{target.size} measured frequencies need as many shapes; got {measured.shape[1]}")
+    if measured.ndim != 2 or measured.shape[1] != target.size or not np.isfinite(measured).all():
+        raise ValueError(
+            f"shapes must be finite, (n_places, n_measured) with {target.size} measured frequencies; got"
+            f" {measured.shape}"
+        )
 
-    def paired(modes: Modes) -> tuple[np.ndarray, np.ndarray]:
-        agreement = subspace_mac(measured, modes.phi(places), modes.omega)
-        rows, columns = linear_sum_assignment(-agreement)
+    def paired(modes: Modes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each measured mode: index and MAC of the model's, and the frequency that the model gives its shape."""
+        if not isinstance(modes, Modes):
+            raise ValueError(f"build must return modes, as model.modes(8) does; got {type(modes).__name__}")
+        own = modes.phi(places)
+        agreement = subspace_mac(measured, own, modes.omega, repeated=UPDATING.repeated)
+        rows, columns = linear_sum_assignment(-agreement - 1e-3 * mac(measured, own))  # alike but for their own shapes
         if rows.size < target.size or agreement[rows, columns].min() < UPDATING.least_mac:
             lost = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
                 f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
                 f" best MAC is {agreement[lost].max():.2f}; let the model give more modes, or leave this one out"
             )
-        return columns, agreement[rows, columns]
+        cluster = repeated_modes(modes.omega, UPDATING.repeated)
+        quotients = modes.omega[columns]
+        for r, s in enumerate(columns):
+            alike = cluster == cluster[s]
+            if alike.sum() > 1:
+                share = np.abs(np.linalg.lstsq(own[:, alike], measured[:, r])[0]) ** 2
+                quotients[r] = np.sqrt(share @ modes.omega[alike] ** 2 / share.sum())
+        return columns, agreement[rows, columns], quotients
 
     def residuals(logarithms: np.ndarray) -> np.ndarray:
-        modes = build(first * np.exp(logarithms))
-        difference: np.ndarray = (modes.omega[paired(modes)[0]] - target) / deviation
+        difference: np.ndarray = (paired(build(first * np.exp(logarithms)))[2] - target) / deviation
         return difference
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
@@ -139,7 +159,7 @@ def update_model(
             "the measured frequencies cannot distinguish the parameters: some change them alike; choose fewer"
         )
     modes = build(parameters)
-    columns, agreement = paired(modes)
+    columns, agreement, _ = paired(modes)
     covariance = np.linalg.inv(found.jac.T @ found.jac) * np.outer(parameters, parameters)
     return UpdatedModel(
         parameters, covariance, modes, columns, agreement, found.fun, bool(found.success), str(found.message)
