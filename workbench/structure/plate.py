@@ -40,10 +40,11 @@ class _Surface:
             value = as_field(getattr(self, name))
             object.__setattr__(self, name, value)
             values = value(x, y)
-            if not (np.isfinite(values).all() and (values > 0).all()):
-                i, j = np.argwhere(~(values > 0))[0]
+            if not (np.isfinite(values) & (values > 0)).all():
+                i, j = np.argwhere(~(np.isfinite(values) & (values > 0)))[0]
                 raise ValueError(
-                    f"{name} must be positive everywhere; it is {values[i, j]:g} at (x, y) = ({x[i, 0]:g}, {y[0, j]:g})"
+                    f"{name} must be positive and finite everywhere; it is {values[i, j]:g} at (x, y) ="
+                    f" ({x[i, 0]:g}, {y[0, j]:g})"
                 )
 
     def _edge_springs(self, derivatives: int) -> tuple[EdgeSpring, ...]:
@@ -121,8 +122,7 @@ class Plate(_Surface):
 
     def __post_init__(self) -> None:
         self._prepare(("simply supported", "clamped", "free", "guided"), ("mass_per_area", "bending_stiffness"))
-        if not -1.0 < self.poisson_ratio < 0.5 + 1e-12:
-            raise ValueError(f"Poisson's ratio lies between -1 and 0.5; got {self.poisson_ratio}")
+        check_poisson_ratio(self.poisson_ratio)
         tension = np.atleast_1d(np.asarray(self.tension, float))
         if tension.size > 3 or not np.isfinite(tension).all():
             raise ValueError(f"tension is one number, (N_x, N_y) or (N_x, N_y, N_xy) in N/m; got {self.tension}")
@@ -294,6 +294,16 @@ class Plate(_Surface):
                 row = modes.phi(part.at)[0]
                 damping = damping + part.coefficient * np.outer(row, row)
         return Modes(omega=modes.omega, damping=damping, shapes=modes.shapes, domain=modes.domain)
+
+
+def check_poisson_ratio(value: float) -> None:
+    """Refuse a ratio that no isotropic material has.
+
+    Raises:
+        ValueError: outside -1 to 0.5.
+    """
+    if not -1.0 < value < 0.5 + 1e-12:
+        raise ValueError(f"Poisson's ratio lies between -1 and 0.5; got {value}")
 
 
 def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]:

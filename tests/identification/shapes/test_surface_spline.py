@@ -129,6 +129,9 @@ def test_what_cannot_be_drawn_is_refused(plate):
     ):
         with pytest.raises(ValueError, match=words):
             surface_eigenfunctions(SampledModes(found.omega, found.zeta, found.shapes, positions), length=LENGTH)
+    lost = np.where(np.arange(20)[:, None] == 7, np.nan, found.shapes)
+    with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 8 has .*nan.*: leave it out"):
+        surface_eigenfunctions(SampledModes(found.omega, found.zeta, lost, places), length=LENGTH)
     with pytest.raises(ValueError, match="no places along a bar or beam; on a plate take `surface_eigenfunctions`"):
         eigenfunctions(found, length=1.2)
 

@@ -68,6 +68,8 @@ def test_the_self_check_shows_too_few_terms_and_no_plate_at_all():
     negative = replace(flat, stiffness=replace(flat.stiffness, coefficients=-flat.stiffness.coefficients))
     refused = check_plate(negative, modes, poisson_ratio=NU, edges="simply supported")
     assert "bending_stiffness must be positive" in refused.refusal and np.isinf(refused.worst)
+    with pytest.raises(ValueError, match="edges are given for left, right, bottom, top"):  # no fault of what was found
+        check_plate(flat, modes, poisson_ratio=NU, edges={"left": "clamped"})
 
 
 def test_what_cannot_be_found_is_refused():
@@ -75,6 +77,14 @@ def test_what_cannot_be_found_is_refused():
     few = {"poisson_ratio": NU, "mass_basis": basis(2, 1), "stiffness_basis": basis(2, 1)}
     with pytest.raises(ValueError, match="give the mass at one point"):
         plate_mass_and_stiffness(modes, known_mass=[], **few)
+    with pytest.raises(ValueError, match="lies outside the structure"):
+        plate_mass_and_stiffness(modes, known_mass=[((2.6, 0.4), 8.0)], **few)
+    with pytest.raises(ValueError, match=r"a known mass must be positive and finite, kg/m²; got \[-8"):
+        plate_mass_and_stiffness(modes, known_mass=[((0.6, 0.4), -8.0)], **few)
+    with pytest.raises(ValueError, match=r"Poisson's ratio lies between -1 and 0\.5; got 7"):
+        plate_mass_and_stiffness(modes, known_mass=[((0.6, 0.4), 8.0)], **few | {"poisson_ratio": 7})
+    with pytest.raises(ValueError, match="one polynomial or more along each side; got 0 along x"):
+        basis(0, 1)
     with pytest.raises(ValueError, match="20 terms of mass cannot be found from 16 relations of 6 modes"):
         plate_mass_and_stiffness(modes, known_mass=[((0.6, 0.4), 8.0)], **few | {"mass_basis": basis(5, 4)})
     with pytest.raises(ValueError, match="24 terms of stiffness cannot be found from 21"):

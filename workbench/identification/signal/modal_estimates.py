@@ -240,7 +240,14 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
 
 
 def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
-    """Each column turned as near the real axis as it goes, largest entry 1, first clear entry positive."""
+    """Each column turned as near the real axis as it goes, largest entry 1, first clear entry positive.
+
+    Raises:
+        ValueError: an entry that is not finite.
+    """
+    if not np.isfinite(shapes).all():
+        i, r = np.argwhere(~np.isfinite(shapes))[0]
+        raise ValueError(f"shapes must be finite; of mode {r + 1} sensor {i + 1} has {shapes[i, r]}: leave it out")
     turned = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
     turned = turned / np.abs(turned).max(axis=0)
     clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)

@@ -10,7 +10,7 @@ size, all of them then the stiffness. No edge may do work: springs along edges a
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
@@ -20,7 +20,7 @@ from workbench.identification.updating.distributions import mass_series, stiffne
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, frozen
-from workbench.structure.plate import Plate, bending_squares
+from workbench.structure.plate import Plate, bending_squares, check_poisson_ratio
 from workbench.structure.profile import Field, FieldLike, as_field
 from workbench.structure.supports import Edge
 from workbench.threads import one_blas_thread
@@ -43,8 +43,14 @@ class SurfaceBasis:
 
     @classmethod
     def legendre(cls, n_x: int, n_y: int, *, length: tuple[float, float]) -> "SurfaceBasis":
-        """Products of Legendre polynomials, n_x along x and n_y along y, each from edge to edge."""
+        """Products of Legendre polynomials, n_x along x and n_y along y, each from edge to edge.
+
+        Raises:
+            ValueError: no polynomial along a side.
+        """
         a, b = length
+        if min(n_x, n_y) < 1:
+            raise ValueError(f"a series takes one polynomial or more along each side; got {n_x} along x, {n_y} along y")
 
         def functions(x: np.ndarray, y: np.ndarray) -> np.ndarray:
             along_x = legvander(2.0 * np.asarray(x, float) / a - 1.0, n_x - 1)
@@ -118,21 +124,24 @@ def plate_mass_and_stiffness(
         prior_mass, prior_stiffness: first estimates, kg/m² and N m; the series then corrects them.
 
     Raises:
-        ValueError: modes of another domain, no known mass, more terms than relations, known values that the series
-            cannot take, a mass so negative that a mode has no scale.
+        ValueError: modes of another domain, no known mass, one that is not positive or off the plate, more terms than
+            relations, known values that the series cannot take, a mass so negative that a mode has no scale.
     """
     if not isinstance(modes.domain, Rectangle):
         raise ValueError(f"m(x, y) and D(x, y) are those of a plate; these modes are on {modes.domain}")
+    check_poisson_ratio(poisson_ratio)
     prior_mass, prior_stiffness = as_field(prior_mass), as_field(prior_stiffness)
     at, weights = modes.domain.quadrature(QUADRATURE)
     x, y = at.T
     shapes = modes.phi(at)
     size = np.sqrt((shapes**2).mean(axis=0))
     shapes = shapes / size
-    places = np.array([place for place, _ in known_mass], float).reshape(-1, 2)
-    values = np.array([value for _, value in known_mass], float)
-    if not values.size:
+    if not known_mass:
         raise ValueError("orthogonality leaves the size of the mass open; give the mass at one point or more")
+    places = np.vstack([modes.domain.locate(place) for place, _ in known_mass])
+    values = np.array([value for _, value in known_mass], float)
+    if not (np.isfinite(values) & (values > 0)).all():
+        raise ValueError(f"a known mass must be positive and finite, kg/m²; got {values}")
     coefficients, misfit = mass_series(
         shapes,
         weights,
@@ -171,6 +180,8 @@ def check_plate(
 ) -> SelfCheck:
     """Solve the eigenproblem of what was identified and compare it with what was measured, as `self_check` does.
 
+    Frequencies say little of D where the plate hardly bends, at a free edge say: it may be further off there.
+
     Args:
         found: mass and stiffness.
         measured: the modes that they were found from, consecutive.
@@ -179,19 +190,20 @@ def check_plate(
         tolerance: of the frequencies of the eigenproblem.
 
     Raises:
-        ValueError: modes of another domain.
+        ValueError: modes of another domain, edges or a Poisson's ratio that no plate has.
     """
     if not isinstance(measured.domain, Rectangle):
         raise ValueError(f"m(x, y) and D(x, y) are those of a plate; these modes are on {measured.domain}")
     n = measured.n_modes
+    plate = Plate(
+        length=measured.domain.length,
+        mass_per_area=1.0,
+        bending_stiffness=1.0,
+        poisson_ratio=poisson_ratio,
+        edges=edges,
+    )
     try:
-        plate = Plate(
-            length=measured.domain.length,
-            mass_per_area=found.mass.field,
-            bending_stiffness=found.stiffness.field,
-            poisson_ratio=poisson_ratio,
-            edges=edges,
-        )
+        plate = replace(plate, mass_per_area=found.mass.field, bending_stiffness=found.stiffness.field)
         again = plate.modes(first_mode + n, tolerance=tolerance).select(slice(first_mode, None))
     except ValueError as error:
         return SelfCheck(np.full(n, np.inf), np.zeros(n), str(error))
