@@ -349,3 +349,31 @@ def test_all_of_a_patch_keeps_out_of_a_forbidden_stretch():
     limits = Limits(effort=1.0, forbidden=((2.0, 3.0), (9.5, 9.8)))
     assert limits.allowed(10.0) == [(0.0, 2.0), (3.0, 9.5), (9.8, 10.0)]
     assert limits.allowed(10.0, clear=0.25) == [(0.25, 1.75), (3.25, 9.25)]
+
+
+def test_a_zone_up_to_an_end_leaves_no_place_at_the_end():
+    assert Limits(effort=1.0, forbidden=((7.0, 10.0),)).allowed(10.0) == [(0.0, 7.0)]
+    with pytest.raises(DesignError, match="leave no place"):
+        Limits(effort=1.0, forbidden=((0.0, 10.0),)).allowed(10.0)
+    with pytest.raises(
+        DesignError, match=r"forbidden zone \[300.0\] to \[400.0\] lies outside .* 0 to 10 m; give it in m"
+    ):
+        Limits(effort=1.0, forbidden=((300.0, 400.0),)).allowed(10.0)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"impulse_at": 0.0}, "an impulse at 0.0 moves no mode"),
+        ({"impulse": np.nan}, "the impulse must be positive and finite, N s; got nan"),
+        ({"weight": [1.0, 2.0]}, "R is one number, or one a mode: 4 modes need as many; got 2"),
+    ],
+)
+def test_a_task_that_is_none_is_refused(hinged_modes, change, message):
+    with pytest.raises(DesignError, match=message):
+        placement_task(hinged_modes(9), 4, **{"impulse_at": 6.3, "weight": 20.0, **change})
+
+
+def test_as_many_places_as_controlled_modes_are_placed(task):
+    with pytest.raises(DesignError, match="4 controlled modes take as many actuators; got 2 places"):
+        task.placed((3.0, 6.0), "")

@@ -64,6 +64,15 @@ def test_a_plate_is_placed_as_well_as_by_a_fine_grid_and_outside_the_zone(task):
     assert [len(actuator.at) for actuator in best.law.actuators] == [2, 2]
 
 
+def test_a_zone_up_to_an_edge_leaves_no_place_along_the_edge(task):
+    corner = Limits(effort=0.021, forbidden=(((0.7, 0.5), (1.2, 0.9)),)).boxes(task)
+    assert sorted(high.tolist() for _, high in corner) == [[0.7, 0.9], [1.2, 0.5]]
+    with pytest.raises(DesignError, match="leave no place of"):
+        Limits(effort=0.021, forbidden=(((0.0, 0.0), (1.2, 0.9)),)).boxes(task)
+    with pytest.raises(DesignError, match=r"forbidden zone \[400.0, 300.0\] to .* lies outside the structure"):
+        Limits(effort=0.021, forbidden=(((400.0, 300.0), (800.0, 600.0)),)).boxes(task)
+
+
 def test_patches_are_placed_as_well_as_by_a_fine_grid_and_lie_on_the_plate(task):
     patch = piezo_patch("P", (0.6, 0.45), length=(0.2, 0.16))
     patches = placement_task(task.modes, 2, impulse_at=(0.4, 0.35), weight=1e4, actuator=patch)

@@ -31,8 +31,13 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
         g1 (n_modes,) in 1/s² and g2 (n_modes,) in 1/s.
 
     Raises:
-        DesignError: a weight that is not positive.
+        DesignError: a weight that is not positive, or others than one a mode.
     """
+    if np.ndim(omega) and np.size(weight) not in (1, np.size(omega)):
+        raise DesignError(
+            f"the control weight R is one number, or one a mode: {np.size(omega)} modes need as many; got"
+            f" {np.size(weight)}"
+        )
     omega, weight, c = np.broadcast_arrays(
         np.asarray(omega, float), np.asarray(weight, float), np.asarray(damping, float)
     )
@@ -85,7 +90,7 @@ def imsc(modes: Modes, controlled: int | Sequence[int], actuators: Sequence[Actu
     """
     index = controlled_indices(modes, controlled)
     c = np.diag(modes.damping)[list(index)]
-    gains = riccati_gains(modes.omega[list(index)], np.broadcast_to(weight, len(index)), c)
+    gains = riccati_gains(modes.omega[list(index)], weight, c)
     return _law(modes, index, actuators, gains, "IMSC", partial(imsc, weight=weight))
 
 

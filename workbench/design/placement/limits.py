@@ -1,6 +1,6 @@
 """What a placement must keep to, and which limit is to blame where none can."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from itertools import combinations
@@ -13,7 +13,16 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
-from workbench.structure.domain import Interval, NamedPoints, Place, position, reach, same_place
+from workbench.structure.domain import (
+    SLACK,
+    Interval,
+    NamedPoints,
+    Place,
+    Rectangle,
+    position,
+    reach,
+    same_place,
+)
 
 TOLERANCE = 2e-6
 APART = 1e-6  # of the length: actuators closer than this stand at one place
@@ -31,7 +40,7 @@ class Limits:
         effort: largest ∫ FᵀF dt.
         peak_force: largest force of any actuator.
         condition: of B, largest ‖B‖‖B⁻¹‖ in the Frobenius norm (n where B is orthogonal).
-        spacing: least distance between neighbours, m.
+        spacing: least distance between neighbours, m; of the middles of patches, which overlap where it is small.
         margin: least distance from the ends or edges, m.
         forbidden: zones where no actuator can stand, m: intervals (from, to), or on a rectangle boxes between two
             corners ((x, y), (x, y)). All of a patch keeps out of them.
@@ -76,15 +85,18 @@ class Limits:
             clear: half the extent of an actuator, m.
 
         Raises:
-            DesignError: none is left.
+            DesignError: none is left, or a zone that lies outside.
         """
         margin = max(self.margin, clear)
         at, intervals = margin, []
-        for low, high in sorted((position(low), position(high)) for low, high in self.forbidden):
+        zones = sorted((position(low), position(high)) for low, high in self.forbidden)
+        _check_overlap([(np.array([low]), np.array([high])) for low, high in zones], Interval(length))
+        for low, high in zones:
             if low - clear > at:
                 intervals.append((at, min(low - clear, length - margin)))
             at = max(at, high + clear)
-        intervals.append((at, length - margin))
+        if not self.forbidden or length - margin - at > SLACK * length:  # no end that a zone reaches up to
+            intervals.append((at, length - margin))
         intervals = [(low, high) for low, high in intervals if low <= high]
         if not intervals:
             raise DesignError(f"margin {margin:g} and the forbidden intervals leave no place of {length:g} m")
@@ -110,6 +122,7 @@ class Limits:
         zones = tuple((np.atleast_1d(low), np.atleast_1d(high)) for low, high in self.forbidden)
         if any(part.shape != (2,) for zone in zones for part in zone):
             raise DesignError(f"a forbidden zone of a rectangle is ((x, y), (x, y)), m; got {self.forbidden}")
+        _check_overlap(zones, domain)
         zones = tuple((low - half, high + half) for low, high in zones)
         return free_boxes(domain, np.maximum(self.margin, half), zones)
 
@@ -185,6 +198,15 @@ def takes_former_limits(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return with_former
+
+
+def _check_overlap(zones: Sequence[Box], domain: Interval | Rectangle) -> None:
+    for low, high in zones:
+        if (high <= 0).any() or (low >= domain.length).any():
+            raise DesignError(
+                f"forbidden zone {low.tolist()} to {high.tolist()} lies outside the structure, {domain}; give it in m,"
+                " or leave it out"
+            )
 
 
 def _excess(values: np.ndarray, limit: float) -> np.ndarray:

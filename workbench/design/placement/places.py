@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from workbench.design.laws.law import DesignError
-from workbench.structure.domain import Domain, Interval, NamedPoints, Rectangle
+from workbench.structure.domain import SLACK, Domain, Interval, NamedPoints, Rectangle
 
 Box = tuple[np.ndarray, np.ndarray]
 
@@ -62,6 +62,7 @@ def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) ->
     Raises:
         DesignError: none is left.
     """
+    slack = SLACK * domain.size
     free: list[Box] = [(margin, np.array(domain.length) - margin)]
     for zone_low, zone_high in zones:
         parts: list[Box] = []
@@ -69,11 +70,10 @@ def free_boxes(domain: Rectangle, margin: np.ndarray, zones: tuple[Box, ...]) ->
             if (zone_low >= high).any() or (zone_high <= low).any():
                 parts.append((low, high))
                 continue
-            for axis in range(2):  # left and right of the zone, below and above it
+            for axis in range(2):  # left and right of the zone, below and above it, but for what its own edge leaves
                 before, after = high.copy(), low.copy()
                 before[axis], after[axis] = zone_low[axis], zone_high[axis]
-                parts += [(low, before), (after, high)]
-        parts = [part for part in parts if (part[0] <= part[1]).all()]
+                parts += [part for part in ((low, before), (after, high)) if part[1][axis] - part[0][axis] > slack]
         free = [part for i, part in enumerate(parts) if not any(_inside(part, other) for other in parts[:i])]
         free = [part for i, part in enumerate(free) if not any(_inside(part, other) for other in free[i + 1 :])]
     if not free or not all((low <= high).all() for low, high in free):

@@ -161,9 +161,17 @@ class PlacementTask(Printed):
         return imsc(self.modes, self.n_controlled, actuators, weight=self.weight)
 
     def placed(self, positions: Any, status: str, optima: Sequence[tuple[np.ndarray, float]] = ()) -> Placement:
-        """A `Placement` of given positions; infinite work where B is singular."""
+        """A `Placement` of given positions; infinite work where B is singular.
+
+        Raises:
+            DesignError: more places than controlled modes, or fewer.
+        """
         domain = self.modes.domain
         positions = as_places(domain, positions)
+        if len(positions) != self.n_controlled:
+            raise DesignError(
+                f"{self.n_controlled} controlled modes take as many actuators; got {len(positions)} places"
+            )
         if isinstance(domain, Interval):
             positions = np.sort(positions)
         shapes = self.shapes(positions)
@@ -234,16 +242,21 @@ def placement_task(
         chances: the former name of probabilities.
 
     Raises:
-        DesignError: no residual mode, probabilities that are none, or a time that is not positive.
+        DesignError: no residual mode, an impulse that moves nothing, probabilities that are none, or a time that is not
+            positive.
     """
     if not 1 <= n_controlled < modes.n_modes:
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
     if not final_time > 0:
         raise DesignError(f"the final time must be positive; got {final_time}")
+    if not (np.isfinite(impulse) and impulse > 0):
+        raise DesignError(f"the impulse must be positive and finite, N s; got {impulse}")
     if chances is not None:
         warn("placement_task(chances=...) is now placement_task(probabilities=...)", DeprecationWarning, stacklevel=2)
         probabilities = chances
     places = listed(as_places(modes.domain, impulse_at))
+    if modes.are_still(places).all():
+        raise DesignError(f"an impulse at {impulse_at} moves no mode: a support holds that place; give another")
     shares = np.full(len(places), 1.0 / len(places)) if probabilities is None else np.asarray(probabilities, float)
     if shares.shape != (len(places),) or not (shares >= 0).all() or not shares.sum() > 0:
         raise DesignError(f"{len(places)} places need as many probabilities, none negative; got {shares}")
