@@ -49,7 +49,8 @@ def test_a_placement_is_drawn_over_the_nodal_lines_of_the_next_mode(size):
     limits = Limits(effort=1.0, forbidden=(((0.5, 0.1), (0.7, 0.3)),))
     figure = plot_surface_placement(task, placed, limits=limits, struck=(0.35, 0.3))
     left, right = figure.axes
-    assert left.get_title("left").startswith("mode 3")
+    assert "nodal lines of mode 3" in left.get_title("left") and not left.lines[0].get_clip_on()
+    assert "forbidden" in [text.get_text() for text in left.get_legend().get_texts()]
     nodal = next(c for c in left.collections if c.get_linewidths()[0] == 1.4)
     line = np.vstack([path.vertices for path in nodal.get_paths()])
     np.testing.assert_allclose(line[:, 1], B / 2, atol=1e-3)

@@ -165,13 +165,14 @@ def plot_surface_placement(
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
     left.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
     _nodal_lines(left, x, y, fields[0], 1.4)
-    for (x0, y0), (x1, y1) in limits.forbidden if limits is not None else ():  # type: ignore[misc, str-unpack]
-        left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2)
+    for i, ((x0, y0), (x1, y1)) in enumerate(limits.forbidden if limits is not None else ()):  # type: ignore[misc, str-unpack]
+        left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2,
+                  label="forbidden" if i == 0 else None)  # fmt: skip
     numbers = n + 1 + np.arange(modes.n_modes - n)
     width = 0.8 / len(placements)
     for i, (name, placement) in enumerate(placements.items()):
         label = f"{name}: W_R = {placement.residual_work:.2g}"
-        left.plot(*placement.positions.T, "o", color=COLOURS[i], markersize=10, label=label, zorder=3)
+        left.plot(*placement.positions.T, "o", color=COLOURS[i], markersize=10, label=label, zorder=3, clip_on=False)
         if isinstance(task.actuator.at, Patch):
             half = 0.5 * np.array(task.actuator.at[2:])
             for middle in placement.positions:
@@ -180,7 +181,8 @@ def plot_surface_placement(
     if struck is not None:
         left.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
     _bare(left, modes)
-    left.set_title(f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, and its nodal lines", fontsize=10)
+    first = f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, the first left alone"
+    left.set_title(f"{modes.domain}, with the nodal lines of {first}", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
     work = np.concatenate([placement.by_mode for placement in placements.values()])
     most, least = float(work.max()), float(work.min())

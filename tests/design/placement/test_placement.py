@@ -1,7 +1,10 @@
 """Placement: exact derivatives, limits kept, global by a scan; and the trap that limits are for."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.linalg import solve_continuous_lyapunov
 from scipy.optimize import linprog
 
 from workbench.design.laws.law import DesignError
@@ -365,13 +368,30 @@ def test_a_zone_up_to_an_end_leaves_no_place_at_the_end():
     "change, message",
     [
         ({"impulse_at": 0.0}, "an impulse at 0.0 moves no mode"),
-        ({"impulse": np.nan}, "the impulse must be positive and finite, N s; got nan"),
+        ({"impulse": np.nan}, "the impulse must be finite and not 0, N s; got nan"),
         ({"weight": [1.0, 2.0]}, "R is one number, or one a mode: 4 modes need as many; got 2"),
     ],
 )
 def test_a_task_that_is_none_is_refused(hinged_modes, change, message):
     with pytest.raises(DesignError, match=message):
         placement_task(hinged_modes(9), 4, **{"impulse_at": 6.3, "weight": 20.0, **change})
+
+
+def test_a_damped_structure_is_placed_with_the_law_that_it_gets(hinged_modes):
+    """∫ FᵀF dt by Lyapunov's equation, and W_R = ½ Σ |b_rᵀ F(iω_r)|², of the law that the placement has."""
+    modes = replace(hinged_modes(6), damping=np.full(6, 0.02))
+    placed = placement_task(modes, 2, impulse_at=6.3, weight=20.0).placed((3.0, 6.0), "")
+    b, gain = modes.phi(placed.positions), placed.law.gain
+    free = np.block([[np.zeros((2, 2)), np.eye(2)], [-np.diag(modes.omega[:2] ** 2), -modes.damping[:2, :2]]])
+    loop = free - np.vstack([np.zeros((2, 2)), b[:, :2].T]) @ gain
+    start = np.r_[0.0, 0.0, modes.phi(6.3)[0, :2]]
+    state = solve_continuous_lyapunov(loop, -np.outer(start, start))
+    np.testing.assert_allclose(placed.effort, np.trace(gain @ state @ gain.T), rtol=1e-9)
+    work = [
+        0.5 * abs(b[:, r] @ gain @ np.linalg.solve(1j * modes.omega[r] * np.eye(4) - loop, start)) ** 2
+        for r in range(2, 6)
+    ]
+    np.testing.assert_allclose(placed.by_mode, work, rtol=1e-9)
 
 
 def test_as_many_places_as_controlled_modes_are_placed(task):

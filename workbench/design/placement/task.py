@@ -90,7 +90,7 @@ class PlacementTask(Printed):
     """The task; n modes controlled by as many actuators.
 
     Attributes:
-        modes: controlled first, then residual; undamped or nearly so.
+        modes: controlled first, then residual.
         n_controlled: n.
         roots: (n_residual, n, n_columns) real T_r with T_r T_rᵀ = E Re f̂ f̂ᴴ at the residual frequency.
         force_gramian: (n, n) E ∫ f fᵀ dt.
@@ -229,6 +229,9 @@ def placement_task(
 ) -> PlacementTask:
     """The task for an impulse (N s) at a place, or at any of several, IMSC with control weight R (5.43).
 
+    Effort and peak force are those of the law that a placement has, its modes' own damping included; W_R is the work on
+    residual modes as if these had none.
+
     White-noise forces of intensity s at those places, given in place of probabilities, are impulses of √s N s at every
     instant: W_R and effort are then powers.
 
@@ -249,8 +252,8 @@ def placement_task(
         raise DesignError(f"{n_controlled} of {modes.n_modes} modes controlled leaves no residual mode to spill into")
     if not final_time > 0:
         raise DesignError(f"the final time must be positive; got {final_time}")
-    if not (np.isfinite(impulse) and impulse > 0):
-        raise DesignError(f"the impulse must be positive and finite, N s; got {impulse}")
+    if not np.isfinite(impulse) or impulse == 0:
+        raise DesignError(f"the impulse must be finite and not 0, N s; got {impulse}")
     if chances is not None:
         warn("placement_task(chances=...) is now placement_task(probabilities=...)", DeprecationWarning, stacklevel=2)
         probabilities = chances
@@ -267,11 +270,12 @@ def placement_task(
         )
     n = n_controlled
     omega = modes.omega[:n]
-    g1, g2 = riccati_gains(omega, weight)
+    g1, g2 = riccati_gains(omega, weight, np.diag(modes.damping)[:n])
+    rate = g2 + np.diag(modes.damping)[:n]  # of the closed loop: s² + rate s + ω² + g1
     rates = impulse * modes.phi(places)[:, :n] * np.sqrt(shares)[:, None]
     s = 1j * modes.omega[n:, None]
-    unit = -(g1 + g2 * s) / (s**2 + g2 * s + omega**2 + g1)
-    a = modal_state_matrix(omega**2 + g1, g2)
+    unit = -(g1 + g2 * s) / (s**2 + rate * s + omega**2 + g1)
+    a = modal_state_matrix(omega**2 + g1, rate)
     gains = np.hstack([np.diag(g1), np.diag(g2)])
     slowest = -np.linalg.eigvals(a).real.max()
     if np.isfinite(final_time):
