@@ -53,3 +53,22 @@ def test_the_bands_of_a_plate_are_drawn_where_they_are_wide():
     assert "of 3 eigenfunctions at" in str(bands)
     with pytest.raises(ValueError, match="stand on one line: give a grid"):
         plot(Bands(at[:3], bands.phi[:3], std[:3], std[:3], np.full(3, 3.0), 0.95))
+
+
+def test_a_response_at_many_points_shows_those_that_move_most():
+    n = 20
+    points = wb.NamedPoints(tuple(f"S{i}" for i in range(n)), None, ("x",) * n)
+    modes = wb.FiniteElements(np.eye(n), np.diag(np.arange(1.0, n + 1)), nodes=points).modes(n)
+    law = wb.imsc(modes, 1, [wb.Actuator("F1", "S0")], weight=1.0)
+    response = wb.initial_response(wb.close_loop(modes, law), np.r_[np.arange(n), np.zeros(n)], np.linspace(0, 9, 50))
+    figure = plot(response)
+    assert [ax.get_ylabel() for ax in figure.axes] == [f"S{i}" for i in range(8, n)]
+    assert "of the 12 points of 20 that move most" in figure.axes[0].get_title("left")
+
+
+def test_an_explanation_at_named_points_is_printed_and_drawn():
+    law = wb.imsc(FRAME, 1, [wb.Actuator("F1", "S3")], weight=1.0)
+    explained = wb.explain_spillover(FRAME, wb.kalman(FRAME, law, [wb.Sensor("y", "S3")], disturbance=1.0, noise=0.1))
+    assert "S3 to F1" in str(explained) and str(explained).startswith("closed loop of 3 modes: ")
+    assert "sensor S3 → F1" in [label.get_text() for label in plot(explained).axes[1].get_yticklabels()]
+    assert "place [m]" not in str(law)

@@ -16,6 +16,7 @@ from workbench.design.placement.velocity_feedback import FeedbackPlacement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
 
@@ -166,7 +167,7 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     axes[0].set_title("above zero the full plant is unstable")
     axes[0].legend()
     worst = explained.shifts[0]
-    labels = [f"sensor {p.sensor_at:.2f} → {p.actuator}" for p in worst.paths] + ["all paths"]
+    labels = [f"sensor {place_text(p.sensor_at)} → {p.actuator}" for p in worst.paths] + ["all paths"]
     shifts = np.array([p.shift.real for p in worst.paths] + [worst.shift.real])
     rows = np.arange(len(labels))[::-1]
     axes[1].barh(rows, shifts, color=[COLOURS[1] if s > 0 else COLOURS[0] for s in shifts])

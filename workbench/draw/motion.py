@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse.csgraph import minimum_spanning_tree
 
 from workbench.design.loop.closed_loop import Response
 from workbench.rig.actuators import Actuator
@@ -239,12 +240,16 @@ def frame_net(domain: Domain) -> Net:
 
 
 def _neighbours(at: np.ndarray) -> list[list[int]]:
-    """Pairs of points that no other point is nearer to both of (the relative neighbourhood graph; Toussaint 1980)."""
+    """Pairs of points that no other point is nearer to both of (the relative neighbourhood graph; Toussaint 1980).
+
+    None is twice as far apart as what joins all points takes: the feet of a portal are not joined.
+    """
     distance = np.linalg.norm(at[:, None] - at, axis=2)
+    longest = 2.0 * minimum_spanning_tree(distance).max()
     pairs = []
     for i in range(len(at)):
         between = (np.maximum(distance[i], distance) < distance[i][:, None] * (1.0 - 1e-9)).any(axis=1)
-        pairs += [[i, int(j)] for j in np.flatnonzero(~between) if j > i]
+        pairs += [[i, int(j)] for j in np.flatnonzero(~between & (distance[i] < longest)) if j > i]
     return pairs
 
 

@@ -138,7 +138,7 @@ def _(result: Response) -> Figure:
         instants = np.linspace(result.time[0], result.time[-1], MOST_INSTANTS)
         return plot_surface_motion({"displacement": result}, instants.tolist())
     if isinstance(domain, NamedPoints):
-        return _point_motion(result, domain.grid()[:MOST_PANELS])
+        return _point_motion(result, domain.grid())
     return plot_motion({"displacement": result}, np.linspace(0.0, domain.length, 201))
 
 
@@ -181,14 +181,17 @@ def _(result: Distortion) -> Figure:
 
 
 def _point_motion(result: Response, names: Sequence[str]) -> Figure:
-    """Displacement of each point over time, a panel a point, all in one scale."""
+    """Displacement over time of the points that move most, a panel a point, all in one scale."""
+    moved = result.displacement(list(names))
+    most = np.sort(np.argsort(-np.abs(moved).max(axis=1), kind="stable")[:MOST_PANELS])
     figure, axes = new_figure(
-        len(names), 1, width=9, height=0.8 + 1.0 * len(names), sharex=True, sharey=True, squeeze=False
+        len(most), 1, width=9, height=0.8 + 1.0 * len(most), sharex=True, sharey=True, squeeze=False
     )
-    for ax, name, values in zip(axes[:, 0], names, result.displacement(list(names))):
-        ax.plot(result.time, values, linewidth=0.9)
-        ax.set_ylabel(name)
-    axes[0, 0].set_title("displacement [m]")
+    for ax, i in zip(axes[:, 0], most):
+        ax.plot(result.time, moved[i], linewidth=0.9)
+        ax.set_ylabel(names[i])
+    fewer = f" of the {len(most)} points of {len(names)} that move most" if len(most) < len(names) else ""
+    axes[0, 0].set_title(f"displacement [m]{fewer}")
     axes[-1, 0].set_xlabel("time [s]")
     return figure
 

@@ -228,6 +228,10 @@ def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
     for ax in grid.flat:
         ax.set_aspect("equal")
         ax.axis("off")
+    handles = [
+        Line2D([], [], color=c, marker="o", label=told) for c, told in ((GREY, "at rest"), (COLOURS[0], "moved"))
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
 

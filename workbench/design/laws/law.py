@@ -58,7 +58,12 @@ class Law(Printed):
         line = f"{self.name}, u = -K x: mode{'s' * several} {numbered(self.controlled)} by {count} actuator"
         line += "s" * (count > 1)
         modes = [str(r + 1) for r in self.controlled]
-        headings = ["actuator", "place [m]", *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
+        headings = [
+            "actuator",
+            "at" if isinstance(self.actuators[0].at, str) else "place [m]",
+            *(f"q{r}" for r in modes),
+            *(f"q{r}'" for r in modes),
+        ]
         rows = [
             [a.name, place_text(a.at), *(f"{k:.4g}" for k in gains)]
             for a, gains in zip(self.actuators, self.gain, strict=True)

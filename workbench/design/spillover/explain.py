@@ -8,6 +8,7 @@ one term for each actuator j and sensor i. At s = λ this is the perturbation of
 pole of the full loop it is exact. Either spillover at zero, b_r or c_r, leaves the mode where it was (Balas 1978).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from workbench.design.loop.closed_loop import ClosedLoop, close_with
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes
+from workbench.structure.printed import Printed, counted, place_text
 
 SECANT_STEPS = 40
 TWIN = 1e-12
@@ -69,8 +71,8 @@ class PoleShift:
         return sum(path.first_order for path in self.paths)
 
 
-@dataclass(frozen=True, eq=False)
-class Explanation:
+@dataclass(frozen=True, eq=False, repr=False)
+class Explanation(Printed):
     """A controller on the full plant.
 
     Attributes:
@@ -86,6 +88,30 @@ class Explanation:
     shifts: tuple[PoleShift, ...]
     reduced_margin: float
     destabilising: PoleShift | None
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        state = (
+            f"stable, margin {self.margin:.3g} 1/s"
+            if self.loop.stable
+            else f"unstable, grows by {-self.margin:.3g} 1/s"
+        )
+        rows = [
+            (
+                str(each.mode + 1),
+                f"{abs(each.pole) / (2 * np.pi):.4g}",
+                f"{each.pole.real:.4g}",
+                f"{each.closed_pole.real:.4g}",
+                f"{place_text(each.paths[0].sensor_at)} to {each.paths[0].actuator}",
+            )
+            for each in self.shifts
+        ]
+        behind = self.destabilising
+        remarks = (
+            f"controlled modes alone: margin {self.reduced_margin:.3g} 1/s",
+            *((f"mode {behind.mode + 1} makes the loop unstable",) if behind else ()),
+        )
+        headings = ("residual mode", "frequency [Hz]", "growth alone [1/s]", "controlled [1/s]", "path that adds most")
+        return f"closed loop of {counted(self.loop.modes.n_modes, 'mode')}: {state}", headings, rows, remarks
 
     @property
     def poles(self) -> np.ndarray:
