@@ -241,7 +241,7 @@ class Modes(Printed):
         """Only some of the modes, by zero-based index."""
         index = np.arange(self.n_modes)[modes] if isinstance(modes, slice) else np.asarray(modes, int)
         if index.size == 0 or index.min() < 0 or index.max() >= self.n_modes:
-            raise ValueError(f"modes {list(index)} are not all among the {self.n_modes} modes at hand (from 0)")
+            raise ValueError(f"modes {index.tolist()} are not all among the {self.n_modes} modes at hand (from 0)")
         shapes = self.shapes
         covariance = self.covariance
         if covariance is not None:

@@ -87,6 +87,8 @@ def test_a_filter_is_tried_where_only_points_are_known():
 def test_sensors_that_make_no_filter_are_refused(points, words):
     with pytest.raises(ValueError, match=words):
         point_filter(modes(3), points, range(3))
+    with pytest.raises(ValueError, match=r"modes \[0, 5\] are not all among the 3 modes"):
+        point_filter(modes(3), ["P2", "P4"], [0, 5])
 
 
 def test_modes_that_sensors_cannot_tell_apart_are_named():

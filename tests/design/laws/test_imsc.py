@@ -91,6 +91,13 @@ def test_response_at_uneven_times_is_the_same_response():
     assert not many.modal.flags.writeable and state.flags.writeable
 
 
+def test_a_state_of_another_size_starts_no_response():
+    loop = close_loop(modes(), imsc(modes(), 2, actuators(2.0, 4.0), weight=1.0))
+    for state in (np.zeros(3), np.full(18, np.nan)):
+        with pytest.raises(ValueError, match=r"the state must be finite, \(18,\) of the modes; got"):
+            initial_response(loop, state, [0.0, 1.0])
+
+
 @pytest.mark.parametrize(
     ("act", "words"),
     [
@@ -103,6 +110,7 @@ def test_response_at_uneven_times_is_the_same_response():
         (lambda: imsc(modes(), [1], actuators(5.0), weight=1.0), "no actuator moves mode 2"),
         (lambda: imsc(modes(), [11], actuators(5.0), weight=1.0), "not distinct modes"),
         (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=[1.0, -1.0]), "positive definite"),
+        (lambda: coupled_lqr(modes(), 2, actuators(2.0, 3.0), weight=np.nan), "positive definite"),
     ],
 )
 def test_designs_that_cannot_be_are_refused(act, words):

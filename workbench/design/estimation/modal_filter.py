@@ -136,9 +136,11 @@ def point_filter(modes: Modes, points: Sequence[str], filtered: Sequence[int]) -
         filtered: indices of the modes to be filtered, from 0.
 
     Raises:
-        ValueError: two sensors at one point, fewer sensors than filtered modes, or modes that they cannot tell apart.
+        ValueError: two sensors at one point, fewer sensors than filtered modes, modes that they cannot tell apart, or
+            that are not at hand.
     """
     names, index = list(points), list(filtered)
+    modes.select(index)  # refuses what is not at hand
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise ValueError(f"two of the {len(names)} sensors stand at point {twice}; move one")

@@ -34,7 +34,7 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
         mass_per_area: kg/m², a number or a function of (x, y).
 
     Raises:
-        ValueError: two sensors at one place, or fewer readings than a surface needs.
+        ValueError: two sensors at one place, fewer of them than modes, or fewer readings than a surface needs.
     """
     domain = modes.domain
     if not isinstance(domain, Rectangle):
@@ -42,6 +42,11 @@ def surface_filter(modes: Modes, places: ArrayLike, mass_per_area: FieldLike) ->
     at = domain.locate(places)
     if len(np.unique(at, axis=0)) < len(at):
         raise ValueError(f"two of the {len(at)} sensors stand at one place; move one")
+    if len(at) < modes.n_modes:
+        raise ValueError(
+            f"a filter of {modes.n_modes} modes on a plate needs at least as many sensors; got {len(at)}: add sensors,"
+            " or filter fewer modes"
+        )
     nodes = np.vstack([at, _held(modes, domain, at)])
     if np.linalg.matrix_rank(np.column_stack([np.ones(len(nodes)), nodes / domain.length])) < READINGS:
         raise ValueError(

@@ -46,7 +46,8 @@ def coupled_lqr(
     q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
     r = np.asarray(weight, float)
     r = r * np.eye(len(actuators)) if r.ndim == 0 else np.diag(r) if r.ndim == 1 else r
-    if r.shape != (len(actuators),) * 2 or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
+    known = r.shape == (len(actuators),) * 2 and np.isfinite(r).all()
+    if not known or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
         raise DesignError(
             f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {r}"
         )

@@ -141,12 +141,16 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     has a closed form; else uniform instants share one matrix exponential, and others cost one each.
 
     Raises:
-        ValueError: times that do not increase from zero or later.
+        ValueError: times that do not increase from zero or later, a state of another size or not finite.
     """
     time = np.asarray(time, float)
     if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
         raise ValueError("times must increase, from zero or later")
-    state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
+    sizes = (2 * loop.modes.n_modes, loop.matrix.shape[0])
+    if np.shape(state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(state).all():
+        more = f", or ({sizes[1]},) with the controller" if sizes[1] > sizes[0] else ""
+        raise ValueError(f"the state must be finite, ({sizes[0]},) of the modes{more}; got {np.shape(state)}")
+    state = np.r_[state, np.zeros(sizes[1] - np.size(state))]
     modal = _cascade(loop, state, time)
     if modal is None:
         modal = _stepped(loop.matrix, state, time)
