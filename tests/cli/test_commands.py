@@ -220,6 +220,23 @@ noise_std = 1e-6
 """
 
 
+def test_an_input_at_a_node_is_placed_at_its_point_in_its_direction(tmp_path):
+    rows = [f"{n}{d},{n},0,0,{n},{d},{0.2 * n + 0.1 * (d == 'y')},{0.3 - 0.1 * n}" for n in (1, 2) for d in "xy"]
+    (tmp_path / "points.csv").write_text("\n".join(["name,node,x,y,z,direction,mode_1,mode_2", *rows]))
+    inputs = "".join(
+        f'[[input]]\nname = "{kind}"\nkind = "{kind}"\npoint = "2"\ndirection = "y"\n'
+        for kind in ("actuator", "hammer")
+    )
+    (tmp_path / "case.toml").write_text(
+        '[structure]\nkind = "modal"\nnatural_frequencies_hz = [1.0, 3.0]\ndamping_ratios = [0.01, 0.01]\n'
+        f'points = "points.csv"\n{inputs}[[output]]\nname = "y"\nquantity = "displacement"\npoint = "2y"\n'
+        "noise_std = 1.0\n"
+    )
+    result = run("place", tmp_path, "--control", 1)
+    assert result.exit_code == 0 and "unit impulse at 2y" in result.output, result.output
+    assert run("design", tmp_path, "--control", 1).exit_code == 0
+
+
 @pytest.fixture
 def plate(tmp_path):
     path = tmp_path / "plate.toml"
@@ -327,7 +344,10 @@ def test_places_that_a_plate_does_not_have_are_refused(plate, arguments, words):
         (("design", "{rig}", "--final-time", -1), "final time must be positive and finite; got -1"),
         (("design", "{rig}", "--json", "nowhere/found.json"), "there is no folder nowhere"),
         (("place", "{rig}", "--control", 4, "--json", "nowhere/found.json"), "there is no folder nowhere"),
-        (("place", "{rig}", "--control", 4, "--forbid", "0.5:10"), "find room for 3 on the intervals left"),
+        (
+            ("place", "{rig}", "--control", 4, "--forbid", "0.5:10"),
+            "find room for 2 on the intervals left, 0 to 0.5 m:",
+        ),
         (("place", "{rig}", "--control", 9), "residual"),
         (("place", "{rig}", "--control", 4, "--impulse-at", 11), "outside the structure"),
         (("place", "{rig}", "--control", 4, "--at", "1,2,3,11"), "outside the structure"),

@@ -1,5 +1,6 @@
 """The rig that `design`, `place` and `redesign` read, and what their options say about it."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -24,7 +25,7 @@ Weight = Annotated[float, typer.Option(help="Control weight R: force against mot
 
 
 def read_structure_rig(path: Path) -> Rig:
-    """The rig of a TOML file or a case folder.
+    """The rig of a TOML file or a case folder; an actuator at a node stands at its point in the actuator's direction.
 
     Raises:
         ValueError: plain modal data without a file of points, where nothing is known but the shapes at the rig itself.
@@ -38,6 +39,14 @@ def read_structure_rig(path: Path) -> Rig:
             f'{path}: plain modal data have no shapes between points; name a file of points (points = "points.csv"), or'
             " describe a beam, a rod or a plate"
         )
+    if isinstance(domain, NamedPoints):
+        actuators = [
+            replace(a, at=domain.slope(a.at, int(a.kind == "moment"), a.direction)[0][0], direction=None)
+            if isinstance(a.at, str)
+            else a
+            for a in found.actuators
+        ]
+        return replace(found, actuators=tuple(actuators))
     return found
 
 
