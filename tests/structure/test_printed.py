@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import workbench as wb
+from workbench.design.estimation.controller import filtered
+from workbench.design.estimation.surface_filter import filter_on
+from workbench.identification.updating.self_check import SelfCheck
 from workbench.structure.domain import NamedPoints
 
 
@@ -48,6 +51,20 @@ def test_nothing_prints_an_array(beam, rig, record):
     for result in (beam, rig, record, rig.modes, many, record.only(["y"])):
         assert len(repr(result)) < 200 and "array(" not in repr(result) + str(result)
         assert len(str(result)) < 1000
+
+
+def test_what_is_designed_and_checked_prints_no_array():
+    points = NamedPoints(tuple(f"S{i}" for i in range(4)))
+    frame = wb.FiniteElements(np.eye(4), np.diag([1.0, 2.0, 3.0, 4.0]), nodes=points)
+    modes = frame.modes(4)
+    law = wb.imsc(modes, 1, [wb.Actuator("F", "S0")], weight=1.0)
+    sensors = wb.place_sensors(modes, 1, 2, mean_squares=np.ones(4))
+    through = filter_on(None, modes, [0], sensors.positions)
+    check = SelfCheck(np.array([0.01, -0.02]), np.array([1.0, 0.9]))
+    for result in (frame, sensors, through, filtered(law, through), check):
+        assert len(repr(result)) < 200 and "array(" not in repr(result) + str(result)
+    assert str(check).splitlines()[2].split() == ["1", "1", "1.0000"] and "at most 2 % off" in str(check)
+    assert "4 degrees of freedom at 4 nodes" in repr(frame) and "y1" in str(filtered(law, through))
 
 
 def test_a_notebook_shows_the_same_table_with_nothing_left_to_run():

@@ -15,6 +15,7 @@ from workbench.arrays import Floats
 from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import ROTATIONS, Between, NamedPoints, Where
 from workbench.structure.modes import Modes
+from workbench.structure.printed import Printed, counted
 from workbench.structure.supports import Attachment, PointMass, PointSpring
 
 SYMMETRIC = 1e-9  # of the largest entry: more is no rounding of the program that wrote the matrix
@@ -26,8 +27,8 @@ ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot 
 Matrix: TypeAlias = sparray | spmatrix | np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class FiniteElements:
+@dataclass(frozen=True, eq=False, repr=False)
+class FiniteElements(Printed):
     """A structure of finite elements, known by its matrices.
 
     Attributes:
@@ -69,6 +70,11 @@ class FiniteElements:
         if (self.mass.diagonal() < 0).any():
             i = int(np.argmin(self.mass.diagonal()))
             raise ValueError(f"the mass matrix is not positive: point {points.names[i]!r} has {self.mass[i, i]:.3g} kg")
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        n, nodes = len(self.nodes.names), len(set(self.nodes.nodes))
+        damping = "a damping matrix" if isinstance(self.damping, csc_array) else repr(self.damping)
+        return f"finite elements, {n} degrees of freedom at {counted(nodes, 'node')}, {damping}", (), (), ()
 
     @property
     def domain(self) -> NamedPoints:

@@ -17,10 +17,11 @@ from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Place
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed, counted, place_text
 
 
-@dataclass(frozen=True, eq=False)
-class Controller:
+@dataclass(frozen=True, eq=False, repr=False)
+class Controller(Printed):
     """A law with what it knows of the state.
 
     Attributes:
@@ -51,6 +52,12 @@ class Controller:
             object.__setattr__(self, name, frozen(getattr(self, name)))
         if self.estimator is not None:
             object.__setattr__(self, "estimator", frozen(self.estimator))
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line = f"{self.name}: {counted(len(self.sensors), 'channel')} to {counted(len(self.law.actuators), 'actuator')}"
+        rows = [(sensor.name, sensor.quantity, place_text(sensor.at)) for sensor in self.sensors]
+        rows += [(actuator.name, actuator.kind, place_text(actuator.at)) for actuator in self.law.actuators]
+        return f"{line}, {counted(len(self.state), 'state')}", ("name", "quantity", "at"), rows, ()
 
     @property
     def places(self) -> tuple[Place, ...]:

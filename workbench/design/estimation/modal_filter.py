@@ -16,6 +16,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from workbench.arrays import Floats
 from workbench.structure.domain import Place, same_place
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 
 GAUSS_POINTS = 24
@@ -23,8 +24,8 @@ BLIND = 1e-6  # of the largest singular value of the shapes at the sensors: belo
 RIGID = 1e-4  # of the slowest elastic frequency: a rigid mode counts as one so slow, which costs next to no energy
 
 
-@dataclass(frozen=True, eq=False)
-class ModalFilter:
+@dataclass(frozen=True, eq=False, repr=False)
+class ModalFilter(Printed):
     """Weights that turn readings into modal coordinates; rates go through the same weights.
 
     Attributes:
@@ -44,6 +45,17 @@ class ModalFilter:
         object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
         for name in ("displacement", "slope"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        n_modes, n_sensors = self.displacement.shape
+        read = "displacements and slopes" if self.slope.size else "displacements"
+        line = f"modal filter of {counted(n_modes, 'mode')} through {read} of {counted(n_sensors, 'sensor')}"
+        headings = ("sensor", "place", *(f"q{r + 1}" for r in range(n_modes)))
+        rows = [
+            (str(i + 1), place_text(place), *(f"{weight:.4g}" for weight in self.displacement[:, i]))
+            for i, place in enumerate(self.places)
+        ]
+        return line, headings, rows, ()
 
     @property
     def places(self) -> list[Place]:

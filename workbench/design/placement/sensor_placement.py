@@ -19,6 +19,7 @@ from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.design.placement.places import as_places
 from workbench.structure.domain import Interval, Place, Rectangle, listed, same_place
 from workbench.structure.modes import Modes, frozen
+from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import FieldLike, ProfileLike
 from workbench.threads import one_blas_thread
 
@@ -27,8 +28,8 @@ SPACINGS = 40  # from end to end of a structure between candidates
 SPACINGS_OVER = 12  # along the longer side of a surface
 
 
-@dataclass(frozen=True, eq=False)
-class SensorPlacement:
+@dataclass(frozen=True, eq=False, repr=False)
+class SensorPlacement(Printed):
     """Places of the sensors and how well the filter then reads.
 
     Attributes:
@@ -47,6 +48,12 @@ class SensorPlacement:
     def __post_init__(self) -> None:
         named = np.asarray(self.positions).dtype.kind in "OU"
         object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        line = f"{counted(len(self.positions), 'sensor')} placed: error of the filter {self.error:.3g}"
+        line += f", of even places {self.even_error:.3g}"
+        rows = [(str(i + 1), place_text(place)) for i, place in enumerate(self.places)]
+        return line, ("sensor", "place"), rows, () if self.exhaustive else ("the best of several searches, not of all",)
 
     @property
     def places(self) -> list[Place]:

@@ -9,14 +9,15 @@ import numpy as np
 from workbench.identification.updating.distributions import Basis, Distributions, mass_and_stiffness
 from workbench.structure.member import Bar, Beam
 from workbench.structure.modes import Modes, mac
+from workbench.structure.printed import Printed
 from workbench.structure.supports import End
 from workbench.threads import one_blas_thread
 
 N_POINTS = 101
 
 
-@dataclass(frozen=True, eq=False)
-class SelfCheck:
+@dataclass(frozen=True, eq=False, repr=False)
+class SelfCheck(Printed):
     """The eigensolution of an identified structure beside the one that was measured.
 
     Attributes:
@@ -28,6 +29,14 @@ class SelfCheck:
     frequency_errors: np.ndarray
     mac: np.ndarray
     refusal: str = ""
+
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        each = enumerate(zip(self.frequency_errors, self.mac, strict=True))
+        rows = [(str(r + 1), f"{100 * error:.3g}", f"{agreement:.4f}") for r, (error, agreement) in each]
+        if self.refusal:
+            return f"identified structure against measurement: {self.refusal}", (), (), ()
+        line = f"identified structure against measurement: frequencies at most {100 * self.worst:.3g} % off"
+        return line, ("mode", "frequency [%]", "MAC"), rows, ()
 
     @property
     def worst(self) -> float:
