@@ -45,6 +45,16 @@ def test_every_mode_of_a_turned_basis_is_paired():
     np.testing.assert_allclose(pairing.mac, 1.0, rtol=1e-9)
 
 
+def test_one_of_repeated_modes_is_paired_with_the_one_it_is():
+    modes = square()
+    some = [0, 2, 3, 5]
+    measured = SampledModes(modes.omega[some], np.zeros(4), turned(0.1)[:, some], PLACES)
+    assert pair_modes(measured, modes).model.tolist() == some
+    lost = np.where(np.arange(14)[:, None] == 3, np.nan, measured.shapes)
+    with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 3 has .*nan"):
+        pair_modes(SampledModes(measured.omega, measured.zeta, lost, PLACES), modes)
+
+
 def test_modes_at_named_points_are_paired_with_those_of_a_model():
     names = ("S1", "S2", "S3")
     points = NamedPoints(names, np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3]]), ("x",) * 3)

@@ -9,6 +9,8 @@ from scipy.optimize import linear_sum_assignment
 from workbench.structure.modes import Modes, SampledModes, mac
 from workbench.structure.printed import Printed, counted
 
+ITSELF = 1e-3  # weight of a shape by itself beside the subspace of repeated modes: it decides where these agree alike
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModePairing(Printed):
@@ -87,15 +89,22 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
         frequency: largest relative difference from the median ratio.
 
     Raises:
-        ValueError: a sensor without a place, or at one that the model does not have.
+        ValueError: a sensor without a place, or at one that the model does not have, a shape that is not finite.
     """
     if measured.unplaced.any():
         raise ValueError(
             f"sensor {int(np.argmax(measured.unplaced))} has no place, so no shape of the model can be compared; give"
             " its channel `at`"
         )
-    agreement = subspace_mac(measured.shapes, model.phi(measured.positions), model.omega)
-    rows, columns = linear_sum_assignment(-np.where(agreement >= shape, agreement, 0.0))
+    if not np.isfinite(measured.shapes).all():
+        i, r = np.argwhere(~np.isfinite(measured.shapes))[0]
+        raise ValueError(f"shapes must be finite; of mode {r + 1} sensor {i} has {measured.shapes[i, r]}: leave it out")
+    own = model.phi(measured.positions)
+    agreement = subspace_mac(measured.shapes, own, model.omega)
+    # of repeated modes, which agree alike as a subspace, each goes to the one that is most like it by itself
+    rows, columns = linear_sum_assignment(
+        -np.where(agreement >= shape, agreement + ITSELF * mac(measured.shapes, own), 0.0)
+    )
     good = agreement[rows, columns] >= shape
     rows, columns = rows[good], columns[good]
     ratio = measured.omega[rows] / model.omega[columns]
