@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import butter, lfilter
 
 from workbench.gap.prediction.random_force import TONAL, _power, followed, tonal
+from workbench.gap.prediction.unmodelled_force import colour_of
 
 N = 2000
 
@@ -50,4 +51,15 @@ def test_what_follows_the_inputs_without_delay(record):
 @pytest.mark.parametrize("memory", [0.0, 0.6, 0.95])
 def test_power_of_a_colour(stages, memory):
     impulse = lfilter([1.0], np.poly([memory] * stages), np.eye(1, N)[0])
-    assert _power(memory, stages) == pytest.approx((impulse**2).sum(), rel=1e-9)
+    assert _power(colour_of(memory, stages)) == pytest.approx((impulse**2).sum(), rel=1e-9)
+
+
+@pytest.mark.parametrize("stages", [1, 2, 3, 4])
+@pytest.mark.parametrize("memory", [0.5, 0.9])
+def test_a_flat_colour_has_the_poles_of_a_butterworth_filter(stages, memory):
+    poles = np.exp(butter(stages, -np.log(memory), analog=True, output="zpk")[1])
+    colour = colour_of(memory, stages, flat=True)
+    found = np.linalg.eigvals(colour)
+    assert np.sort_complex(found) == pytest.approx(np.sort_complex(poles), abs=1e-9)
+    impulse = lfilter([1.0], np.poly(poles), np.eye(1, N)[0])
+    assert _power(colour) == pytest.approx((impulse**2).sum(), rel=1e-9)

@@ -8,6 +8,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.stats import multivariate_normal
 
 from workbench.gap.prediction.unmodelled_force import (
+    colour_of,
     driven,
     force_filter,
     innovations,
@@ -27,7 +28,7 @@ NOISE = np.array([1e-4, 3e-4, 2e-4, 1e-4])
 def kalman(hinged_rig):
     rig = hinged_rig(n_modes=3)
     model = sampled_model(rig.modes, rig.sensors, NOISE, DT)
-    return force_filter(model, rig.modes.phi(0.9).T, np.array([0.04]), 0.7)
+    return force_filter(model, rig.modes.phi(0.9).T, np.array([0.04]), colour_of(0.7, 1))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ def test_sensors_that_are_late_or_early_read_the_forces_of_their_interval(hinged
     force = np.random.default_rng(3).normal(size=(1, SAMPLES))
     expected = simulate(replace(rig, actuators=rig.actuators[:1]), force, sample_time=DT).outputs
     kalman = force_filter(
-        sampled_model(rig.modes, rig.sensors, NOISE, DT), rig.modes.phi(at).T, np.ones(1), 0.0, stages
+        sampled_model(rig.modes, rig.sensors, NOISE, DT), rig.modes.phi(at).T, np.ones(1), colour_of(0.0, stages)
     )
     n, state, read = 2 * rig.modes.n_modes, np.zeros(len(kalman.a)), []
     for k in range(SAMPLES):

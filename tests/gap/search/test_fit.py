@@ -64,7 +64,7 @@ def test_predictions_ahead_err_by_the_innovations_of_the_filter_where_all_is_lin
     data = FitData((record,), np.full(4, NOISE))
     places = (np.arange(50) + 0.5) / 25
     forces = LOOSE * data.force_rms * np.sqrt(np.mean(rig.modes.phi(places) ** 2, axis=0))
-    kalman = force_filter(sampled_model(rig.modes, rig.sensors, data.noise, DT), np.eye(6), forces**2, 0.0)
+    kalman = force_filter(sampled_model(rig.modes, rig.sensors, data.noise, DT), np.eye(6), forces**2)
     expected = whiten(kalman, data.residual(rig).reshape(4, -1) * NOISE)
     np.testing.assert_allclose(data.following(rig).residual(rig).reshape(4, -1), expected, atol=1e-6)
     assert np.std(expected) > 2.0  # so that more than noise was compared

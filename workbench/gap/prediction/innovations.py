@@ -56,7 +56,7 @@ class Follower:
         shape = np.zeros(n) if at is None else modes.phi_at(at)
         patterns, variances = np.column_stack([np.eye(n), shape]), np.r_[forces**2, rms**2]
         model = sampled_model(modes, _at_once(rig).sensors, noise, sample_time)
-        found = force_filter(model, patterns, variances, 0.0)
+        found = force_filter(model, patterns, variances)
         # what an error says of the forces until the next sample is put into the state at this one
         gain = np.linalg.solve(model.transition, found.gain[: 2 * n])
         whitening = np.linalg.inv(np.linalg.cholesky(found.innovation))

@@ -102,7 +102,7 @@ def input_filters(rig: Rig, data: FitData, share: float) -> dict[str, ForceFilte
     """
     model = sampled_model(rig.modes, rig.sensors, data.noise, data.records[0].sample_time)
     patterns = np.column_stack([a.gain * shape_of(rig.modes, a) for a in rig.actuators])
-    return {r.name: force_filter(model, patterns, _variances(r, share), 0.0) for r in data.records}
+    return {r.name: force_filter(model, patterns, _variances(r, share)) for r in data.records}
 
 
 def _variances(record: Record, share: float) -> Floats:

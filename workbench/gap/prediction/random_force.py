@@ -2,15 +2,19 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_discrete_lyapunov
 from scipy.optimize import minimize
 
+from workbench.arrays import Floats
 from workbench.gap.effects.environment import tone
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import (
     ForceFilter,
     SampledModel,
+    colour_of,
     force_filter,
     log_likelihood,
     sampled_model,
@@ -34,6 +38,7 @@ class RandomForceSettings:
     tolerance: float = 1e-4  # shares and logarithms
     loss_tolerance: float = 0.1  # twice a log-likelihood
     evaluations: int = 160
+    families: int = 3  # of colours, likeliest first, that are fitted to two records before one is to all
     curved_over: float = 2e-3  # of the extent: half of the stretch over which the likelihood's curvature is taken
     # what may be one random force of the surroundings: by how much its level spreads between records, relative; how far
     # the mean square of what is left may be from one; what share of it inputs and motion may account for
@@ -43,8 +48,13 @@ class RandomForceSettings:
 
 
 RANDOM_FORCE = RandomForceSettings()
-# Memory and stages, the likeliest of which a fit starts from.
-COLOURS = ((0.0, 1), (0.6, 1), (0.9, 1), (0.5, 2), (0.8, 2), (0.95, 2), (0.6, 3), (0.85, 3))
+# Memory, stages and whether they are flat, the likeliest of which a fit starts from.
+COLOURS = (
+    *((memory, 1, False) for memory in (0.0, 0.6, 0.9)),
+    *((memory, 2, False) for memory in (0.5, 0.8, 0.95)),
+    *((memory, 3, False) for memory in (0.6, 0.85)),
+    *((memory, stages, True) for stages in (2, 4) for memory in (0.1, 0.4, 0.7, 0.9)),
+)
 TONAL = 0.7  # share of it that its mean and one sinusoid account for, at most
 
 
@@ -56,7 +66,7 @@ class RandomForceFit:
         at: where it acts.
         rms: of the process, N; its part above what the structure answers to is a guess.
         at_std: standard deviation of each coordinate of the place, m; none of a named point.
-        memory, stages: colour of the force; see `force_filter`.
+        colour: (n_stages, n_stages) of the force; see `colour_of`.
         cost: minus twice the log-likelihood per value, on the scale where a residual of pure sensor noise costs 1.
         chi2_by_record: (n_records,) mean squares of the whitened residual.
         left: mean square of what the smoothed force leaves of whole records, in units of the noise.
@@ -69,8 +79,7 @@ class RandomForceFit:
     at: Where
     rms: float
     at_std: tuple[float, ...]
-    memory: float
-    stages: int
+    colour: Floats
     cost: float
     chi2_by_record: np.ndarray
     left: float
@@ -125,37 +134,50 @@ def fit_random_force(
     def placed_at(point: np.ndarray, start: Where) -> Where:
         return start if d == 0 else same_place(point[:d] * extent)
 
-    def filter_at(where: Where, log_rms: float, memory: float, stages: int) -> ForceFilter:
-        variance = np.exp(2.0 * log_rms) / _power(memory, stages)
-        return force_filter(model, rig.modes.phi_at(where)[:, None], np.array([variance]), memory, stages)
+    def colour_at(point: np.ndarray, stages: int, flat: bool) -> Floats:
+        return colour_of(float(1.0 / (1.0 + np.exp(-point[d + 1]))), stages, flat=flat)
 
-    def loss(point: np.ndarray, start: Where, stages: int, records: list[np.ndarray]) -> float:
+    def loss(point: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray]) -> float:
+        start, stages, flat = family
         memory = 1.0 / (1.0 + np.exp(-point[d + 1]))
         if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
             return 1e300
-        value = -2.0 * log_likelihood(filter_at(placed_at(point, start), point[d], memory, stages), records)
+        kalman = _filter(model, rig, placed_at(point, start), np.exp(point[d]), colour_at(point, stages, flat))
+        value = -2.0 * log_likelihood(kalman, records)
         return value if np.isfinite(value) else 1e300
 
     grid = [
-        (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], where, stages)
+        (np.r_[within, np.log(size * share), np.log((memory + 1e-3) / (1.0 - memory))], (where, stages, flat))
         for where in places
         for within in [np.atleast_1d(np.asarray(where)) / extent if extent.size else np.zeros(0)]
         for share in RANDOM_FORCE.sizes
-        for memory, stages in COLOURS
+        for memory, stages, flat in COLOURS
     ]
-    start, beside, stages = min(grid, key=lambda each: loss(each[0], each[1], each[2], quick))
     place, log_size, logit_of_memory = RANDOM_FORCE.first_place, RANDOM_FORCE.first_log_rms, RANDOM_FORCE.first_logit
-    simplex = start + np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
-    options = {
-        "initial_simplex": simplex,
-        "xatol": RANDOM_FORCE.tolerance,
-        "fatol": RANDOM_FORCE.loss_tolerance,
-        "maxfev": RANDOM_FORCE.evaluations,
-    }
-    found = minimize(loss, start, args=(beside, stages, residuals), method="Nelder-Mead", options=options)
-    at, log_rms, logit = placed_at(found.x, beside), found.x[d], found.x[d + 1]
-    memory = float(1.0 / (1.0 + np.exp(-logit)))
-    kalman = filter_at(at, log_rms, memory, stages)
+    steps = np.vstack([np.zeros(d + 2), np.diag(np.r_[np.full(d, place), log_size, logit_of_memory])])
+
+    def refined(start: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray], most: int) -> Any:
+        options = {
+            "initial_simplex": start + steps,
+            "xatol": RANDOM_FORCE.tolerance,
+            "fatol": RANDOM_FORCE.loss_tolerance,
+            "maxfev": most,
+        }
+        return minimize(loss, start, args=(family, records), method="Nelder-Mead", options=options)
+
+    likely: dict[tuple[int, bool], tuple[np.ndarray, tuple[Where, int, bool]]] = {}
+    for start, family in sorted(grid, key=lambda each: loss(each[0], each[1], quick)):
+        likely.setdefault(family[1:], (start, family))
+    briefly = RANDOM_FORCE.evaluations // 2
+    nearer = [
+        (refined(first, family, quick, briefly), family)
+        for first, family in list(likely.values())[: RANDOM_FORCE.families]
+    ]
+    nearest, family = min(nearer, key=lambda each: float(each[0].fun))
+    found, (beside, stages, flat) = refined(nearest.x, family, residuals, RANDOM_FORCE.evaluations), family
+    at, log_rms = placed_at(found.x, beside), found.x[d]
+    colour = colour_at(found.x, stages, flat)
+    kalman = _filter(model, rig, at, np.exp(log_rms), colour)
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))
     both = [(r, smoothed_states(kalman, r)) for r in residuals]
@@ -165,12 +187,10 @@ def fit_random_force(
         at=at,
         rms=float(np.exp(log_rms)),
         at_std=tuple(
-            _deviation(lambda p: loss(p, beside, stages, residuals), found.x, i, RANDOM_FORCE.curved_over)
-            * float(extent[i])
+            _deviation(lambda p: loss(p, family, residuals), found.x, i, RANDOM_FORCE.curved_over) * float(extent[i])
             for i in range(d)
         ),
-        memory=memory,
-        stages=stages,
+        colour=colour,
         cost=float((found.fun - noise_part) / n_values),
         chi2_by_record=np.array([np.mean(whiten(kalman, r) ** 2) for r in residuals]),
         left=float(np.sum([(((r - kalman.h @ x) / data.noise[:, None]) ** 2).sum() for r, x in both])) / n_values,
@@ -193,14 +213,19 @@ def tonal(force: np.ndarray, sample_time: float) -> float:
 
 def model_filter(model: SampledModel, rig: Rig, found: RandomForceFit) -> ForceFilter:
     """The filter of a fitted random force."""
-    variance = found.rms**2 / _power(found.memory, found.stages)
-    return force_filter(model, rig.modes.phi_at(found.at)[:, None], np.array([variance]), found.memory, found.stages)
+    return _filter(model, rig, found.at, found.rms, found.colour)
 
 
-def _power(memory: float, stages: int) -> float:
-    """Variance of the force per variance of what drives its colour: Σ C(k + s - 1, s - 1)² m^2k over k, of s stages."""
-    x = memory**2
-    return {1: 1.0, 2: 1.0 + x, 3: 1.0 + 4.0 * x + x**2}[stages] / (1.0 - x) ** (2 * stages - 1)
+def _filter(model: SampledModel, rig: Rig, at: Where, rms: float, colour: Floats) -> ForceFilter:
+    variance = np.array([rms**2 / _power(colour)])
+    return force_filter(model, rig.modes.phi_at(at)[:, None], variance, colour)
+
+
+def _power(colour: Floats) -> float:
+    """Variance of a force per variance of what drives its colour."""
+    drive = np.zeros_like(colour)
+    drive[-1, -1] = 1.0
+    return float(solve_discrete_lyapunov(colour, drive)[0, 0])
 
 
 def followed(force: np.ndarray, inputs: np.ndarray, motion: np.ndarray) -> float:

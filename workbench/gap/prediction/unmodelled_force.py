@@ -17,6 +17,7 @@ from workbench.rig.stepping import FAST, LANES
 from workbench.structure.modes import Modes
 
 RUNAWAY = 1e100
+WHITE = np.zeros((1, 1))  # colour of a force that no sample tells of the next
 TETHER = 1e-4  # radians a sample
 
 
@@ -95,21 +96,22 @@ class ForceFilter:
 
 
 def force_filter(
-    model: SampledModel, patterns: np.ndarray, variances: np.ndarray, memory: float, stages: int = 1
+    model: SampledModel, patterns: np.ndarray, variances: np.ndarray, colour: Floats = WHITE
 ) -> ForceFilter:
     """The filter for forces along `patterns` (n_modes, n_forces) with the given process variances.
 
-    memory is the correlation of a force from one sample to the next: 0 for white, near 1 for a random walk. Several
-    stages in a row make the force smoother, as a band limit does.
+    Args:
+        colour: (n_stages, n_stages) of each force from one sample to the next, from the force itself to the last stage,
+            which white noise drives; see `colour_of`.
     """
     n_state, m = model.transition.shape[0], patterns.shape[1]
-    forces = n_state + stages * m
+    forces = n_state + len(colour) * m
     late = m if model.before.any() else 0
     size = forces + late
     a = np.zeros((size, size))
     a[:n_state, :n_state] = model.transition
     a[:n_state, n_state : n_state + m] = model.growth @ patterns
-    a[n_state:forces, n_state:forces] = memory * np.eye(stages * m) + np.eye(stages * m, k=m)
+    a[n_state:forces, n_state:forces] = np.kron(colour, np.eye(m))
     a[forces:, n_state : n_state + late] = np.eye(late)
     h = np.zeros((model.output.shape[0], size))
     h[:, :n_state], h[:, n_state : n_state + m] = model.output, model.feedthrough @ patterns
@@ -117,6 +119,26 @@ def force_filter(
     q = np.zeros_like(a)
     q[forces - m : forces, forces - m : forces] = np.diag(variances)
     return _steady(a, h, q, model.noise_variance)
+
+
+def colour_of(memory: float, stages: int, *, flat: bool = False) -> Floats:
+    """How a coloured force goes on from one sample to the next: (stages, stages).
+
+    Args:
+        memory: of each stage, from one sample to the next: 0 for white, near 1 for a random walk.
+        stages: in a row, each of which makes the force smoother.
+        flat: with the poles of a Butterworth filter in place of equal real ones: as strong at all frequencies up to a
+            corner, as noise that is limited to a band.
+    """
+    turns = np.pi * (1.0 - (2.0 * np.arange(stages) + 1.0) / stages) / 2.0 if flat else np.zeros(stages)
+    poles = max(memory, 1e-12) ** np.exp(1j * turns)
+    colour = np.diag(np.where(np.abs(poles.imag) < 1e-12, poles.real, 0.0)) + np.eye(stages, k=1)
+    for k, pole in enumerate(np.sort_complex(poles[poles.imag > 1e-12])):
+        i = 2 * k
+        colour[i : i + 2, i : i + 2] = [[2.0 * pole.real, 1.0], [-(abs(pole) ** 2), 0.0]]
+    if stages % 2 and flat:
+        colour[-1, -1] = memory
+    return colour
 
 
 def wandering_force_filter(

@@ -8,6 +8,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
+from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.innovations import Follower
 from workbench.gap.prediction.random_force import TONAL, RandomForceFit, fit_random_force, followed, model_filter, tonal
@@ -211,7 +212,10 @@ def _random_beside(search: Search, given: Fit, evidence: Evidence) -> tuple[Fit,
     least = INTERVALS.alike * domain.size if found.at_std else 0.0
     at_std = (max(float(level * std), least) for std in found.at_std)
     spread = dict(zip(domain.coordinates, at_std, strict=True))
-    deviations = {**spread, "rms": max(float(level * rms_std), INTERVALS.alike * rms)}
+    # the force is known by what it does to mass and stiffness, which are off by so much
+    priors = (e.target for e in given.effects if isinstance(e.target, NominalPrior))
+    off = max((float(np.hypot(prior.mass, prior.stiffness)) for prior in priors), default=INTERVALS.alike)
+    deviations = {**spread, "rms": float(np.hypot(level * rms_std, off * rms))}
     effect = Effect(RANDOM_DISTURBANCE, None, {**place_values(found.at), "rms": rms}, deviations)
     fitted = given.n_parameters + 1 + len(spread)
     combined = Fit((*given.effects, effect), found.cost, given.cost_by_channel, fitted, "maximum likelihood")
