@@ -12,7 +12,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.coupled import controlled_plant
-from workbench.design.laws.imsc import imsc
+from workbench.design.laws.imsc import imsc, pole_gains
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopTest, named
@@ -252,6 +252,8 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
 def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> Loop | None:
     """The loop designed for multiples of its settings; None where its design has no such setting.
 
+    A law by poles has no weight: it feeds back 1/√weight times as much, as a regulator of light damping does.
+
     Args:
         loop: as it is.
         rig: whose actuators and sensors are taken, by name.
@@ -267,11 +269,28 @@ def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> L
         keywords = getattr(part.designed_by, "keywords", {})
         if factor == 1.0:
             continue
-        if setting not in keywords:
+        if setting in keywords:
+            changed = {setting: factor * np.asarray(keywords[setting])}
+        elif name == "law" and "poles" in keywords:
+            changed = {"poles": _moved(np.asarray(keywords["poles"]), loop, 1.0 / np.sqrt(factor))}
+        else:
             return None
-        other = partial(part.designed_by.func, **{**keywords, setting: factor * np.asarray(keywords[setting])})
-        parts[name] = replace(part, designed_by=other)
+        parts[name] = replace(part, designed_by=partial(part.designed_by.func, **{**keywords, **changed}))
     return designed_anew(loop._replace(**parts), rig, loop.modes)
+
+
+def _moved(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:
+    """The poles (n_controlled,) where each mode is fed back `gain` times what puts them at `poles`.
+
+    s² + (c + gain g2) s + ω² + gain g1, with g1 and g2 of `pole_gains`.
+    """
+    index = list(loop.law.controlled)
+    omega, c = loop.modes.omega[index], np.diag(loop.modes.damping)[index]
+    g1, g2 = pole_gains(omega, poles, c)
+    half, square = 0.5 * (c + gain * g2), omega**2 + gain * g1
+    if (square <= half**2).any():
+        raise DesignError(f"{gain:.3g} times the gain leaves a mode that does not oscillate")
+    return -half + 1j * np.sqrt(square - half**2)
 
 
 def _estimated(

@@ -487,7 +487,7 @@ def _compensated(
         if other is None:
             continue
         trial = compensated(rig, other, test.sample_time, kept)
-        step = tried(name, _tuning(weight_by, noise_by), trial)
+        step = tried(name, _tuning(loop, weight_by, noise_by), trial)
         if name == "gain":
             pays = step.loss < now.loss - PAYS
         else:  # no trade: no part may be worse than under the present controller and before
@@ -538,13 +538,19 @@ def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
         trials = [(vibration(one), one, noise) for noise in SLOWEST if (one := designed(weight, noise)) is not None]
         least, best, noise = min(trials, key=lambda trial: trial[0], default=(np.inf, None, 1.0))
         if best is not None and np.isfinite(least):
-            return best, f", {_tuning(weight, noise)}: otherwise unstable"
+            return best, f", {_tuning(loop, weight, noise)}: otherwise unstable"
     return loop, ""
 
 
-def _tuning(weight: float, noise: float) -> str:
+def _weighted(loop: Loop) -> bool:
+    """Whether the law minimises a cost that weights its forces."""
+    return "weight" in getattr(loop.law.designed_by, "keywords", {})
+
+
+def _tuning(loop: Loop, weight: float, noise: float) -> str:
     """By what a law and its filter were tuned, in words."""
-    said = [f"{what} taken as {by:.3g} times" for what, by in (("weight", weight), ("noise", noise)) if by != 1]
+    of_law = ("weight", weight) if _weighted(loop) else ("gain", 1.0 / np.sqrt(weight))
+    said = [f"{what} taken as {by:.3g} times" for what, by in (of_law, ("noise", noise)) if by != 1]
     return f"{' and '.join(said)} what was designed for"
 
 
