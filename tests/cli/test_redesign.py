@@ -96,6 +96,7 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
         ("--rate-hz", 0, "above 0 Hz"),
         ("--rate-hz", "nan", "above 0 Hz"),
         ("--draws", 0, "greater than or equal"),
+        ("--aim", "fast", "cost or settling; got 'fast'"),
         ("--impulse-at", 9.0, "lies outside the structure"),
         ("--impulse-at", "F9", "or name an input: F1, F2"),
         ("--impulse-at", 0, "moves none of the controlled modes"),

@@ -20,7 +20,7 @@ from workbench.rig.sensors import Sensor
 from workbench.robust.on_rig import fitted, impulse_test, tuned
 from workbench.robust.plain_law import plain_law
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Verification
+from workbench.robust.proof import Verification, verify
 from workbench.robust.redesign import redesign
 from workbench.structure.domain import Patch
 from workbench.trials.controlled import control_plant
@@ -126,10 +126,11 @@ def test_where_neither_controller_is_stable_neither_is_advised(rig, controller):
         assert "Use neither controller" in found.sentence and "Keep" not in found.sentence
 
 
-def told(stable, vibration, work):
+def told(stable, vibration, work, **figures):
     """A proof with these figures of each draw, and nothing else of interest."""
     n = len(stable)
-    none = {name: np.ones(n) for name in ("peak_force", "stroke", "settling", "effort")}
+    others = ("peak_force", "stroke", "settling", "controlled_settling", "effort")
+    none = {name: np.ones(n) for name in others} | figures
     return Verification(
         stable=stable, damping=np.ones((n, 2)), work=np.array(work)[:, None], controlled=(0,), vibration=vibration,
         energy=np.ones((3, 2)), margin=1.0, margin_frequency_hz=1.0, **none,
@@ -164,6 +165,55 @@ def test_the_present_controller_is_kept_where_the_redesigned_does_no_better(
         assert replace(found, more_work=allowed).pays and not replace(found, more_work=allowed - 0.02).pays
     back = replace(sure, present_proof=found.proof, proof=present, weight=0.5)
     assert back.pays or pays or stable == [True, True], "more stable draws come first"
+
+
+def test_a_law_is_judged_by_what_it_is_for(rig, controller):
+    """Less vibration is no merit of a law by poles whose modes settle later, nor sooner settling at any effort."""
+    law = plain_law("poles", rig, 2, damping=0.2)
+    found = redesign(possible(rig), law, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    by_weight = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False)
+    assert (found.aim, by_weight.aim) == ("settling", "cost")
+    one = np.ones(2)
+    present = told([True, True], one, -one)
+
+    def judged(result, vibration, time, effort):
+        proof = told([True, True], vibration * one, -one, controlled_settling=time * one, effort=effort * one)
+        return replace(result, present_proof=present, proof=proof, weight=1.0)
+
+    later = judged(found, 0.5, 1.2, 1.0)
+    assert not later.pays and judged(by_weight, 0.5, 1.2, 1.0).pays
+    sooner = judged(found, 1.1, 0.7, 1.1)
+    assert sooner.pays and not judged(by_weight, 1.1, 0.7, 1.1).pays
+    assert "settles the controlled modes in 0.7 s where the present one settles them in 1 s" in sooner.advice
+    assert "for 1.1 times the effort" in sooner.advice
+    dear = judged(found, 1.0, 0.9, 1.5)
+    assert not dear.pays and "more_cost = 0.2 allows it" in dear.advice
+    asked = redesign(
+        possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=1, placement=False, aim="settling"
+    )
+    assert asked.aim == "settling" and not judged(asked, 0.5, 1.2, 1.0).pays
+    with pytest.raises(ValueError, match="cost or settling; got 'speed'"):
+        redesign(possible(rig), controller, sample_time=DT, aim="speed")
+    short = LoopTest(100, DT, 0.8)
+    cut = redesign(possible(rig), law, test=short, draws=1, placement=False)
+    assert cut.aim == "cost" and "give a longer test" in cut.notes[0]
+
+
+def test_settling_and_effort_cost_least_where_the_poles_are_asked_for(rig):
+    """One lightly damped mode: t ~ 1/ζ and ∫ F² dt ~ ζ, so that t / t_0 + effort / effort_0 is least at ζ_0."""
+    modes = rig.modes.select(slice(1))
+    one = replace(rig, modes=replace(modes, damping=np.zeros(1)), actuators=(Actuator("F", 1.0),))
+    one = replace(one, sensors=(Sensor("v", 1.0, "velocity"),))
+    law = imsc_poles(one.modes, 1, one.actuators, poles=modes.omega[:1] * (-0.05 + 1j))
+    speedy = kalman(one.modes, law, one.sensors, disturbance=1.0, noise=1e-9)
+    asked = redesign(possible(one), speedy, sample_time=DT, impulse_at=1.0, draws=1, placement=False)
+    cost = {}
+    for gain in (0.7, 1.0, 1.4):
+        off = replace(one, actuators=(Actuator("F", 1.0, gain=gain),))
+        run = verify([off], asked.redesigned, asked.test, controlled=(0,))
+        cost[gain] = float(run.controlled_settling[0] + asked.weight * run.effort[0])
+    assert cost[0.7] == pytest.approx((0.7 + 1 / 0.7) / 2 * cost[1.0], rel=0.02)
+    assert cost[1.4] == pytest.approx((1.4 + 1 / 1.4) / 2 * cost[1.0], rel=0.02)
 
 
 def test_the_gain_of_a_law_by_poles_is_tuned_as_that_of_a_weight(rig):
@@ -225,7 +275,8 @@ def test_relays_that_a_dead_zone_silences_are_made_to_act_again(rig):
     sticking = possible(rig, effect("actuator_dead_zone", "all", width=0.9 * max(r.force for r in law.relays)))
     found = redesign(sticking, law, test=LoopTest(2500, DT, 0.8, 0.5, seed=0), draws=2, placement=False)
     assert found.after.effort > 1.5 * found.before.effort and found.weight == 0.0
-    assert found.pays and found.advice.startswith("Use the redesigned controller: it settles in")
+    assert found.pays and found.advice.startswith("Use the redesigned controller: it settles the controlled modes in")
+    assert "for some instead of no effort" in found.advice and "some instead of no work" in found.sentence
 
 
 def test_moving_the_actuators_is_offered_where_it_pays(rig):

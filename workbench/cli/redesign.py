@@ -35,6 +35,14 @@ def redesign(
         float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
     ] = None,
     impulse_at: ImpulseAt = None,
+    aim: Annotated[
+        str | None,
+        typer.Option(
+            metavar="cost|settling",
+            help="What the controllers are judged by: the cost of the LQR, or settling and effort; by the law's kind"
+            " unless given.",
+        ),
+    ] = None,
     more_cost: Annotated[
         float, typer.Option(help="Share by which a new controller that settles sooner may cost more than the present.")
     ] = 0.01,
@@ -63,6 +71,7 @@ def redesign(
     from workbench.design.export.export import check_name
     from workbench.design.laws.law import controlled_indices
     from workbench.robust.on_rig import Design, impulse_test
+    from workbench.robust.redesign import AIMS
     from workbench.robust.redesign import redesign as run
     from workbench.study.pages.redesign_page import redesign_page
     from workbench.study.runs.whole_file import check_target
@@ -71,6 +80,8 @@ def redesign(
     check_target(to)
     if to is not None:
         check_name(to)
+    if aim not in (None, *AIMS):
+        raise ValueError(f"--aim is {' or '.join(AIMS)}; got {aim!r}")
     if rate_hz is not None and not 0 < rate_hz < float("inf"):
         raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
     found = read_case(case)
@@ -96,6 +107,7 @@ def redesign(
             test=test,
             draws=draws,
             seed=seed,
+            aim=aim,
             more_cost=more_cost,
             more_work=more_work,
             report=lambda what, share: report(what, 0.7 + 0.3 * share),

@@ -33,6 +33,7 @@ class Verification:
         vibration: (n_draws,) ∫ of the energy of all modes over time.
         settling: (n_draws,) s until the energy stays below a hundredth of its peak; inf where it does not within the
             test.
+        controlled_settling: the same of the energy of the controlled modes; of all where none is named.
         energy: (3, n_samples) of all modes: median over the draws, and lower and upper end of the 95 % interval.
         margin: relative uncertainty of all outputs at once, of any phase, that the loop surely tolerates; 0 where it is
             not stable, inf where nothing is fed back, nan where it has no linear part.
@@ -48,13 +49,15 @@ class Verification:
     effort: np.ndarray
     vibration: np.ndarray
     settling: np.ndarray
+    controlled_settling: np.ndarray
     energy: np.ndarray
     margin: float
     margin_frequency_hz: float
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stable", frozen(self.stable, bool))
-        for name in ("damping", "peak_force", "stroke", "work", "effort", "vibration", "settling", "energy"):
+        loads, motion = ("peak_force", "stroke", "work", "effort"), ("vibration", "energy", "damping")
+        for name in (*loads, *motion, "settling", "controlled_settling"):
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
@@ -96,6 +99,7 @@ class Verification:
             "effort": self.effort,
             "vibration": self.vibration,
             "settling": self.settling,
+            "controlled_settling": self.controlled_settling,
         }
         return {
             "draws": self.n_draws,
@@ -154,6 +158,7 @@ def verify(
     n_modes = min(rig.modes.n_modes for rig in rigs)
     poles = [loop_poles(rig, controller, modes_in_motion(rig, run)) for rig, run in zip(rigs, runs, strict=True)]
     energies = [run.response.energy.sum(axis=0) for run in runs]
+    of_controlled = [run.response.energy[list(controlled)].sum(axis=0) for run in runs] if controlled else energies
     stable = [
         run.bounded and p.spectral_radius <= 1.0 + 1e-9 and not (test.forces is None and _grows(e))
         for run, p, e in zip(runs, poles, energies, strict=True)
@@ -172,7 +177,8 @@ def verify(
             controlled=tuple(controlled),
             effort=_finite([run.effort for run in runs]),
             vibration=_finite([e.sum() * dt for e in energies]),
-            settling=np.array([settling(e, dt) if s else np.inf for e, s in zip(energies, stable, strict=True)]),
+            settling=_settlings(energies, stable, dt),
+            controlled_settling=_settlings(of_controlled, stable, dt),
             energy=_band(energies),
             margin=margin,
             margin_frequency_hz=frequency,
@@ -211,10 +217,15 @@ def _grows(energy: np.ndarray) -> bool:
     return bool(energy[-quarter:].max() > GROWN * energy[:quarter].max())
 
 
+def _settlings(energies: Sequence[np.ndarray], stable: Sequence[bool], sample_time: float) -> np.ndarray:
+    return np.array([settling(e, sample_time) if s else np.inf for e, s in zip(energies, stable, strict=True)])
+
+
 def settling(energy: np.ndarray, sample_time: float) -> float:
     """Time until an energy (n_samples,) stays below a hundredth of its peak, s; infinite where it does not."""
     above = np.flatnonzero(energy > SETTLED * energy.max())
-    return np.inf if above[-1] == energy.size - 1 else float(sample_time * (above[-1] + 1))
+    last = above[-1] if above.size else -1  # nothing moves
+    return np.inf if last == energy.size - 1 else float(sample_time * (last + 1))
 
 
 def _stroke(rig: Rig, controller: DigitalController, run: LoopRun) -> float:

@@ -21,7 +21,7 @@ from workbench.rig.rig import Rig
 from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
 from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
 from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Verification, drawn_with_errors, interval, verify
+from workbench.robust.proof import Verification, drawn_with_errors, interval, settling, verify
 from workbench.robust.relocation import Relocation, relocated
 from workbench.robust.small_motion import loop_poles, modes_in_motion
 from workbench.structure.domain import Where
@@ -37,6 +37,8 @@ SOFTER = (1.0, 3.0, 10.0, 30.0, 100.0)  # of the forces of a law that is unstabl
 SLOWEST = tuple(10.0**k for k in np.arange(0.0, 9.1, 0.5))  # of the readings of its Kalman filter: noise over its own
 SPEEDS = (1e-3, 1e-2, 0.1, 10.0, 100.0)  # of the readings of a Kalman filter: noise over its own
 MORE_COST = 0.01  # of the present one's: what counts as no more
+AS_MUCH = "as much"
+AIMS = ("cost", "settling")  # what a law can be for
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,7 @@ class Step:
             kept before: of the vibration of controlled modes, of that of residual modes (over that of all modes), and
             of the effort, as shares; none is below zero, so that a gain in one makes up for no loss in another.
         loss: their sum.
-        cost: J / J₀ - 1, J = 2 ∫ energy dt + ρ ∫ FᵀF dt, J₀ that of the same perfect loop; ρ makes its two terms
-            equal over the controlled modes, as they are in an optimal regulator. Below zero the loop does better.
+        cost: J / J₀ - 1, J₀ that of the same perfect loop; see `Redesign.aim`. Below zero the loop does better.
         kept: whether it paid.
     """
 
@@ -91,8 +92,10 @@ class Redesign:
         test: what the loops were put through.
         before, after: the present and the redesigned controller on the corrected rig under test.
         present_proof, proof: both on the same draws.
-        weight: ρ of the cost J = 2 ∫ energy dt + ρ ∫ FᵀF dt, whose terms are equal over the controlled modes where
-            actuators and sensors are perfect; 0 for on-off control.
+        weight: ρ of the cost J; 0 for on-off control.
+        aim: what the law is for. "cost": J = 2 ∫ energy dt + ρ ∫ FᵀF dt, with ρ such that both terms are equal over
+            the controlled modes where actuators and sensors are perfect; "settling": J = t + ρ ∫ FᵀF dt with t the
+            settling time of the controlled modes, at most that of the test, and ρ such that both are equal there.
         more_cost, more_work: shares by which the redesigned controller may cost more, J, and do more work, W, than the
             present one.
         relocation: where the actuators should stand for the corrected structure; None where that is not known.
@@ -111,6 +114,7 @@ class Redesign:
     present_proof: Verification
     proof: Verification
     weight: float
+    aim: str = "cost"
     more_cost: float = MORE_COST
     more_work: float = np.inf
     relocation: Relocation | None = None
@@ -131,7 +135,15 @@ class Redesign:
     @property
     def _better(self) -> bool:
         """Whether it costs less than the present controller, or settles sooner."""
-        return self._over[0] < 1.0 or interval(self.proof.settling)[0] < interval(self.present_proof.settling)[0]
+        return self._over[0] < 1.0 or self._sooner
+
+    @property
+    def _sooner(self) -> bool:
+        return interval(self._settling(self.proof))[0] < interval(self._settling(self.present_proof))[0]
+
+    def _settling(self, proof: Verification) -> np.ndarray:
+        """Settling time of each draw (n_draws,), s: of the controlled modes where the law is for it."""
+        return proof.settling if self.aim == "cost" else proof.controlled_settling
 
     @property
     def _more(self) -> str:
@@ -150,11 +162,17 @@ class Redesign:
         both = old.stable & new.stable
         if not both.any():
             return np.inf, np.inf
-        costs = (2.0 * p.vibration[both] + self.weight * p.effort[both] for p in (new, old))
+        costs = (self._gained(p)[both] + self.weight * p.effort[both] for p in (new, old))
         works = (p.all_work[both] for p in (new, old))
         with np.errstate(divide="ignore", invalid="ignore"):  # a controller that does nothing does no work
             cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
+
+    def _gained(self, proof: Verification) -> np.ndarray:
+        """What the forces are spent on, of each draw (n_draws,): the first term of J."""
+        if self.aim == "cost":
+            return 2.0 * proof.vibration
+        return np.asarray(np.minimum(proof.controlled_settling, self.test.time[-1]))
 
     @property
     def controller(self) -> DigitalController:
@@ -176,18 +194,15 @@ class Redesign:
         """The redesign in one sentence."""
         old, new = self.present_proof, self.proof
         unstable = old.n_draws - int(old.stable.sum())
-        effort, work = (
-            interval(after)[0] / max(interval(before)[0], 1e-300)
-            for before, after in ((old.effort, new.effort), (old.all_work, new.all_work))
-        )
+        effort, work = _times(new.effort, old.effort), _times(new.all_work, old.all_work)
         if old.share_stable < 0.5:
             text = f"the present controller is unstable on {_of(unstable, old.n_draws)} draws; redesigned, it "
             text += self._does(new, "95 %: ")
         else:
             text = f"the present controller {self._does(old, '95 %: ')}"
             text += f", unstable on {unstable} draws" if unstable else ""
-            text += f"; redesigned: {self._does(new, '', named=False)}, {_times(effort)} effort"
-            text += "" if _times(work) == _times(1.0) else f" and {_times(work)} work"
+            text += f"; redesigned: {self._does(new, '', named=False)}, {effort} effort"
+            text += "" if work == AS_MUCH else f" and {work} work"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
         text += f" {self.left_undamped}" if self.left_undamped else ""
         text += "" if self.pays and not self._neither else f" {self._kept}"
@@ -202,7 +217,7 @@ class Redesign:
         if new.stable.sum() < old.stable.sum():
             why = "it is stable on more draws"
         elif self._better and np.isfinite(self._over).all():
-            why = f"the new one {self._difference('it')}, but {self._more}"
+            why = f"the new one {self._difference}, but {self._more}"
         else:
             why = "the new one costs no less and settles no sooner"
         return f"Keep the present controller: {why}."
@@ -222,9 +237,9 @@ class Redesign:
     def _does(self, proof: Verification, lead: str, *, named: bool = True) -> str:
         """What a controller does to the mode that is changed most; on-off control, which adds no pole, by settling."""
         if self.redesigned.relays is not None:
-            middle, low, high = interval(proof.settling)
+            middle, low, high = interval(self._settling(proof))
             if not np.isfinite(high):
-                return _settles(proof)
+                return self._settles(proof)
             return f"{'settles in ' * named}{middle:.3g} s ({lead}{low:.3g} to {high:.3g})"
         ratios = _ratios(proof.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
@@ -234,23 +249,35 @@ class Redesign:
         """Which controller to use, and what it does after the test."""
         if not self.pays or self._neither:
             return self._kept
-        difference = self._difference("the present one")
+        difference = self._difference
         if self.present_proof.share_stable < 0.5:
             return f"Use the redesigned controller: it {difference}."
-        if 1.0 - self._over[0] < PAYS and _settles(self.proof) == _settles(self.present_proof):
+        if 1.0 - self._over[0] < PAYS and self._settles(self.proof) == self._settles(self.present_proof):
             return f"Either controller does: the redesigned {difference} (medians of the draws)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
         return f"Use the redesigned controller: it {difference}{forced} (medians of the draws)."
 
-    def _difference(self, other: str) -> str:
+    @property
+    def _difference(self) -> str:
         """What the redesigned controller does better than the present one, in words."""
         old, new = self.present_proof, self.proof
         if new.stable.sum() != old.stable.sum():
-            return f"is stable on {_of(int(new.stable.sum()), new.n_draws)} draws, {other} on {int(old.stable.sum()):,}"
-        if _settles(new) != _settles(old):
-            return f"{_settles(new)} where {other} {_settles(old)}"
-        return f"takes {_percent(1.0 - self._over[0])} less vibration and effort than {other}"
+            stable = _of(int(new.stable.sum()), new.n_draws)
+            return f"is stable on {stable} draws, the present one on {int(old.stable.sum()):,}"
+        if self.aim == "settling":
+            settles, effort = self._settles(new, " the controlled modes"), f"{_times(new.effort, old.effort)} effort"
+            settles += f" where the present one {self._settles(old, ' them')}"
+            return f"{settles}, for {effort}" if self._sooner else f"takes {effort} and {settles}"
+        if self._sooner and self._settles(new) != self._settles(old):
+            return f"{self._settles(new)} where the present one {self._settles(old)}"
+        less = 1.0 - self._over[0]
+        return f"takes {_percent(abs(less))} {'less' if less > 0 else 'more'} vibration and effort than the present one"
+
+    def _settles(self, proof: Verification, what: str = "") -> str:
+        """How soon it settles, in the median of the draws, in words."""
+        time = interval(self._settling(proof))[0]
+        return f"settles{what} in {time:.3g} s" if np.isfinite(time) else f"does not settle{what} within the test"
 
     @property
     def left_undamped(self) -> str:
@@ -311,6 +338,7 @@ class Redesign:
             "sentence": self.sentence,
             "safe": self.safe,
             "pays": self.pays,
+            "aim": self.aim,
             "controlled": [r + 1 for r in self.controlled],
             "steps": [asdict(s) for s in self.steps],
             "present": self.present_proof.to_json(),
@@ -332,6 +360,7 @@ def redesign(
     draws: int = 200,
     seed: int = 0,
     placement: bool = True,
+    aim: str | None = None,
     more_cost: float = MORE_COST,
     more_work: float = np.inf,
     report: Report = lambda text, share: None,
@@ -352,16 +381,19 @@ def redesign(
         draws: possible rigs on which both are proved.
         seed: of the draws and of the sensors' noise.
         placement: whether to look where the actuators should stand instead.
-        more_cost: share by which the redesigned controller may cost more than the present one, J = 2 ∫ energy dt +
-            ρ ∫ FᵀF dt, where it settles sooner.
+        aim: what it is judged by, "cost" or "settling", see `Redesign`; unless given "cost" for a law that minimises
+            it, and "settling" for one by poles or on-off.
+        more_cost: share by which the redesigned controller may cost more than the present one where it settles sooner.
         more_work: share by which it may do more work, W = Σ_r |W_r|: as much as it takes, unless given.
         report: called with (what, share done).
 
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
-        ValueError: an impulse outside the structure, no draws, or a share below zero.
+        ValueError: an impulse outside the structure, no draws, an unknown aim, or a share below zero.
     """
+    if aim not in (None, *AIMS):
+        raise ValueError(f"a controller is judged by {' or '.join(AIMS)}; got {aim!r}")
     for name, share in (("more_cost", more_cost), ("more_work", more_work)):
         if not share >= 0:
             raise ValueError(f"{name} is a share of that of the present controller, 0 or more; got {share:g}")
@@ -386,7 +418,8 @@ def redesign(
     steps: tuple[Step, ...]
     for _ in range(2):  # elements are worth another stiffness in the smaller motion of the redesigned loop
         anew = designed_anew(loop, corrected, modes)
-        redesigned, steps, anew, weight = _compensated(corrected, anew, test, present)
+        wanted = aim or ("cost" if _weighted(anew) else "settling")
+        redesigned, steps, anew, weight, judged = _compensated(corrected, anew, test, present, wanted)
         after = run_loop(corrected, redesigned, test)
         if not corrected.elements or not after.bounded:
             break
@@ -401,7 +434,7 @@ def redesign(
     report("done", 1.0)
     return Redesign(
         possible, present, redesigned, anew, anew.law.controlled, steps, test, before, after, old, new, weight,
-        more_cost, more_work, moved, _notes(possible, corrected),
+        judged, more_cost, more_work, moved, _notes(possible, corrected, judged == wanted),
     )  # fmt: skip
 
 
@@ -434,25 +467,34 @@ def _silent(controller: DigitalController) -> DigitalController:
 
 
 def _compensated(
-    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController
-) -> tuple[DigitalController, tuple[Step, ...], Loop, float]:
+    rig: Rig, loop: Loop, test: LoopTest, present: DigitalController, aim: str
+) -> tuple[DigitalController, tuple[Step, ...], Loop, float, str]:
     """The redesigned controller: compensations one after the other, each kept where it pays; then sensors left out.
 
-    The last that is returned is ρ of the cost, see `Redesign`.
+    The last that are returned are ρ of the cost and what the law is judged by, see `Redesign`.
     """
     perfect = replace(
         rig, actuators=tuple(_perfect(a) for a in rig.actuators), sensors=without(rig.sensors), elements=rig.elements
     )
     loop, softened = _stabilised(perfect, loop, test)
     ideal = run_loop(perfect, compensated(perfect, loop, test.sample_time, ()), test)
-    # relays have forces of a given size, which nothing is traded for: they are judged by vibration and settling alone
-    weight = 0.0 if isinstance(loop.law, OnOffLaw) else force_weight(ideal, loop.law.controlled)
-    optimum = max(2.0 * _vibration(ideal) + weight * ideal.effort, 1e-300)
+    settles, controlled = _settling(ideal, loop.law.controlled), loop.law.controlled
+    aim = aim if settles < test.time[-1] else "cost"  # a test that does not tell how soon judges by vibration
+    # relays have forces of a given size, which nothing is traded for: they are judged by what they gain alone
+    weight = settles / max(ideal.effort, 1e-300) if aim == "settling" else force_weight(ideal, controlled)
+    weight = 0.0 if isinstance(loop.law, OnOffLaw) else weight
+
+    def costing(run: LoopRun) -> float:
+        if not run.bounded:
+            return np.inf
+        return weight * run.effort + (_settling(run, controlled) if aim == "settling" else 2.0 * _vibration(run))
+
+    optimum = max(costing(ideal), 1e-300)
 
     def tried(name: str, what: str, controller: DigitalController) -> Step:
         run = run_loop(rig, controller, test)
         vibration, effort = _vibration(run), run.effort if run.bounded else np.inf
-        cost = (2.0 * vibration + weight * effort) / optimum - 1.0
+        cost = costing(run) / optimum - 1.0
         excess = _excess(run, ideal, loop.law.controlled)
         work = float(np.abs(run.work).sum()) if run.bounded else np.inf
         return Step(name, what, vibration, effort, work, excess, sum(excess), float(cost), True)
@@ -510,7 +552,7 @@ def _compensated(
         if pays:
             removed.append(name)
             best, now = trial, step
-    return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight
+    return best, tuple(steps), designed_anew(loop, rig, loop.modes, removed) if removed else loop, weight, aim
 
 
 def _stabilised(rig: Rig, loop: Loop, test: LoopTest) -> tuple[Loop, str]:
@@ -596,6 +638,14 @@ def _vibration(run: LoopRun, modes: Sequence[int] | None = None) -> float:
     return float((energy if modes is None else energy[list(modes)]).sum() * (time[1] - time[0]))
 
 
+def _settling(run: LoopRun, controlled: Sequence[int]) -> float:
+    """Settling time of the controlled modes, at most that of the test, s; inf where the motion runs away."""
+    if not run.bounded:
+        return np.inf
+    time, energy = run.response.time, run.response.energy[list(controlled)].sum(axis=0)
+    return min(settling(energy, float(time[1] - time[0])), float(time[-1]))
+
+
 def _losses(rig: Rig, loop: Loop, step: str) -> str:
     """What a step takes out, in words; empty where there is nothing."""
     words = []
@@ -630,8 +680,13 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
     return "; ".join(words)
 
 
-def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
+def _notes(possible: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:
     notes = []
+    if not aimed:
+        notes.append(
+            "Even with perfect actuators and sensors the controlled modes do not settle within the test, so the"
+            " controllers are judged by vibration and effort; give a longer test to judge them by settling."
+        )
     if any(a.hysteresis_share for a in rig.actuators):
         notes.append("The hysteresis of an actuator is in the verification, but no step makes up for it.")
     if possible.rivals:
@@ -640,14 +695,13 @@ def _notes(possible: UncertainRig, rig: Rig) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _settles(proof: Verification) -> str:
-    middle = interval(proof.settling)[0]
-    return f"settles in {middle:.3g} s" if np.isfinite(middle) else "does not settle within the test"
-
-
-def _times(effort: float) -> str:
-    times = f"{effort:.2g}"
-    return "as much" if times == "1" else f"{times} times the"
+def _times(after: np.ndarray, before: np.ndarray) -> str:
+    """Median of draws (n_draws,) over another, in words that go before what is meant."""
+    new, old = interval(after)[0], interval(before)[0]
+    if old == 0.0:
+        return AS_MUCH if new == 0.0 else "some instead of no"
+    times = f"{new / old:.2g}"
+    return AS_MUCH if times == "1" else f"{times} times the"
 
 
 def _of(part: int, whole: int) -> str:
