@@ -26,7 +26,7 @@ def plot_redesign(result: Redesign) -> Figure:
         left.fill_between(time, low, high, color=colour, alpha=0.25, linewidth=0)
         left.semilogy(time, middle, color=colour, linewidth=1.2, label=f"{name}: stable on {proof.share_stable:.0%}")
     left.axhline(SETTLED, color=GREY, linewidth=0.8)
-    left.text(time[-1], SETTLED, "settled", fontsize=8, ha="right", va="bottom")
+    left.annotate("settled", (time[-1], SETTLED), (0, 3), textcoords="offset points", fontsize=8, ha="right")
     left.set(xlabel="time [s]", ylabel="modal energy over its peak", ylim=(1e-6, 3.0))
     left.set_title(f"{result.proof.n_draws} samples of the uncertain model: median and 95 % interval")
     left.legend(fontsize=8)
@@ -53,7 +53,7 @@ def plot_steps(result: Redesign) -> Figure:
     colours = [OLD if step.name == "present" else NEW if step.kept else GREY for step in result.steps]
     ax.barh(range(len(names)), losses, color=colours)
     for i, step in enumerate(result.steps):
-        ax.text(losses[i], i, f"  {step.lost}", va="center", fontsize=8)
+        ax.annotate(step.lost, (losses[i], i), (4, 0), textcoords="offset points", va="center", fontsize=8)
     ax.set_yticks(range(len(names)), names)
     ax.set(ylim=(len(names) - 0.5, -0.5), xlim=(0, 1.25 * max(*losses, 1e-6)))
     ax.set_xlabel("vibration and effort above the ideal [%]")

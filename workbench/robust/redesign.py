@@ -138,6 +138,13 @@ class Redesign:
         return self._over[0] < 1.0 or self._sooner
 
     @property
+    def _better_on(self) -> int:
+        """Draws that both keep stable on which it does better, by what `_better` finds in the mean."""
+        of_draw = self._cost if self._over[0] < 1.0 else self._settling
+        new, old = (of_draw(p)[self._both] for p in (self.proof, self.present_proof))
+        return int((new < old).sum())
+
+    @property
     def _sooner(self) -> bool:
         return interval(self._settling(self.proof))[0] < interval(self._settling(self.present_proof))[0]
 
@@ -148,31 +155,37 @@ class Redesign:
     @property
     def _more(self) -> str:
         """What it takes more than is allowed, in words; empty for nothing."""
-        over = zip(("costs", "works"), self._over, ("cost", "work"), (self.more_cost, self.more_work))
+        said = f"{'vibration' if self.aim == 'cost' else 'time'} and effort", "work"
+        over = zip(said, np.array(self._over) - 1.0, ("cost", "work"), (self.more_cost, self.more_work))
         return ", and ".join(
-            f"{does} {_percent(share - 1.0)} more: more_{name} = {np.ceil(100.0 * (share - 1.0)) / 100.0:g} allows it"
-            for does, share, name, allowed in over
-            if share > 1.0 + allowed
+            f"takes {_percent(more)} more {what}: more_{name} = {np.ceil(100.0 * more) / 100.0:g} allows it"
+            for what, more, name, allowed in over
+            if more > allowed
         )
 
     @cached_property
     def _over(self) -> tuple[float, float]:
         """J and W over those of the present controller: means of the draws that both keep stable; inf for none."""
-        old, new = self.present_proof, self.proof
-        both = old.stable & new.stable
+        old, new, both = self.present_proof, self.proof, self._both
         if not both.any():
             return np.inf, np.inf
-        costs = (self._gained(p)[both] + self.weight * p.effort[both] for p in (new, old))
+        costs = (self._cost(p)[both] for p in (new, old))
         works = (p.all_work[both] for p in (new, old))
         with np.errstate(divide="ignore", invalid="ignore"):  # a controller that does nothing does no work
             cost, work = (float(np.exp(np.log(a / b).mean())) for a, b in (costs, works))
         return cost, work
 
-    def _gained(self, proof: Verification) -> np.ndarray:
-        """What the forces are spent on, of each draw (n_draws,): the first term of J."""
-        if self.aim == "cost":
-            return 2.0 * proof.vibration
-        return np.asarray(np.minimum(proof.controlled_settling, self.test.time[-1]))
+    def _cost(self, proof: Verification) -> np.ndarray:
+        """J of each draw (n_draws,); inf where it is not stable."""
+        settles = np.minimum(proof.controlled_settling, self.test.time[-1])
+        cost = 2.0 * proof.vibration if self.aim == "cost" else np.array(settles)
+        if self.weight:  # relays have none, and an effort may be infinite
+            cost = cost + self.weight * proof.effort
+        return np.asarray(np.where(proof.stable, cost, np.inf))
+
+    @property
+    def _both(self) -> np.ndarray:
+        return np.asarray(self.present_proof.stable & self.proof.stable)
 
     @property
     def controller(self) -> DigitalController:
@@ -250,13 +263,15 @@ class Redesign:
         if not self.pays or self._neither:
             return self._kept
         difference = self._difference
-        if self.present_proof.share_stable < 0.5:
+        if self.present_proof.stable.sum() != self.proof.stable.sum():
             return f"Use the redesigned controller: it {difference}."
         if 1.0 - self._over[0] < PAYS and self._settles(self.proof) == self._settles(self.present_proof):
             return f"Either controller does: the redesigned {difference} (medians of the draws)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
-        forced = f", with at most {forces[0]:.3g} N instead of {forces[1]:.3g} N" if np.isfinite(forces).all() else ""
-        return f"Use the redesigned controller: it {difference}{forced} (medians of the draws)."
+        after, before = (f"{force:.3g} N" for force in forces)
+        forced = f", with at most {after} instead of {before}" if np.isfinite(forces).all() and after != before else ""
+        sure = f"it does better on {_of(self._better_on, self.proof.n_draws)} draws"
+        return f"Use the redesigned controller: it {difference}{forced} (medians); {sure}."
 
     @property
     def _difference(self) -> str:

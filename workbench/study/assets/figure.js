@@ -154,7 +154,7 @@ var workbench = (function () {
         var name = svg("text", { x: left - 5, y: Y(t[0]) + 4, "text-anchor": "end" }, node, t[1]);
         if (textWidth(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
       });
-      if (p.x.label) svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, p.x.label);
+      if (p.x.label) fit(svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, p.x.label), right - left + 16);
       if (p.y.label) fit(svg("text", { class: "axis", x: 0, y: 0, "text-anchor": "middle",
         transform: "translate(12," + (top + bottom) / 2 + ") rotate(-90)" }, node, p.y.label), height - 8);
       var id = "clip" + (++count), clip = svg("clipPath", { id: id }, svg("defs", {}, node));

@@ -70,9 +70,9 @@ def redesign_page(
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
-        lead=f"{found.advice} {found.sentence.replace(found.advice, '').rstrip()}",
+        lead=found.advice,
         standing="bad" if used.share_stable < 0.95 else "good" if found.safe and not found.left_undamped else "part",
-        lines=[*moved, *found.notes],
+        lines=[found.sentence.replace(found.advice, "").rstrip(), *moved, *found.notes],
         blocks=blocks,
         tables=tables,
         inputs={} if folder is None else case_inputs(folder),
