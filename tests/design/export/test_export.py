@@ -95,6 +95,26 @@ def interpreted(path, readings: np.ndarray) -> np.ndarray:
     return np.array([one.step(reading) for reading in readings.T.tolist()]).T
 
 
+def from_mat(path, readings: np.ndarray) -> np.ndarray:
+    """What the variables of a MAT file command by the equations of the how-to."""
+    m = {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+    row = {name: value.ravel() for name, value in m.items() if min(np.shape(value)) == 1}
+    z, v, commands = np.zeros(len(m["A"])), np.zeros(len(row["limit"])), []
+    for reading in readings.T:
+        y = row["scale"] * (reading - row["offset"])
+        w = m["C"] @ z + m["D"] @ y
+        if "relay_force" in m:
+            w = -m["relay_spread"] @ (row["relay_force"] * np.sign(w) * (np.abs(w) > row["relay_dead_band"]))
+        if "friction_force" in m:
+            speed = m["friction_of_state"] @ z + m["friction_of_reading"] @ y
+            w = w + m["friction_push"] @ (m["friction_force"][0] * np.tanh(speed / m["friction_smoothing"][0]))
+        w = np.minimum(np.maximum(w, -row["limit"]), row["limit"])
+        v = np.minimum(np.maximum(w, v - row["rate"]), v + row["rate"])
+        commands.append(v + row["dead_zone"] * np.minimum(np.maximum(v / row["onset"], -1), 1) - row["bias"])
+        z = m["A"] @ z + m["B"] @ y + m["E"] @ v
+    return np.array(commands).T
+
+
 def error(found: np.ndarray, true: np.ndarray) -> float:
     return float(np.abs(found - true).max() / np.abs(true).max())
 
@@ -121,6 +141,14 @@ def test_what_a_controller_makes_up_for_is_exported_too(make, tmp_path):
     write_controller(controller, tmp_path / "py" / "arm.py")
     assert error(compiled(tmp_path / "arm.c", readings, 2), true) < 1e-12
     assert error(interpreted(tmp_path / "py" / "arm.py", readings), true) < 1e-12
+
+
+@pytest.mark.parametrize("make", [everything, switching])
+def test_a_mat_file_holds_all_that_the_step_needs(make, tmp_path):
+    rng = np.random.default_rng(2)
+    controller, readings = make(rng), rng.standard_normal((2, 10_000))
+    write_controller(controller, tmp_path / "arm.mat")
+    assert error(from_mat(tmp_path / "arm.mat", readings), stepped(controller, readings)) < 1e-12
 
 
 @needs_compiler

@@ -128,9 +128,13 @@ class DigitalController:
             speed = self.friction.of_state @ z + self.friction.of_reading @ y
             w = w + self.friction.push @ (self.friction.force * np.tanh(speed / self.friction.smoothing))
         v = np.clip(np.clip(w, -self.limit, self.limit), before - self.rate, before + self.rate)
-        onset = np.clip(v / np.where(self.dead_zone > 0, ONSET * self.dead_zone, 1.0), -1.0, 1.0)
-        command = v + self.dead_zone * onset - self.bias
+        command = v + self.dead_zone * np.clip(v / self.onset, -1.0, 1.0) - self.bias
         return command, v, self.a @ z + self.b @ y + self.e @ v
+
+    @property
+    def onset(self) -> np.ndarray:
+        """(n_actuators,) the v at which the inverse of a dead zone is whole; 1 where there is no dead zone."""
+        return np.asarray(np.where(self.dead_zone > 0, ONSET * self.dead_zone, 1.0))
 
     @property
     def linear(self) -> bool:

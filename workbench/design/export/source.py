@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
-from workbench.design.estimation.digital import ONSET, DigitalController
+from workbench.design.estimation.digital import DigitalController
 from workbench.records.record import QUANTITIES
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
@@ -101,8 +101,7 @@ class _Numbers:
             if np.isfinite(values).any():
                 self.vectors[name] = row(values)
         if one.dead_zone.any():
-            onset = np.where(one.dead_zone > 0, ONSET * one.dead_zone, 1.0)
-            self.vectors |= {"DEAD_ZONE": row(one.dead_zone), "ONSET": row(onset)}
+            self.vectors |= {"DEAD_ZONE": row(one.dead_zone), "ONSET": row(one.onset)}
         if one.bias.any():
             self.vectors["BIAS"] = row(one.bias)
 
