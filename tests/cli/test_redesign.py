@@ -91,11 +91,34 @@ def test_what_is_no_verdict_or_no_law_is_named(run, case, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda told: told.pop("effects"), "it has no 'effects'; diagnose it again"),
+        (lambda told: told["effects"][0].update(values={}), "needs a number 'delay'; got None"),
+        (lambda told: told["effects"][0].update(values={"delay": "x"}), "needs a number 'delay'; got 'x'"),
+        (lambda told: told["effects"][0].update(target="F9"), "acts on 'F9', which the rig does not have"),
+        (lambda told: told.update(covariance=[[1.0, 2.0], [3.0]]), "covariance must be 1 by 1 finite numbers"),
+        (lambda told: told.update(covariance=[[float("nan")]]), "covariance must be 1 by 1 finite numbers"),
+        (lambda told: told.update(unexplained=None), "it is damaged; diagnose it again"),
+    ],
+)
+def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
+    folder, verdict = case
+    told = json.loads(verdict.read_text())
+    change(told["posterior"])
+    (tmp_path / "v.json").write_text(json.dumps(told))
+    refused = run("redesign", folder, "--verdict", tmp_path / "v.json")
+    assert refused.exit_code == 2 and said in " ".join(refused.output.split())
+
+
+@pytest.mark.parametrize(
     ("option", "value", "said"),
     [
         ("--rate-hz", 0, "above 0 Hz"),
         ("--rate-hz", "nan", "above 0 Hz"),
         ("--draws", 0, "greater than or equal"),
+        ("--draws", 10**9, "less than or equal to 100000"),
+        ("--seed", -1, "greater than or equal"),
         ("--aim", "fast", "cost or settling; got 'fast'"),
         ("--impulse-at", 9.0, "lies outside the structure"),
         ("--impulse-at", "F9", "or name an input: F1, F2"),

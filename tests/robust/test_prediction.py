@@ -154,6 +154,16 @@ def test_bands_are_drawn_by_sensor_over_time_and_frequency(plain):
     assert labels[0] == "d1\n[m]" and [ax.get_xlabel() for ax in figure.axes[-2:]] == ["time [s]", "frequency [Hz]"]
 
 
+def test_a_record_too_slow_for_a_mode_is_noted_and_one_too_short_is_refused(plain):
+    sent = np.random.default_rng(0).normal(size=(1, 100))
+    assert not predict(uncertain(plain), sent, sample_time=0.01, draws=40).notes
+    slow = predict(uncertain(plain), sent, sample_time=0.02, draws=40)
+    assert slow.notes[-1].startswith("Modes at 28.27 Hz lie above half of 50 samples a second")
+    short = measured(plain, 1.0, np.random.default_rng(1), n=39)
+    with pytest.raises(ValueError, match="'new' has 39 samples, too few to test a model: measure 40 or more"):
+        check_prediction(predict(uncertain(plain), short, draws=40), short)
+
+
 def test_what_cannot_be_predicted_or_checked_is_named(plain):
     rng = np.random.default_rng(8)
     new = measured(plain, 1.0, rng)

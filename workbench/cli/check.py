@@ -32,7 +32,7 @@ def check(
     import numpy as np
 
     from workbench.cases.case import read_case
-    from workbench.robust.check import check_prediction, log_test, read_log
+    from workbench.robust.check import check_length, check_prediction, log_test, read_log
     from workbench.study.pages.prediction_page import prediction_page
     from workbench.study.runs.whole_file import check_target
 
@@ -41,6 +41,7 @@ def check(
     read_log(log)  # a file that is no log is refused before the work
     found = read_case(case)
     measured = record_of(found, record, sample_rate_hz)
+    check_length(measured)
     fitted = [one.name for one in found.fit if np.array_equal(one.outputs, measured.outputs)]
     if fitted:
         raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; check one that was not")

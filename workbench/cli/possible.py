@@ -108,8 +108,10 @@ def read_verdict(path: Path, rig: Rig) -> "tuple[UncertainRig, tuple[float, ...]
         ) from None
     try:
         return UncertainRig.from_json(rig, posterior), tuple(noise) if noise else None
-    except (KeyError, TypeError, IndexError) as error:
-        raise ValueError(f"{path} is no verdict of this case: {error}; diagnose it again") from None
+    except KeyError as error:
+        raise ValueError(f"{path} is no verdict of this case: it has no {error}; diagnose it again") from None
+    except (TypeError, IndexError, AttributeError):
+        raise ValueError(f"{path} is no verdict of this case: it is damaged; diagnose it again") from None
 
 
 def record_of(case: "Case", name: str, sample_rate_hz: float | None) -> Record:

@@ -13,7 +13,7 @@ RecordName = Annotated[
 ]
 Rate = Annotated[float | None, typer.Option(help="Sampling rate, where the file has no time axis.")]
 Draws = Annotated[int, typer.Option(min=1, help="Samples of the uncertain model from which the bands are computed.")]
-Seed = Annotated[int, typer.Option(help="Seed of the samples and of the noise.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")]
 
 
 @guarded

@@ -50,9 +50,10 @@ def redesign(
         float, typer.Option(help="Share by which it may do more work; as much as it takes unless given.")
     ] = float("inf"),
     draws: Annotated[
-        int, typer.Option(min=1, help="Samples of the uncertain model on which both controllers are verified.")
+        int,
+        typer.Option(min=1, max=100_000, help="Samples of the uncertain model on which both controllers are verified."),
     ] = 200,
-    seed: Annotated[int, typer.Option(help="Seed of the samples and of the noise.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")] = 0,
     workers: Workers = None,
     to: Annotated[
         Path | None,
@@ -112,7 +113,8 @@ def redesign(
             more_work=more_work,
             report=lambda what, share: report(what, 0.7 + 0.3 * share),
         )
-    say(result.sentence, bold=True)
+    say(f"{result.advice} {result.promise}".rstrip(), bold=True)
+    say(result.figures)
     table = Table("step", "what", "loss", "kept", box=None, pad_edge=False)
     for step in result.steps:
         table.add_row(step.name, step.what, step.lost, "yes" if step.kept else "no")

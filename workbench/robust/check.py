@@ -16,6 +16,7 @@ from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed
 
 UNLIKELY = 0.01  # share of tests of a true model that come out worse, below which the model does not hold
+LEAST_SAMPLES = 40  # of a record: of fewer readings a sensor hardly two lie outside the bands of a true model
 COLUMNS = ("checked", "record", "readings", "coverage", "expected_least", "worst_sensor", "worst_coverage", "holds")
 
 
@@ -96,6 +97,19 @@ class PredictionCheck(Printed):
         return self.sentence, ("sensor", "over time [%]", *bands), rows, ()
 
 
+def check_length(record: Record) -> None:
+    """Refuse a record too short to be a test.
+
+    Raises:
+        ValueError: saying how long it must be.
+    """
+    if record.n_samples < LEAST_SAMPLES:
+        raise ValueError(
+            f"record {record.name!r} has {record.n_samples} samples, too few to test a model: measure {LEAST_SAMPLES}"
+            " or more"
+        )
+
+
 def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
     """How much of a record lies inside the bands that were predicted for its inputs.
 
@@ -104,8 +118,9 @@ def check_prediction(prediction: Prediction, record: Record) -> PredictionCheck:
         record: what was measured, its sensors named as the rig's.
 
     Raises:
-        ValueError: sensors that are missing, or another length or sampling rate.
+        ValueError: sensors that are missing, a record too short, or another length or sampling rate.
     """
+    check_length(record)
     there = {channel.name: row for channel, row in zip(record.output_channels, record.outputs)}
     names = [channel.name for channel in prediction.channels]
     missing = [name for name in names if name not in there]

@@ -165,8 +165,8 @@ class UncertainRig:
             catalogue: kinds by which effects are known, where kinds of your own are among them.
 
         Raises:
-            ValueError: another rig, an effect of a kind that the catalogue does not hold, or a covariance of another
-                size.
+            ValueError: another rig, an effect of a kind that the catalogue does not hold, of a channel that the rig
+                does not have or without its numbers, or a covariance of another size.
         """
         kinds = {kind.name: kind for kind in (*catalogue, *BEYOND, NOMINAL_ERRORS)}
         unknown = [entry["kind"] for entry in written["effects"] if entry["kind"] not in kinds]
@@ -180,7 +180,7 @@ class UncertainRig:
                 )
         effects = tuple(_effect(nominal, kinds[entry["kind"]], entry) for entry in written["effects"])
         n = len(parameters_of(nominal, effects))
-        covariance = np.array(written["covariance"], float) if n else np.zeros((0, 0))
+        covariance = _covariance_read(written["covariance"], n)
         rivals = tuple((cls.from_json(nominal, rival, catalogue=catalogue), p) for rival, p in written["rivals"])
         return cls(nominal, effects, covariance, written["unexplained"], written["outcome"], rivals)
 
@@ -262,7 +262,36 @@ def _effect(nominal: Rig, kind: Kind, written: Mapping[str, Any]) -> Effect:
     elif isinstance(target, list):
         target = tuple(target)
     values = {n: Between(*v["between"]) if isinstance(v, Mapping) else v for n, v in written["values"].items()}
-    return Effect(kind, target, values, dict(written["deviations"]))
+    effect = Effect(kind, target, values, dict(written["deviations"]))
+    _check_effect(nominal, effect)
+    return effect
+
+
+def _check_effect(nominal: Rig, effect: Effect) -> None:
+    """Refuse an effect that acts on what the rig does not have, or that lacks a number."""
+    known = {"all", *(name for target in effect.kind.targets(nominal) for name in _names(target))}
+    strange = [name for name in _names(effect.target) if name not in known]
+    if strange:
+        raise ValueError(f"{effect.kind.name} acts on {strange[0]!r}, which the rig does not have; diagnose it again")
+    for parameter in effect.parameters(nominal):
+        value = effect.values.get(parameter.name)
+        if not isinstance(value, int | float) or not np.isfinite(value):
+            raise ValueError(f"{effect.label} needs a number {parameter.name!r}; got {value!r}: diagnose it again")
+
+
+def _names(target: Any) -> list[str]:
+    return [name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str)]
+
+
+def _covariance_read(written: Any, n: int) -> np.ndarray:
+    """(n, n), finite."""
+    try:
+        covariance = np.array(written, float) if n else np.zeros((0, 0))
+    except ValueError:
+        covariance = np.array(np.nan)
+    if covariance.shape != (n, n) or not np.isfinite(covariance).all():
+        raise ValueError(f"the covariance must be {n} by {n} finite numbers, one row a parameter; diagnose it again")
+    return covariance
 
 
 def _identified(nominal: Rig, root: Floats) -> IdentifiedPrior:

@@ -144,7 +144,19 @@ def predict(
         truths.append(truth)
     time = np.asarray(start + period * np.arange(n_samples), float)
     name = inputs.name if isinstance(inputs, Record) else "prediction"
-    return _banded(found, found.rig, truths, time, spread, rng, name)
+    told = _banded(found, found.rig, truths, time, spread, rng, name)
+    return replace(told, notes=(*told.notes, *_too_fast(found.rig.modes, period)))
+
+
+def _too_fast(modes: Modes, period: float) -> tuple[str, ...]:
+    """Which modes move between the samples, in words."""
+    fast = [f"{f:.4g}" for f in modes.frequencies_hz if f > 0.5 / period]
+    if not fast:
+        return ()
+    return (
+        f"Modes at {', '.join(fast)} Hz lie above half of {1 / period:.4g} samples a second: what drives them between"
+        " samples is not in the inputs, unless these were held as input_hold says; sample faster.",
+    )
 
 
 @one_blas_thread

@@ -205,6 +205,12 @@ class Redesign:
     @property
     def sentence(self) -> str:
         """The redesign in one sentence."""
+        kept = "" if self.pays and not self._neither else self._kept
+        return " ".join(part for part in (self.figures, kept, self.promise) if part)
+
+    @property
+    def figures(self) -> str:
+        """What both controllers do on the real structure, in one sentence."""
         old, new = self.present_proof, self.proof
         unstable = old.n_draws - int(old.stable.sum())
         effort, work = _times(new.effort, old.effort), _times(new.all_work, old.all_work)
@@ -217,9 +223,7 @@ class Redesign:
             text += f"; redesigned: {self._does(new, '', named=False)}, {effort} effort"
             text += "" if work == AS_MUCH else f" and {work} work"
         text = f"On the real structure {text}; stable on {_of(int(new.stable.sum()), new.n_draws)} draws."
-        text += f" {self.left_undamped}" if self.left_undamped else ""
-        text += "" if self.pays and not self._neither else f" {self._kept}"
-        return text if self.possible.explained else f"{text} {self._promise}"
+        return f"{text} {self.left_undamped}".rstrip()
 
     @property
     def _kept(self) -> str:
@@ -315,8 +319,10 @@ class Redesign:
         return bool(self._used.stable.all() and (self.possible.explained or holds))
 
     @property
-    def _promise(self) -> str:
-        """What can be promised where the gap is not explained."""
+    def promise(self) -> str:
+        """What can be promised where the gap is not explained; empty where it is."""
+        if self.possible.explained:
+            return ""
         share, margin = self.possible.unexplained, self._used.margin
         error = f"the model's readings are off by {_percent(share)} that nothing explains"
         if np.isnan(margin):

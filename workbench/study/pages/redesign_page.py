@@ -70,9 +70,9 @@ def redesign_page(
     moved = [] if found.relocation is None else [found.relocation.sentence]
     page_content = PageContent(
         title=f"Redesign for {name}",
-        lead=found.advice,
+        lead=f"{found.advice} {found.promise}".rstrip(),
         standing="bad" if used.share_stable < 0.95 else "good" if found.safe and not found.left_undamped else "part",
-        lines=[found.sentence.replace(found.advice, "").rstrip(), *moved, *found.notes],
+        lines=[found.figures, *moved, *found.notes],
         blocks=blocks,
         tables=tables,
         inputs={} if folder is None else case_inputs(folder),
