@@ -117,7 +117,7 @@ def test_a_damaged_verdict_is_named(run, case, tmp_path, change, said):
         ("--rate-hz", 0, "above 0 Hz"),
         ("--rate-hz", "nan", "above 0 Hz"),
         ("--draws", 0, "greater than or equal"),
-        ("--draws", 10**9, "less than or equal to 100000"),
+        ("--draws", 10**9, "less than or equal to 10000"),
         ("--seed", -1, "greater than or equal"),
         ("--aim", "fast", "cost or settling; got 'fast'"),
         ("--impulse-at", 9.0, "lies outside the structure"),

@@ -51,7 +51,7 @@ def redesign(
     ] = float("inf"),
     draws: Annotated[
         int,
-        typer.Option(min=1, max=100_000, help="Samples of the uncertain model on which both controllers are verified."),
+        typer.Option(min=1, max=10_000, help="Samples of the uncertain model on which both controllers are verified."),
     ] = 200,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")] = 0,
     workers: Workers = None,

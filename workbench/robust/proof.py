@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.design.estimation.digital import DigitalController
-from workbench.design.loop.rig_loop import LoopRun, LoopTest, run_loop, run_loops
+from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
 from workbench.rig.rig import Rig
 from workbench.robust.posterior import UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
@@ -154,35 +154,59 @@ def verify(
         centre = centre or possible.rig
     else:
         rigs, centre = possible, centre or possible[0]
-    runs = run_loops(rigs, controller, test)
+    index = list(controlled)
     n_modes = min(rig.modes.n_modes for rig in rigs)
-    poles = [loop_poles(rig, controller, modes_in_motion(rig, run)) for rig, run in zip(rigs, runs, strict=True)]
-    energies = [run.response.energy.sum(axis=0) for run in runs]
-    of_controlled = [run.response.energy[list(controlled)].sum(axis=0) for run in runs] if controlled else energies
-    stable = [
-        run.bounded and p.spectral_radius <= 1.0 + 1e-9 and not (test.forces is None and _grows(e))
-        for run, p, e in zip(runs, poles, energies, strict=True)
-    ]
+
+    def told(rig: Rig, run: LoopRun) -> _Draw:
+        poles, energy = loop_poles(rig, controller, modes_in_motion(rig, run)), run.response.energy
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = energy.sum(axis=0)
+            stays = run.bounded and not (test.forces is None and _grows(total))
+            return _Draw(
+                stable=stays and poles.spectral_radius <= 1.0 + 1e-9,
+                damping=poles.damping[:n_modes],
+                peak_force=np.abs(run.response.forces).max(),
+                stroke=_stroke(rig, controller, run),
+                work=run.work[:n_modes],
+                effort=run.effort,
+                energy=total,
+                of_controlled=energy[index].sum(axis=0) if index else total,
+            )
+
+    found = _Draw(*(list(values) for values in zip(*of_loops(rigs, controller, test, told))))
     margin, frequency = small_gain_margin(
         centre, controller, modes_in_motion(centre, run_loop(centre, controller, test))
     )
     dt = test.sample_time
     with np.errstate(over="ignore", invalid="ignore"):
         return Verification(
-            stable=np.array(stable),
-            damping=np.array([p.damping[:n_modes] for p in poles]),
-            peak_force=_finite([np.abs(run.response.forces).max() for run in runs]),
-            stroke=_finite([_stroke(rig, controller, run) for rig, run in zip(rigs, runs, strict=True)]),
-            work=np.array([_finite(run.work[:n_modes]) for run in runs]),
+            stable=np.array(found.stable),
+            damping=np.array(found.damping),
+            peak_force=_finite(found.peak_force),
+            stroke=_finite(found.stroke),
+            work=_finite(found.work),
             controlled=tuple(controlled),
-            effort=_finite([run.effort for run in runs]),
-            vibration=_finite([e.sum() * dt for e in energies]),
-            settling=_settlings(energies, stable, dt),
-            controlled_settling=_settlings(of_controlled, stable, dt),
-            energy=_band(energies),
+            effort=_finite(found.effort),
+            vibration=_finite([energy.sum() * dt for energy in found.energy]),
+            settling=_settlings(found.energy, found.stable, dt),
+            controlled_settling=_settlings(found.of_controlled, found.stable, dt),
+            energy=_band(found.energy),
             margin=margin,
             margin_frequency_hz=frequency,
         )
+
+
+class _Draw(NamedTuple):
+    """What is kept of a draw's run, see `Verification`; and lists of these, of all draws."""
+
+    stable: Any
+    damping: Any
+    peak_force: Any
+    stroke: Any
+    work: Any
+    effort: Any
+    energy: Any
+    of_controlled: Any
 
 
 def drawn_with_errors(possible: UncertainRig, draws: int, seed: int = 0) -> tuple[Rig, ...]:

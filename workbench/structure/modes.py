@@ -85,7 +85,7 @@ class Modes(Printed):
     def __post_init__(self) -> None:
         object.__setattr__(self, "domain", as_domain(self.domain))
         omega = frozen(self.omega)
-        damping = np.array(self.damping, float)
+        damping = np.asarray(self.damping, float)
         if omega.ndim != 1 or omega.size == 0:
             raise ValueError(f"Modes.omega must have shape (n_modes,) with at least one mode; got {omega.shape}")
         if not np.isfinite(omega).all() or (omega < 0).any():

@@ -1,6 +1,6 @@
 """A whole rig under a digital controller: every actuator, sensor and element as it is, sample by sample."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from os import cpu_count
@@ -22,6 +22,7 @@ from workbench.structure.domain import Where
 SUBSTEPS = 4
 
 P = TypeVar("P", Actuator, Sensor)
+K = TypeVar("K")
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,13 +151,20 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
 
 def run_loops(rigs: Sequence[Rig], controller: DigitalController, test: LoopTest) -> list[LoopRun]:
     """The same of many rigs, each with noise of its own, on all cores."""
+    return of_loops(rigs, controller, test, lambda _, run: run)
+
+
+def of_loops(
+    rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, kept: Callable[[Rig, LoopRun], K]
+) -> list[K]:
+    """What is kept of the run of each of many rigs: a thousand runs fill the memory, a few figures of each do not."""
     seeds = [test.seed if test.seed is None else test.seed + i for i in range(len(rigs))]
     tests = [
         LoopTest(test.n_samples, test.sample_time, test.impulse_at, test.impulse, test.forces, test.ports, s)
         for s in seeds
     ]
     with ThreadPoolExecutor(cpu_count() or 1) as pool:
-        return list(pool.map(lambda rig, one: run_loop(rig, controller, one), rigs, tests))
+        return list(pool.map(lambda rig, one: kept(rig, run_loop(rig, controller, one)), rigs, tests))
 
 
 def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
