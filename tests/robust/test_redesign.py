@@ -359,6 +359,13 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
     elsewhere = kalman(rig.modes, controller.law, [Sensor("s", 0.5)], disturbance=1.0, noise=1e-4)
     with pytest.raises(DesignError, match=r"displacement at x = 0.5.*has no such sensor: it has d1"):
         redesign(plain, elsewhere, sample_time=DT)
+    high = replace(controller.law, controlled=(0, 6))
+    with pytest.raises(DesignError, match="controls mode 7, and the rig has 6"):
+        redesign(plain, high, sample_time=DT)
+    with pytest.raises(TypeError, match=r"from the verdict of diagnose; got Rig\. A rig that is known for certain"):
+        redesign(rig, controller, sample_time=DT)
+    with pytest.raises(TypeError, match="a law, a controller or a placement task; got str"):
+        redesign(plain, "imsc", sample_time=DT)
     with pytest.raises(DesignError, match="where the rig has no actuator"):
         redesign(possible(replace(rig, actuators=rig.actuators[:1])), controller, sample_time=DT)
     with pytest.raises(ValueError, match="2 samples or more"):

@@ -99,11 +99,16 @@ def _held(a: np.ndarray, b: np.ndarray, span: float) -> np.ndarray:
 
 
 def check_rate(modes: Modes, controlled: Sequence[int], sample_time: float) -> None:
-    """Refuse a rate that is none, or too slow for the controlled modes.
+    """Refuse a rate that is none, or too slow for the controlled modes, and modes that are not there.
 
     Raises:
         DesignError: naming the mode and the rate that it needs.
     """
+    if max(controlled) >= modes.n_modes:
+        raise DesignError(
+            f"the controller controls mode {max(controlled) + 1}, and the rig has {modes.n_modes}: design it for the"
+            " modes of this rig, or give the rig more"
+        )
     if not 0 < sample_time < np.inf:
         raise DesignError(f"a controller runs once every sample_time seconds, above 0; got {sample_time:g}")
     r = max(controlled, key=lambda i: modes.omega[i])

@@ -41,7 +41,16 @@ def law_of(design: Law | OnOffLaw | Controller) -> Law | OnOffLaw:
 
 
 def controlled_by(design: Design) -> tuple[int, ...]:
-    """The controlled modes of a design, zero-based."""
+    """The controlled modes of a design, zero-based.
+
+    Raises:
+        TypeError: no design.
+    """
+    if not isinstance(design, Design):
+        raise TypeError(
+            f"the controller in use is a law, a controller or a placement task; got {type(design).__name__}: make one"
+            " by imsc, coupled_lqr, coupled_poles or on_off, with an estimator by luenberger or kalman"
+        )
     return tuple(range(design.n_controlled)) if isinstance(design, PlacementTask) else law_of(design).controlled
 
 

@@ -62,7 +62,16 @@ class UncertainRig:
 
     @classmethod
     def of(cls, verdict: Verdict) -> "UncertainRig":
-        """The corrected rig of a verdict, with the covariance of its effects and rivals that are not excluded."""
+        """The corrected rig of a verdict, with the covariance of its effects and rivals that are not excluded.
+
+        Raises:
+            TypeError: no verdict.
+        """
+        if not isinstance(verdict, Verdict):
+            raise TypeError(
+                f"the uncertainty of a rig comes from the verdict of diagnose; got {type(verdict).__name__}. A rig that"
+                " is known for certain is UncertainRig(rig, (), np.zeros((0, 0))), from workbench.robust.posterior"
+            )
         nominal, best = verdict.nominal, verdict.attribution.best
         likely = [(fit, p) for fit, p in verdict.attribution.rivals if p > LIKELY]
         rivals = [(cls(nominal, fit.effects, _covariance(nominal, fit)), p) for fit, p in likely]
