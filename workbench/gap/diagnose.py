@@ -7,7 +7,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import Effect, Kind, apply_all
+from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
@@ -142,8 +142,7 @@ def diagnose(
 
 def _faulty(effects: Sequence[Effect]) -> set[str]:
     """Sensors at fault, which one force at a point would have to explain too."""
-    targets = [effect.target for effect in effects if effect.kind.path == "sensor"]
-    return {name for target in targets for name in (target if isinstance(target, tuple) else (target,))}
+    return {name for effect in effects if effect.kind.path == "sensor" for name in names_in(effect.target)}
 
 
 def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: float) -> Attribution:

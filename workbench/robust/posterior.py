@@ -10,7 +10,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.catalogue import CATALOGUE
-from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all
+from workbench.gap.effects.effect import COORDINATES, Effect, Kind, Parameter, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior, NominalPrior
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.search.fit import Fit, parameters_of
@@ -278,18 +278,14 @@ def _effect(nominal: Rig, kind: Kind, written: Mapping[str, Any]) -> Effect:
 
 def _check_effect(nominal: Rig, effect: Effect) -> None:
     """Refuse an effect that acts on what the rig does not have, or that lacks a number."""
-    known = {"all", *(name for target in effect.kind.targets(nominal) for name in _names(target))}
-    strange = [name for name in _names(effect.target) if name not in known]
+    known = {"all", *(name for target in effect.kind.targets(nominal) for name in names_in(target))}
+    strange = [name for name in names_in(effect.target) if name not in known]
     if strange:
         raise ValueError(f"{effect.kind.name} acts on {strange[0]!r}, which the rig does not have; diagnose it again")
     for parameter in effect.parameters(nominal):
         value = effect.values.get(parameter.name)
         if not isinstance(value, int | float) or not np.isfinite(value):
             raise ValueError(f"{effect.label} needs a number {parameter.name!r}; got {value!r}: diagnose it again")
-
-
-def _names(target: Any) -> list[str]:
-    return [name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str)]
 
 
 def _covariance_read(written: Any, n: int) -> np.ndarray:

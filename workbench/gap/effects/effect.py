@@ -316,6 +316,11 @@ class Effect:
         return f"{self.kind.name}[{names}]" if isinstance(names, str | int) else self.kind.name
 
 
+def names_in(target: Any) -> tuple[str, ...]:
+    """Inputs, outputs or the end that the target of an effect names; empty where it names none."""
+    return tuple(name for name in (target if isinstance(target, tuple) else (target,)) if isinstance(name, str))
+
+
 def label_in_words(label: str) -> str:
     """A label as a figure or a note shows it: actuator gain (F2)."""
     return label.replace("[", " (").replace("]", ")").replace("_", " ")

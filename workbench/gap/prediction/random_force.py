@@ -134,15 +134,15 @@ def fit_random_force(
     def placed_at(point: np.ndarray, start: Where) -> Where:
         return start if d == 0 else same_place(point[:d] * extent)
 
-    def colour_at(point: np.ndarray, stages: int, flat: bool) -> Floats:
-        return colour_of(float(1.0 / (1.0 + np.exp(-point[d + 1]))), stages, flat=flat)
+    def memory_at(point: np.ndarray) -> float:
+        return float(1.0 / (1.0 + np.exp(-point[d + 1])))
 
     def loss(point: np.ndarray, family: tuple[Where, int, bool], records: list[np.ndarray]) -> float:
         start, stages, flat = family
-        memory = 1.0 / (1.0 + np.exp(-point[d + 1]))
+        memory = memory_at(point)
         if not ((point[:d] > 0.0) & (point[:d] < 1.0)).all() or memory > RANDOM_FORCE.longest_memory:
             return 1e300
-        kalman = _filter(model, rig, placed_at(point, start), np.exp(point[d]), colour_at(point, stages, flat))
+        kalman = _filter(model, rig, placed_at(point, start), np.exp(point[d]), colour_of(memory, stages, flat=flat))
         value = -2.0 * log_likelihood(kalman, records)
         return value if np.isfinite(value) else 1e300
 
@@ -176,7 +176,7 @@ def fit_random_force(
     nearest, family = min(nearer, key=lambda each: float(each[0].fun))
     found, (beside, stages, flat) = refined(nearest.x, family, residuals, RANDOM_FORCE.evaluations), family
     at, log_rms = placed_at(found.x, beside), found.x[d]
-    colour = colour_at(found.x, stages, flat)
+    colour = colour_of(memory_at(found.x), stages, flat=flat)
     kalman = _filter(model, rig, at, np.exp(log_rms), colour)
     n_values = sum(r.size for r in residuals)
     noise_part = sum(r.shape[1] for r in residuals) * np.sum(np.log(data.noise**2))

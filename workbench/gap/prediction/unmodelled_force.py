@@ -51,7 +51,7 @@ def _tethered(modes: Modes, sample_time: float) -> Modes:
 def sampled_model(modes: Modes, sensors: tuple[Sensor, ...], noise: np.ndarray, sample_time: float) -> SampledModel:
     """Discretise the modes for sensors with noise standard deviations `noise` (n_sensors,).
 
-    A delay counts as far as a sample, a sensor ahead likewise.
+    Of a sensor that is late by more than a sample, the forces are taken as held for so long.
     """
     n = modes.n_modes
     own = _tethered(modes, sample_time).state_matrix
@@ -132,6 +132,7 @@ def colour_of(memory: float, stages: int, *, flat: bool = False) -> Floats:
     """
     turns = np.pi * (1.0 - (2.0 * np.arange(stages) + 1.0) / stages) / 2.0 if flat else np.zeros(stages)
     poles = max(memory, 1e-12) ** np.exp(1j * turns)
+    # in sections of one pole or a pair: the polynomial of all of them loses digits where they are near 1
     colour = np.diag(np.where(np.abs(poles.imag) < 1e-12, poles.real, 0.0)) + np.eye(stages, k=1)
     for k, pole in enumerate(np.sort_complex(poles[poles.imag > 1e-12])):
         i = 2 * k

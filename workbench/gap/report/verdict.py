@@ -8,7 +8,7 @@ import numpy as np
 
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import in_words
-from workbench.gap.effects.effect import ALL, COORDINATES, Effect
+from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.where import Where
 from workbench.gap.report.budget import Budget, labels_of
@@ -322,8 +322,7 @@ def _described(effect: Effect, nominal: Rig) -> str:
     elif numbers:
         text += f" ({', '.join(n.strip() for n in numbers)})"
     if kind.path in ("actuator", "sensor"):
-        names = effect.target if isinstance(effect.target, tuple) else (effect.target,)
-        text += ", all of them" if effect.target == ALL else f", {kind.joined.join(names)}"
+        text += ", all of them" if effect.target == ALL else f", {kind.joined.join(names_in(effect.target))}"
     if kind.stands is not None:
         text += f" {kind.stands(effect, nominal)[1]}"
     elif effect.at is not None:

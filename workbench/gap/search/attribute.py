@@ -403,11 +403,10 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
-    random = None if beside.is_enough or search.is_over else random_beside(search, singles)
-    if random is None and not (beside.is_enough or search.is_over):
-        random = random_beside_errors(search, beside.last)
-    if random is not None:
-        return random
+    if not (beside.is_enough or search.is_over):
+        random = random_beside(search, singles) or random_beside_errors(search, beside.last)
+        if random is not None:
+            return random
     if beside.is_enough or beside.by_singles():
         beside.run()
         return beside.decision()
@@ -434,11 +433,10 @@ def _with_a_second(
         if not (are_common(decision.best.effects) and beside.is_nothing):
             return decision
     decision = beside.decision()
-    at_end = decision.outcome in ("explained", "none") or search.is_over
-    random = None if at_end else random_beside(search, pairs.found[:1])
-    if random is None and not at_end:
-        random = random_beside_errors(search, beside.steps[0], surely=False)
-    return random or decision
+    if decision.outcome in ("explained", "none") or search.is_over:
+        return decision
+    random = random_beside(search, pairs.found[:1])
+    return random or random_beside_errors(search, beside.steps[0], surely=False) or decision
 
 
 def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from workbench.arrays import Floats
-from workbench.gap.effects.effect import Effect, apply_all, place_values
+from workbench.gap.effects.effect import Effect, apply_all, names_in, place_values
 from workbench.gap.effects.environment import RANDOM_DISTURBANCE
 from workbench.gap.effects.nominal import NominalPrior
 from workbench.gap.localisation.evidence import Evidence
@@ -106,7 +106,7 @@ def random_beside_errors(search: Search, step: Step, *, surely: bool = True) -> 
         found, random = _random_beside(search, step.fit, evidence)
         if random.cost > (1.0 - RANDOM.settled) * before:
             break
-    whole = float(search.data.by_channel(search.data.residual(evidence.rig)).mean())
+    whole = cost_of(search.rig, step.fit.effects, search.data)
     closed = random.left - 1.0 < STEPWISE.explained * whole
     return Decision("explained", found, random) if closed and random.is_steady and looks_random(evidence) else None
 
@@ -143,8 +143,7 @@ def _without_clipped(search: Search, effects: Sequence[Effect], evidence: Eviden
     """The search and its evidence without the sensors that clip; with them where an effect is of one of them."""
     unclipped = search.without_clipped()
     deaf = {sensor.name for sensor in search.rig.sensors} - {sensor.name for sensor in unclipped.rig.sensors}
-    targets = [effect.target if isinstance(effect.target, tuple) else (effect.target,) for effect in effects]
-    if not deaf or any(name in deaf for target in targets for name in target):
+    if not deaf or any(name in deaf for effect in effects for name in names_in(effect.target)):
         return search, evidence
     return unclipped, unclipped.evidence_of(apply_all(unclipped.rig, effects))
 
