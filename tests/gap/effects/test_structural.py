@@ -7,11 +7,12 @@ import pytest
 from scipy.linalg import eigh
 
 from workbench.gap.effects.catalogue import kind_named
-from workbench.gap.effects.effect import Effect, apply_all
+from workbench.gap.effects.effect import Effect, apply_all, can_be
 from workbench.gap.effects.structural import modes_of
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import Between, NamedPoints
+from workbench.structure.member import Beam
 from workbench.structure.modes import Modes, PointShapes
 from workbench.structure.plate import Plate
 from workbench.structure.supports import Edge, PointMass, PointSpring
@@ -104,3 +105,13 @@ def test_a_damper_is_as_strong_whichever_effect_was_found_first(order):
     damping = np.diag(2.0 * zeta * np.sqrt(values)) + c * np.outer(felt, felt)
     expected = np.linalg.eigvals(np.block([[np.zeros((4, 4)), np.eye(4)], [-np.diag(values), -damping]]))
     np.testing.assert_allclose(np.sort_complex(poles), np.sort_complex(expected), rtol=1e-9)
+
+
+def test_a_loss_of_stiffness_that_leaves_the_structure_cannot_be():
+    """Of two losses made one, the wider may not fit where the narrower stands."""
+    beam = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged")
+    rig = Rig(beam.modes(3), (), (), structure=beam)
+    kind = kind_named("local_stiffness_loss")
+    inside, outside = (Effect(kind, None, {"at": 0.07, "width": width, "loss": 0.1}) for width in (0.1, 0.16))
+    assert can_be(rig, [inside])
+    assert not can_be(rig, [inside, outside])

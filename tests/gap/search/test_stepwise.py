@@ -106,6 +106,9 @@ def test_friction_beside_small_errors(rig, measured, records):
         (1068387374, ("bouc_wen",), "shape", 2.0),
         (147580016, ("random_disturbance",), "offset", 0.5),
         (1954737329, ("modulus_error",), "late", 1.0),
+        (20299114, ("support_rotation",), "mixed", 0.5),  # a spring to ground beside it leaves as little
+        (20299158, ("point_mass",), "late", 2.0),  # no start without the errors lies near
+        (20299141, ("midplane_stretching",), "mixed", 0.5),
     ],
 )
 def test_effects_beside_small_errors_are_named(seed, kinds, dirt, size):

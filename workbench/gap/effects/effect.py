@@ -336,3 +336,12 @@ def apply_all(rig: Rig, effects: Iterable[Effect]) -> Rig:
     for effect in sorted(effects, key=lambda e: (e.kind.last, not e.kind.first)):
         rig = effect.apply(rig)
     return rig
+
+
+def can_be(rig: Rig, effects: Iterable[Effect]) -> bool:
+    """Whether a rig can have these effects: one that buckles, or a stretch that leaves the structure, cannot be."""
+    try:
+        apply_all(rig, effects)
+    except (ValueError, np.linalg.LinAlgError):
+        return False
+    return True

@@ -399,7 +399,7 @@ def _with_a_second(
     tolerance: float,
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
-    beside = Stepwise(search, tolerance, singles, ahead)
+    beside = Stepwise(search, tolerance, ahead)
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone

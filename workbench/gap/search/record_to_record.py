@@ -116,7 +116,7 @@ def beside_records(before: Stepwise) -> Stepwise | None:
     if before.decision().outcome == "explained":
         return before
     search.report(f"{asked.figure} that differs from record to record", 0.5)
-    beside = Stepwise(replace(search, differs=asked.figure), before.tolerance, before.singles)
+    beside = Stepwise(replace(search, differs=asked.figure), before.tolerance, before.ahead)
     noise = nearest.noise_power
     if beside.is_enough or beside.by_singles() or beside.nearest.excess(noise) < RECORDS.half * nearest.excess(noise):
         beside.run()

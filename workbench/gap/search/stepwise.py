@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from workbench.gap.effects.effect import Effect, apply_all, key_of
+from workbench.gap.effects.effect import Effect, apply_all, can_be, key_of
 from workbench.gap.effects.limiting_cases import (
     contained,
     each_left_out,
@@ -23,8 +23,8 @@ from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.plain import COMMON, in_place_of_errors, one_late
-from workbench.gap.search.search import Decision, Search, in_one_valley, most_informative, spread_over_kinds
-from workbench.gap.search.selection import one_more
+from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
+from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
 from workbench.rig.simulate import is_stepped
 
@@ -37,9 +37,8 @@ class Stepwise:
     Attributes:
         search: what it works on.
         tolerance: of the signal's rms: an effect that alters it by less in every record is not added.
-        singles: the likeliest effects alone, without errors, which the first one is chosen among too; with the values
-            that predictions one sample ahead give them.
-        ahead: effects alone, fitted to predictions one sample ahead, best first.
+        ahead: effects alone, without errors, fitted to predictions one sample ahead, best first; the first one is
+            chosen among them too.
         at_first: the search without noise of the logged inputs.
         steps: the sets found, each with one effect more or one less than the last.
         plain: the effects of the last without errors of the nominal model, where they explain the records as well.
@@ -49,20 +48,8 @@ class Stepwise:
         is_run: whether effects have been added as long as that pays.
     """
 
-    def __init__(
-        self, search: Search, tolerance: float = 0.0, singles: Sequence[Fit] = (), ahead: Sequence[Fit] = ()
-    ) -> None:
-        self.singles: list[Fit] = []
+    def __init__(self, search: Search, tolerance: float = 0.0, ahead: Sequence[Fit] = ()) -> None:
         self.ahead = ahead
-        domain = search.rig.modes.domain
-        # on whole records, with frequencies that are off, an effect may have gone astray: it starts as it was before
-        before = [next((f for f in ahead if in_one_valley(f, single, domain)), single) for single in singles]
-        for single in spread_over_kinds(before, 1):
-            # a law that comes to a likelier one at its bounds is no other explanation
-            comes_to = contained(single.effects, search.rig)
-            if single.effects[0].kind not in COMMON and not any(f.key in comes_to for f in self.singles):
-                self.singles.append(single)
-        self.singles = self.singles[: STEPWISE.singles]
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
@@ -88,8 +75,21 @@ class Stepwise:
     @cached_property
     def _alone(self) -> list[Step]:
         """The likeliest single effects beside errors that start from none, best first."""
-        found = self.search.workers.map(self._afresh, [f.effects for f in self.singles])
+        found = self.search.workers.map(self._afresh, [f.effects for f in self._likeliest_alone()])
         return sorted((s for s in found if not self._is_timing(s)), key=lambda s: s.fit.cost)
+
+    def _likeliest_alone(self) -> list[Fit]:
+        """The likeliest single effects one sample ahead, beside errors that give way; none that a simpler equals."""
+        search = self.search
+        sets = [f.effects for f in self.ahead if f.effects[0].kind not in COMMON]
+        found = fitted_ahead(replace(search, held=(self.last.errors,)), sets)
+        chosen: list[Fit] = []
+        for single in spread_over_kinds(found, 1):
+            comes_to = contained(single.effects, search.rig)
+            as_likely = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
+            if not comes_to & as_likely:
+                chosen.append(single)
+        return chosen[: STEPWISE.singles]
 
     def by_singles(self) -> bool:
         """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
@@ -442,9 +442,10 @@ class Stepwise:
         return slopes(search.rig, (step.errors,), search.quick, step.effects, search.workers)[1]
 
     def _fitted(self, sets: Sequence[tuple[Effect, ...]], step: Step, known: np.ndarray) -> list[Step]:
-        """Sets beside errors that start as those of a step, fitted to the most telling records."""
+        """Sets that can be, beside errors that start as those of a step, fitted to the most telling records."""
         return self.search.workers.map(
-            lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2, known=known), list(sets)
+            lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2, known=known),
+            [effects for effects in sets if can_be(self.search.rig, effects)],
         )
 
     def _afresh(self, effects: tuple[Effect, ...]) -> Step:
@@ -483,7 +484,7 @@ class Stepwise:
 
     def _simplest(self, best: Step, tried: Sequence[Step]) -> Step:
         """The best, or a set that it comes to at bounds of its parameters, where that leaves hardly more."""
-        equals = [s for s in tried if len(s.effects) > 1 and not self._tells_apart(best, s)]
+        equals = [s for s in (best, *tried) if len(s.effects) > 1 and not self._tells_apart(best, s)]
         fresh = [
             *simpler_sets(best.effects, self.search.rig),
             *merged_sets(best.effects),
