@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import lfilter, welch
 
-from workbench.draw.spectra import plot_frf
+from workbench.draw.spectra import plot_frf, power_spectrum
 from workbench.records.record import Channel, Record
 
 
@@ -20,3 +20,12 @@ def test_the_frequency_response_is_that_of_the_filter_between_input_and_output()
     assert coherence.lines[0].get_ydata().min() > 0.99
     with pytest.raises(ValueError, match="needs one input; record 'record' has 0"):
         plot_frf(Record(1 / rate, u[None], (Channel("y"),)))
+
+
+@pytest.mark.parametrize("n", [1, 3, 100, 16385, 1_100_003])
+def test_spectrum_by_parts_is_that_of_the_whole(n):
+    signal = 3.0 + np.random.default_rng(n).standard_normal(n)
+    lines, power = power_spectrum(signal, 100.0)
+    whole = welch(signal - signal.mean(), 100.0, nperseg=min(4096, max(n // 4, 1)))
+    np.testing.assert_array_equal(lines, whole[0])
+    np.testing.assert_allclose(power, whole[1], rtol=1e-12, atol=1e-15)

@@ -49,6 +49,16 @@ def read(tmp_path, text, encoding="utf-8", ending=".csv", **options):
                      {"a": ("", "")}, [[1, 2]], id="ISO 8601"),
         pytest.param("time a\n23:59:59.50 1\n0:00:00.00 2\n00:00:00.50 3\n", "utf-8", 0.5, {"a": ("", "")},
                      [[1, 2, 3]], id="past midnight"),
+        pytest.param("X_Dimension\tTime\t\n***End_of_Header***\t\t\nX_Value\tAcc\tComment\n0.0\t1\n0.5\t2\n", "utf-8",
+                     0.5, {"Acc": ("", "")}, [[1, 2]], id="LabVIEW's column of comments, of which there are none"),
+        pytest.param("Sensor,S 1,S 2\nPlace,tip,tip\nTime [s],Acc [g],Acc [g]\n0,1,2\n1,3,4\n", "utf-8", 1.0,
+                     {"S 1 tip Acc": ("acceleration", "m/s^2"), "S 2 tip Acc": ("acceleration", "m/s^2")},
+                     [[G, 3 * G], [2 * G, 4 * G]], id="names that differ in the lines above"),
+        pytest.param('"Time","Acc"\n"0,0","1,5"\n"0,5","2,5"\n', "utf-8", 0.5, {"Acc": ("", "")}, [[1.5, 2.5]],
+                     id="decimal commas in quotes between commas"),
+        pytest.param("Sample,Time (us),V (mm/s)\n1,0,1\n2,500,3\n3,1000,2\n", "utf-8", 5e-4,
+                     {"Sample": ("", ""), "V": ("velocity", "m/s")}, [[1, 2, 3], [1e-3, 3e-3, 2e-3]],
+                     id="time behind the numbers of the samples"),
     ],
 )  # fmt: skip
 def test_a_table_in_any_layout(tmp_path, text, encoding, step, channels, values):

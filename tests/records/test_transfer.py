@@ -127,6 +127,33 @@ def test_a_table_of_real_and_imaginary_parts(tmp_path):
         read_record(path)
 
 
+@pytest.mark.parametrize("header", [
+    "Frequency (Hz),Real,Imag", "f,h mag,h phase", "Frequency [Hz],Magnitude (dB),Phase (deg)",
+    "Frequency (kHz),Magnitude,Phase [°]",
+])  # fmt: skip
+def test_a_table_of_two_parts_as_analysers_write_them(tmp_path, header):
+    lines, one, other = header.split(",")
+    h = SPECTRA[0, 0]
+    columns = [
+        LINES * (1e-3 if "kHz" in lines else 1.0),
+        h.real if one == "Real" else 20.0 * np.log10(np.abs(h)) if "dB" in one else np.abs(h),
+        h.imag if other == "Imag" else np.angle(h, deg=other != "h phase"),
+    ]
+    np.savetxt(tmp_path / "x.csv", np.column_stack(columns), delimiter=",", comments="", header=header)
+    found = read_measured(tmp_path / "x.csv")
+    np.testing.assert_allclose(found.values[0, 0], h, rtol=1e-12)
+    np.testing.assert_allclose(found.frequencies_hz, LINES, rtol=1e-14)
+
+
+@pytest.mark.parametrize("names", ["a", "a real", "a real,b imag", "a real,a imag,coherence", "a real,a phase"])
+def test_a_table_of_frequencies_is_no_record(tmp_path, names):
+    """It was told to lack a sample rate; with one it would have been taken for signals over time."""
+    columns = [LINES] * (1 + len(names.split(",")))
+    np.savetxt(tmp_path / "x.csv", np.column_stack(columns), delimiter=",", header=f"f,{names}", comments="")
+    with pytest.raises(RecordFileError, match=r"two columns each, NAME real and NAME imag"):
+        read_measured(tmp_path / "x.csv", sample_rate_hz=100.0)
+
+
 def save_58(path, pairs, function=4):
     file = pyuff.UFF(str(path))
     for output, reference, values in pairs:

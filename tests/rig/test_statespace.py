@@ -92,3 +92,8 @@ def test_an_actuator_on_a_support_is_refused_by_name(modes):
 def test_what_is_not_linear_has_no_state_space(modes, actuator, sensor):
     with pytest.raises(ValueError, match="simulate it instead"):
         state_space(modes, [actuator], [sensor])
+
+
+def test_names_with_a_point_are_such_as_python_control_allows(modes):
+    system = state_space(modes, [Actuator("F 1", 0.4)], [Sensor("Acc. A", 0.7, time_constant=0.01)])
+    assert system.output_labels == ["Acc_ A"] and system.input_labels == ["F 1"]

@@ -22,8 +22,8 @@ from matplotlib.ticker import FixedLocator, LogLocator, MaxNLocator, NullLocator
 from numpy.typing import ArrayLike
 
 from workbench.arrays import Floats
+from workbench.draw.style import MOST_POINTS, envelope
 
-MOST_POINTS = 4000
 MOST_CELLS = (160, 320)
 DASHES = {"-": "", "--": "6 4", ":": "2 3", "-.": "7 3 2 3"}
 POINTS = 4.0 / 3.0  # CSS pixels in a point
@@ -142,12 +142,7 @@ def _line(ax: Axes, line: Line2D) -> list[dict[str, Any]]:
 def _thinned(x: np.ndarray, y: np.ndarray) -> dict[str, Any]:
     """At most MOST_POINTS points that look the same: along rising x, the least and the largest of each stretch."""
     if x.size > MOST_POINTS:
-        if (np.diff(x) >= 0).all():
-            edges = np.linspace(0, x.size, MOST_POINTS // 2 + 1).astype(int)
-            pieces = [(a, np.nan_to_num(y[a:b])) for a, b in zip(edges, edges[1:])]
-            keep = np.unique([a + i for a, piece in pieces for i in (piece.argmin(), piece.argmax())])
-        else:
-            keep = np.arange(0, x.size, -(-x.size // MOST_POINTS))
+        keep = envelope(y) if (np.diff(x) >= 0).all() else np.arange(0, x.size, -(-x.size // MOST_POINTS))
         x, y = x[keep], y[keep]
     return {"x": _numbers(x), "y": _numbers(y)}
 

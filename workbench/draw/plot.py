@@ -19,7 +19,7 @@ from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.spectra import plot_distortion
-from workbench.draw.style import COLOURS, GREY, in_units, new_figure
+from workbench.draw.style import COLOURS, GREY, envelope, in_units, new_figure
 from workbench.draw.surface import (
     plot_point_modes,
     plot_scattered_modes,
@@ -61,7 +61,8 @@ def _(result: Record) -> Figure:
     figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.3 * len(rows), sharex=True, squeeze=False)
     for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
         colour = COLOURS[1] if i < result.n_inputs else COLOURS[0]
-        ax.plot(result.time, values, color=colour, linewidth=0.9)
+        at = envelope(values)
+        ax.plot(result.start_time + result.sample_time * at, values[at], color=colour, linewidth=0.9)
         ax.set_ylabel(in_units(channel.name, channel.unit), fontsize=8)
     axes[0, 0].set_title(result.name)
     axes[-1, 0].set_xlabel("time [s]")

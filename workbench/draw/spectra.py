@@ -15,8 +15,31 @@ LINES = 4096  # samples of a segment
 SHOWN = 1e-12  # least power shown, as a share of the largest
 OUTPUTS_SHOWN = 4  # of a record, in a figure of its distortion
 BEYOND = 4.0  # times the highest line excited, up to which distortion is shown
+TOGETHER = 256  # segments whose spectra are in memory at once
 SEGMENTS = 4  # of the record at least
 MOST_PANELS = 12
+
+
+def power_spectrum(values: np.ndarray, rate_hz: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies, Hz, and power spectral density, (n_lines,) each, of a signal about its mean, by Welch's method.
+
+    Segments of 4,096 samples, or a quarter of the signal, that overlap by half.
+
+    Args:
+        values: (n_samples,).
+        rate_hz: sampling rate.
+    """
+    segment = min(LINES, max(values.size // SEGMENTS, 1))
+    step = segment - segment // 2
+    n_segments, mean = (values.size - segment // 2) // step, values.mean()
+    power = np.zeros(segment // 2 + 1)
+    # so many segments at a time: all of a long record take several times its memory
+    for first in range(0, n_segments, TOGETHER):
+        count = min(TOGETHER, n_segments - first)
+        part = values[first * step : (first + count - 1) * step + segment] - mean
+        lines, each = welch(part, rate_hz, nperseg=segment)
+        power += count / n_segments * each
+    return lines, power
 
 
 def plot_spectra(record: Record) -> Figure:
@@ -24,9 +47,7 @@ def plot_spectra(record: Record) -> Figure:
     rows = [*zip(record.input_channels, record.inputs), *zip(record.output_channels, record.outputs)][:MOST_PANELS]
     figure, axes = new_figure(len(rows), 1, width=9, height=0.8 + 1.6 * len(rows), sharex=True, squeeze=False)
     for i, (ax, (channel, values)) in enumerate(zip(axes[:, 0], rows)):
-        lines, power = welch(
-            values - values.mean(), record.sample_rate_hz, nperseg=min(LINES, max(values.size // SEGMENTS, 1))
-        )
+        lines, power = power_spectrum(values, record.sample_rate_hz)
         if power[1:].max(initial=0.0) > 0:
             ax.semilogy(lines[1:], power[1:], color=COLOURS[1] if i < record.n_inputs else COLOURS[0], linewidth=0.9)
             ax.set_ylim(bottom=max(ax.get_ylim()[0], SHOWN * power[1:].max()))

@@ -3,6 +3,7 @@
 from typing import Any
 
 import matplotlib
+import numpy as np
 from cycler import cycler
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, NullFormatter
@@ -12,6 +13,7 @@ matplotlib.use("Agg")
 # Okabe & Ito's palette, in the order of use
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 GREY = "#8a8a8a"
+MOST_POINTS = 4000  # of a curve, of which a page or a screen shows no more
 PLAIN_LEAST, PLAIN_DECADES = 1e-4, 1e6  # least value and widest range of a logarithmic axis with plain numbers
 
 SETTINGS: Any = {
@@ -61,3 +63,12 @@ def plain_ticks(figure: Figure) -> Figure:
                 FuncFormatter(lambda value, _: f"{value:g}") if high / low < 10 else NullFormatter()
             )
     return figure
+
+
+def envelope(y: np.ndarray) -> np.ndarray:
+    """Which samples to draw of a signal (n_samples,): all, or the least and the largest of each of 2,000 stretches."""
+    if y.size <= MOST_POINTS:
+        return np.arange(y.size)
+    edges = np.linspace(0, y.size, MOST_POINTS // 2 + 1).astype(int)
+    pieces = ((a, np.nan_to_num(y[a:b])) for a, b in zip(edges, edges[1:]))
+    return np.unique([a + i for a, piece in pieces for i in (piece.argmin(), piece.argmax())])

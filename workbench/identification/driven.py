@@ -32,6 +32,7 @@ from workbench.identification.signal.modal_estimates import (
 )
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Channel, Record
+from workbench.rig.statespace import signal_names
 from workbench.structure.modes import SampledModes, frozen
 from workbench.threads import one_blas_thread
 
@@ -144,8 +145,8 @@ class Driven(ModalEstimates):
             b,
             c,
             self.feedthrough,
-            inputs=[channel.name for channel in self.input_channels],
-            outputs=[channel.name for channel in self.output_channels],
+            inputs=signal_names(channel.name for channel in self.input_channels),
+            outputs=signal_names(channel.name for channel in self.output_channels),
             states=[f"{part}{r + 1}" for r in range(n) for part in ("re", "im")],
             name="identified",
         )

@@ -152,7 +152,7 @@ def _start(record: Record) -> tuple[float, list[str]]:
         notes.append(f"free decay from {start:.6g} s on; --start sets another time")
     clipped = [a for a in data_faults(record.between(start)) if a.until is not None]
     behind = max((a.until or start for a in clipped), default=start) + record.sample_time
-    if clipped and behind - start < 0.5 * (record.time[-1] - start):
+    if clipped and behind - start < 0.5 * (record.start_time + record.sample_time * (record.n_samples - 1) - start):
         notes.append(f"output {clipped[0].outputs[0]!r} is clipped: used from {behind:.6g} s on")
         start = behind
     return start, notes
@@ -278,7 +278,9 @@ def _unexplained(records: list[Record], left: list[np.ndarray], refined: Refined
     Noise of sensors is no larger there than beside.
     """
     for record, residual, noise in zip(records, left, refined.noise, strict=True):
-        power, motion = (_power(part / noise[:, None], record.n_samples)[1:] for part in (residual, record.outputs))
+        # in single precision, as transforms of a long record are several times its size
+        scaled = ((part / noise[:, None]).astype(np.float32) for part in (residual, record.outputs))
+        power, motion = (_power(part, record.n_samples)[1:] for part in scaled)
         bin_width = 2.0 * np.pi / (record.n_samples * record.sample_time)
         inside, beside = np.zeros((2, power.size), bool)
         for pole in refined.modes.poles:

@@ -25,6 +25,7 @@ BLOCK = 2**21  # characters
 # a run of lines is one match without backtracking, so that 300 MB of them take seconds
 BLANK_LINES = re.compile(r"\n[ \t\n]+(?<=\n)")
 COMMENT_LINES = re.compile(r"^(?:#.*+\n?+)++", re.MULTILINE)
+COUNTERS = ("sample", "samples", "index", "n", "no", "no.", "nr", "nr.", "#", "scan", "point", "row")  # before the time
 DATES = ("%d.%m.%Y", "%Y/%m/%d")  # beside ISO's, which numpy reads
 
 
@@ -47,7 +48,9 @@ def read(path: Path, limits: Limits = DEFAULT) -> Signals:
     signals = dict(zip(names, columns[layout.n_stamps > 0 :]))
     if layout.n_stamps:
         return columns[0], signals, layout.header
-    first = next(iter(signals))
+    first, *others = signals
+    if first.lower() in COUNTERS and others and time_factor(others[0]) is not None:
+        first = others[0]
     factor = time_factor(first)
     if factor is None:
         return None, signals, layout.header

@@ -23,6 +23,7 @@ FORMATS = {
     ".asc": csv_file,
     ".dat": csv_file,
     ".tsv": csv_file,
+    ".lvm": csv_file,
     ".npz": npz_file,
     ".mat": mat_file,
     ".h5": hdf5_file,
@@ -68,7 +69,8 @@ def read_measured(
 
     Transfer functions are complex arrays of MAT, NPZ or HDF5, shape ([n_outputs, [n_references,]] n_frequencies) with
     the axes in any order, beside their lines (`frequency_hz`, `f`, ..., or `omega`) or a sample rate; data sets 58 of
-    UFF of the function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`.
+    UFF of the function type 4; tables that begin with a column `frequency`, then `NAME real`, `NAME imag`, or
+    `NAME magnitude`, `NAME phase [deg]`.
 
     Args:
         path, inputs, limits: as `read_record`.
@@ -87,7 +89,7 @@ def read_measured(
     try:
         if module is csv_file:
             time, signals, header = csv_file.read(path, limits)
-            arrays = complex_columns(signals)
+            arrays = complex_columns(path, signals)
         else:
             arrays = module.arrays(path, limits)
             if not holds_transfer(arrays):

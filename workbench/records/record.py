@@ -202,6 +202,8 @@ class Record(Printed):
 
     def only(self, outputs: Sequence[str]) -> "Record":
         """The record with only the named outputs, in that order."""
+        if tuple(outputs) == self.output_names:
+            return self
         row_of = {name: row for row, name in enumerate(self.output_names)}
         missing = [name for name in outputs if name not in row_of]
         if missing:

@@ -162,12 +162,18 @@ def _with_names(
     rows = [(number, line, _fields(line, delimiter, trailing)) for number, line in lines]
     rows = [row for row in rows if len(row[2]) == len(fields)]
     titles = [row for row in rows if not any(_is_number(field, decimal_comma) for field in row[2])]
+    if not titles and lines:  # of LabVIEW: a column of comments, which rows without any leave out
+        *names, last = _fields(lines[-1][1], delimiter, trailing)
+        if len(names) == len(fields) and last.strip().lower() == "comment":
+            titles = [(*lines[-1], names)]
     units: tuple[str, ...] = ()
     if len(titles) > 1 and any(unit_named(field.strip(" []()")) for field in titles[-1][2]):
         if _are_units(titles[-1][2]):
             units = tuple(field.strip(" []()") for field in titles[-1][2][n_stamps:])
         titles = titles[:-1]
-    names = titles[-1][2] if titles else _fields(comment, delimiter, trailing)  # as numpy's savetxt: behind a comment
+    names = (
+        _told_apart([row[2] for row in titles]) if titles else _fields(comment, delimiter, trailing)
+    )  # as numpy's savetxt: behind a comment
     if not titles and len(names) != len(fields):
         if lines:
             names = _fields(lines[0][1], delimiter, False)
@@ -180,6 +186,14 @@ def _with_names(
         if titles and number > titles[-1][0] and not units:
             check_row(path, layout, number, line)
     return layout
+
+
+def _told_apart(titles: Sequence[list[str]]) -> list[str]:
+    """The names of the last line of titles; where some are alike, behind what stands above them."""
+    names = [name.strip() for name in titles[-1]]
+    for above in reversed(titles[:-1]):
+        names = [f"{more.strip()} {name}" if names.count(name) > 1 else name for more, name in zip(above, names)]
+    return names
 
 
 def _row_of_numbers(line: str) -> tuple[str, bool, int, bool] | None:
@@ -196,7 +210,7 @@ def _row_of_numbers(line: str) -> tuple[str, bool, int, bool] | None:
             continue
         n_stamps = _n_stamps(fields)
         numbers = fields[n_stamps:]
-        for decimal_comma in (False, True) if delimiter != "," else (False,):
+        for decimal_comma in (False, True) if delimiter != "," or '"' in line else (False,):
             if numbers and all(_is_number(field, decimal_comma) for field in numbers):
                 return delimiter, decimal_comma, n_stamps, trailing
     return None

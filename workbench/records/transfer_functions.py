@@ -14,6 +14,7 @@ from workbench.records.assembly import legible
 from workbench.records.confined import load_confined
 from workbench.records.limits import RecordFileError
 from workbench.records.record import Channel, Record
+from workbench.records.units import split_unit, unit_named
 from workbench.structure.modes import frozen
 from workbench.structure.printed import Printed, counted, place_text
 
@@ -25,7 +26,11 @@ SURE_RATES = ("fs", "sample_rate", "sample_rate_hz")
 LIKELY_RATES = ("freq", "frequency", "rate")  # where the number of samples stands beside it
 SAMPLES = ("npts", "nfft", "n_samples")
 PLACES = ("positions", "at")
-COLUMN = re.compile(r"(.+?)[ ._]+(?:(re|real)|im|imag|imaginary)", re.IGNORECASE)
+# of a table: parts of complex numbers, behind the name of a channel or by themselves
+COLUMN = re.compile(
+    r"(?:(.+?)[ ._]+)?(?:(re|real)|(im|imag|imaginary)|(mag|magnitude|amplitude)|(phase))", re.IGNORECASE
+)
+DECIBEL = re.compile(r"(.+?)\s*[\[(]\s*dB\s*[\])]", re.IGNORECASE)
 DESCRIPTION = "transfer_header"
 
 
@@ -99,18 +104,42 @@ def holds_transfer(arrays: Mapping[str, np.ndarray]) -> bool:
     return any(values.dtype.kind == "c" and values.size > 1 for values in arrays.values())
 
 
-def complex_columns(signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns of a table that begins with frequencies, real and imaginary parts put together; else none."""
+def complex_columns(path: Path, signals: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns of a table that begins with frequencies, the parts of each complex number put together; else none.
+
+    Parts are real and imaginary, or magnitude (which may be in dB) and phase (in rad or degrees).
+
+    Raises:
+        RecordFileError: frequencies, but a column beside them without its other part.
+    """
     names = list(signals)
-    if not names or names[0].lower() not in (*HERTZ, *RADIANS):
+    base, text = split_unit(names[0]) if names else ("", "")
+    unit = unit_named(text)
+    in_hertz = unit is not None and unit.quantity == "frequency" and base.lower() in HERTZ
+    if not names or not (in_hertz or names[0].lower() in (*HERTZ, *RADIANS)):
         return {}
-    parts: dict[str, dict[bool, np.ndarray]] = {}
+    parts: dict[str, dict[int, np.ndarray]] = {}
     for name in names[1:]:
-        column = COLUMN.fullmatch(name)
-        if column:
-            parts.setdefault(column[1], {})[column[2] is not None] = signals[name]
-    both = {name: part[True] + 1j * part[False] for name, part in parts.items() if len(part) == 2}
-    return {names[0]: signals[names[0]], **both} if 2 * len(both) == len(names) - 1 else {}
+        values, decibel = signals[name], DECIBEL.fullmatch(name)
+        bare, angle = split_unit(decibel[1] if decibel else name)
+        column = COLUMN.fullmatch(bare)
+        if column is None:
+            break
+        measure = unit_named(angle)
+        scaled = 10.0 ** (values / 20.0) if decibel else values * (measure.factor if column[5] and measure else 1.0)
+        which = next(i for i in range(2, 6) if column[i])
+        parts.setdefault(column[1] or "H", {})[which] = scaled
+    pairs = [sorted(part) for part in parts.values()]
+    if sum(map(len, pairs)) != len(names) - 1 or not all(pair in ([2, 3], [4, 5]) for pair in pairs):
+        raise RecordFileError(
+            f"{path} begins with frequencies, {names[0]!r}, and is no record; transfer functions need two columns each,"
+            f" NAME real and NAME imag, or NAME magnitude and NAME phase [deg]; got {', '.join(names[1:7])}"
+        )
+    lines = signals[names[0]] * (unit.factor if in_hertz and unit else 1.0)
+    both = {
+        name: part[2] + 1j * part[3] if 2 in part else part[4] * np.exp(1j * part[5]) for name, part in parts.items()
+    }
+    return {"f" if in_hertz else names[0]: lines, **both}
 
 
 def transfer_of(

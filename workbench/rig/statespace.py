@@ -1,6 +1,6 @@
 """Modes with actuators and sensors as python-control's `StateSpace`."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import control
 import numpy as np
@@ -68,8 +68,20 @@ def state_space(modes: Modes, actuators: Sequence[Actuator], sensors: Sequence[S
     a, bb, c, d, states = _with_actuator_lags(a, bb, c, d, states, actuators)
     a, bb, c, d, states = _with_sensor_lags(a, bb, c, d, states, sensors)
     return control.ss(
-        a, bb, c, d, inputs=[x.name for x in actuators], outputs=[y.name for y in sensors], states=states, name="rig"
+        a,
+        bb,
+        c,
+        d,
+        inputs=signal_names(x.name for x in actuators),
+        outputs=signal_names(y.name for y in sensors),
+        states=signal_names(states),
+        name="rig",
     )
+
+
+def signal_names(names: Iterable[str]) -> list[str]:
+    """Names of signals as python-control allows them: a point, which it keeps for subsystems, becomes a line below."""
+    return [name.replace(".", "_") for name in names]
 
 
 def _with_actuator_lags(

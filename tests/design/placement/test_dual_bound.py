@@ -66,6 +66,23 @@ def test_no_placement_that_keeps_the_limit_is_below_the_bound(task):
     assert counts["informative"] > 20 and counts["refused"] > 20 and counts["kept"] > 100
 
 
+def test_a_cell_where_b_is_singular_to_round_off_is_refused(task):
+    """Actuators beside a support, in intervals too short to halve: they need a thousand times the effort allowed."""
+    table, level = Intervals.of(task), 12
+    cell = (np.array([0.9376, 0.9581, 0.9786, 0.9991]) * 2**level).astype(int) + 2**level - 1
+    at = batch_costs(task, task.shapes(table.centre[cell][None]))
+    assert not at.effort[0] < 1000.0
+    assert np.isinf(bound_of(task, table, cell, table.half[cell], 1.0))
+
+
+@pytest.mark.slow
+def test_a_proof_closes_where_actuators_may_stand_beside_a_support(hinged_modes):
+    four = placement_task(hinged_modes(10), 4, impulse_at=4.1, weight=0.2)
+    even = four.placed(10.0 * np.arange(1, 5) / 5, "")
+    proof = certify(four, Limits(effort=even.effort, spacing=0.2), gap=0.05, most_cells=1_000_000, seconds=7200.0)
+    assert proof.complete and proof.better is None
+
+
 @pytest.mark.slow
 def test_six_actuators_have_a_bound_above_zero(hinged_modes):
     """After two million cells; by Neumann's series alone six million leave it at zero."""

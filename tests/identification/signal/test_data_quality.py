@@ -97,3 +97,9 @@ def test_measured_arm_ails_in_nothing():
     for path in sorted(ARM.glob("*.txt")):
         table = np.loadtxt(path)
         assert data_faults(Record(0.002, table[:, -1][None], (Channel("a"),))) == ()
+
+
+def test_a_record_given_twice_is_refused(sound):
+    """Its errors would be too small by the root of two."""
+    with pytest.raises(ValueError, match="'one' and 'again' hold the same measurement"):
+        identify([replace(sound, name="one"), replace(sound, name="again")])

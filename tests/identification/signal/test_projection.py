@@ -10,7 +10,7 @@ from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.signal import projection
-from workbench.identification.signal.projection import differ, power_sums, project, variances
+from workbench.identification.signal.projection import _project_by_parts, differ, power_sums, project, variances
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -169,3 +169,10 @@ def test_driven_records_count_by_their_noise():
     # The noisy record can add a hundredth to what the quiet one tells, and must not take from it.
     alone = identify_driven(pair[1])
     assert (found.omega_std < 1.02 * alone.omega_std).all() and (found.zeta_std < 1.02 * alone.zeta_std).all()
+
+
+def test_exponentials_that_round_off_makes_alike_are_refused():
+    """One that hardly oscillates within the record is, with its slope, all but a multiple of itself."""
+    record = Record(0.002, np.random.default_rng(0).standard_normal((1, 9000)), (Channel("a"),))
+    with pytest.raises(np.linalg.LinAlgError):
+        _project_by_parts(record, np.array([0.0146 + 1e-5j, -0.8 + 1.7j]), True)

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from workbench.design.estimation.controller import Controller
+from workbench.rig.statespace import signal_names
 from workbench.structure.modes import frozen
 
 ONSET = 0.01  # of a dead zone: the v over which its inverse sets in, so that it does not jump at zero
@@ -152,7 +153,13 @@ class DigitalController:
             raise ValueError(f"{self.name} switches, so it has no StateSpace; simulate it instead")
         a, b = self.a + self.e @ self.c, (self.b + self.e @ self.d) * self.scale
         return control.ss(
-            a, b, self.c, self.d * self.scale, self.sample_time, inputs=list(self.sensors), outputs=list(self.actuators)
+            a,
+            b,
+            self.c,
+            self.d * self.scale,
+            self.sample_time,
+            inputs=signal_names(self.sensors),
+            outputs=signal_names(self.actuators),
         )
 
 

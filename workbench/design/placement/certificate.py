@@ -124,7 +124,7 @@ def certify(
         found = least.positions if least.residual_work < best.residual_work * (1.0 - gap) else None
         bound = min(least.residual_work, best.residual_work)
         return Certificate(best, bound, tried, True, found, seconds=time.monotonic() - began)
-    return _Search(task, limits, best, gap).run(began, seconds, most_cells, progress)
+    return _Search(task, limits, best, gap).run(seconds, most_cells, progress)
 
 
 class _Search:
@@ -140,11 +140,13 @@ class _Search:
         self._stuck_cell: np.ndarray | None = None
         self.cells = 0
 
-    def run(self, began: float, seconds: float, most_cells: int, progress: Progress | None) -> Certificate:
+    def run(self, seconds: float, most_cells: int, progress: Progress | None) -> Certificate:
         n = self._task.n_controlled
         level = range(2**START_LEVEL - 1, 2 ** (START_LEVEL + 1) - 1)
         cells = np.array(list(combinations_with_replacement(level, n)), np.int64).reshape(-1, n)
         workers = min(os.cpu_count() or 1, 8)
+        self._bounds(cells[:1])  # compiles them, the first time on a machine: half a minute that is no search
+        began = time.monotonic()
         with ThreadPoolExecutor(workers) as pool:
             while len(cells):
                 better = self._shelve(self._kept(cells), pool, workers)

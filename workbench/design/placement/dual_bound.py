@@ -129,7 +129,10 @@ def dual_bound(
             ends[n + j, k] = h[j] * shapes[1][j, k]
     c, residual = np.ascontiguousarray(ends[:, :n]), np.ascontiguousarray(ends[:, n:])
     gram, d = c.T @ c, np.empty((n, n))
-    if not inverse_of(gram.copy(), d, singular * np.abs(gram).max()):
+    pivot = singular * np.abs(gram).max()
+    exact = inverse_of(gram.copy(), d, pivot)
+    # any D refuses a cell: where D⁻¹ is singular to round-off, as beside a support, a ridge makes one
+    if not exact and not inverse_of(gram + 2.0 * pivot * np.eye(n), d, pivot):
         return -np.inf
     least = d @ square
     both = np.zeros((n_modes, n))
@@ -138,6 +141,8 @@ def dual_bound(
         both[:n] = -least
         if t > limit * _rest_of(h, shapes, both, root, score):
             return np.inf
+    if not exact:
+        return -np.inf
     left = np.sqrt(max(limit**2 - t, BARELY * limit**2))
     forces, other = c @ d, root.T @ root
     of_forces = transforms.transpose(0, 2, 1)

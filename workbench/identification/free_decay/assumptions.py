@@ -109,7 +109,7 @@ def _segments(
         if there.size == 0 or last - first < 4 * (there.size + 1):
             continue
         try:
-            stretch = record.between(record.time[first], record.time[last - 1])
+            stretch = record.between(*(record.start_time + record.sample_time * np.array([first, last - 1])))
             found = in_coloured_noise(refine(stretch, modes.select(list(there)), offset=True), stretch)
         except np.linalg.LinAlgError:
             continue

@@ -134,9 +134,9 @@ class _Search:
 
     def peaks(self) -> np.ndarray:
         """Candidates that stand out of the residual, strongest first."""
-        strengths = [self._strengths(rate) for rate in self.rates]
-        self.fine = strengths[0]
-        found = [self._peaks(rate, each) for rate, each in zip(self.rates, strengths, strict=True)]
+        self.fine = self._strengths(self.rates[0])
+        found = [self._peaks(self.rates[0], self.fine)]
+        found += [self._peaks(rate, self._strengths(rate)) for rate in self.rates[1:]]
         height, poles = np.concatenate([h for h, _ in found]), np.concatenate([p for _, p in found])
         taken, heights = np.zeros(0, complex), np.zeros(0)
         for r in np.argsort(-height):
@@ -212,17 +212,21 @@ class _Search:
         found = np.zeros(size // 2 + 1, np.float32)
         for fit, weights in zip(self.fits, self.weights, strict=True):
             n = min(lives, len(fit.residual))
-            # In single precision, and in place, as these fill the memory.
-            decay = np.exp(-rate * self.dt * np.arange(n, dtype=np.float32))
             energy = np.expm1(-2.0 * rate * self.dt * n) / np.expm1(-2.0 * rate * self.dt)
             scale = (np.sqrt(2.0 / energy) * weights).astype(np.float32)
             for first in range(0, weights.size, LONG.at_once):
                 some = slice(first, first + LONG.at_once)
+                # In single precision, and in place, as these fill the memory.
                 left = np.zeros((scale[some].size, size), np.float32)
+                decay = np.arange(n, dtype=np.float32)
+                decay *= -rate * self.dt
+                np.exp(decay, out=decay)
                 left[:, :n] = fit.residual[:n, some].T
                 left[:, :n] *= scale[some, None]
                 left[:, :n] *= decay
+                del decay
                 spectrum = rfft(left, axis=1, workers=os.cpu_count())
+                del left
                 forget_transforms(n)
                 found += np.einsum("jk,jk->k", spectrum.real, spectrum.real)
                 found += np.einsum("jk,jk->k", spectrum.imag, spectrum.imag)

@@ -89,7 +89,7 @@ def decay_start(record: Record) -> float:
         known = ((starts >= broken[:, None]) & (starts <= broken[:, None] + 2 * window.size)).any(axis=1)
         starts = np.r_[starts, broken[~known] + window.size // 2 + 1]
         step *= START.coarser
-    return float(record.time[min(starts.max(), n - 1)])
+    return float(record.start_time + record.sample_time * min(starts.max(), n - 1))
 
 
 def _scaled(record: Record) -> tuple[np.ndarray, float]:

@@ -71,7 +71,7 @@ def check_data_quality(record: Record) -> None:
 
 
 def check_same_sensors(records: Sequence[Record]) -> None:
-    """Refuse no records, or records that differ in outputs or sample time."""
+    """Refuse no records, records that differ in outputs or sample time, and one that is given twice."""
     if not records:
         raise ValueError("identification needs at least one record")
     first = records[0]
@@ -86,6 +86,14 @@ def check_same_sensors(records: Sequence[Record]) -> None:
                 f"records {first.name!r} and {other.name!r} are sampled every {first.sample_time:g} s and"
                 f" {other.sample_time:g} s; resample one of them"
             )
+    for i, record in enumerate(records):
+        for other in records[:i]:
+            alike = other.input_names == record.input_names and np.array_equal(other.outputs, record.outputs)
+            if alike and np.array_equal(other.inputs, record.inputs):
+                raise ValueError(
+                    f"records {other.name!r} and {record.name!r} hold the same measurement, which would count twice:"
+                    " give it once"
+                )
 
 
 def _dead(record: Record) -> Iterator[DataFault]:

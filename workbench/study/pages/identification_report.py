@@ -140,7 +140,7 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
         **_content(records[0].output_channels, found),
-        "inputs": found.state_space.input_labels,
+        "inputs": [channel.name for channel in found.input_channels],
         "delays": found.delays,
         "state_space": {"A": a, "B": b, "C": c, "D": d},
         "noise_std": found.noise_std,

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.signal import find_peaks, welch
+from scipy.signal import find_peaks
 
 from workbench.draw.plot import plot
-from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
+from workbench.draw.spectra import SEGMENTS, plot_frf, plot_spectra, plot_transfer, power_spectrum
 from workbench.identification.free_decay.preparation import decay_start
 from workbench.identification.signal.data_quality import data_faults
 from workbench.records.record import Channel, Record
@@ -22,10 +22,8 @@ HEADINGS = ("channel", "quantity", "smallest", "largest", "mean", "rms", "strong
 FORCES = re.compile(r"force|hammer|shaker|impulse|excit|input|drive|(^|[^a-z])[fu]\d*$", re.IGNORECASE)
 DECAYED = 0.1  # rms of the last tenth over the largest of any tenth, below which a record is a free decay
 FALLING = 6  # tenths, each quieter than the one before: by chance in one stationary record of 720
-LINES = 4096  # samples of a segment of the spectrum
 PEAKS = 4  # shown of each channel
 PROMINENT, SURROUNDINGS = 20.0, 8  # a peak's power over the median of its surroundings; these as a part of the lines
-SEGMENTS = 4  # of the record at least, so that single lines of noise are no peaks
 MOST_ROWS = 100  # of the table
 
 
@@ -131,11 +129,10 @@ def _transfer(measured: TransferFunctions, path: Path) -> Look:
 def _row(channel: Channel, row: np.ndarray, rate_hz: float) -> tuple[str, ...]:
     quantity = channel.quantity or "not stated"
     quantity += f" [{channel.unit}]" if channel.unit else ""
-    about = row - row.mean()
-    numbers = (f"{value:.4g}" for value in (row.min(), row.max(), row.mean(), np.sqrt((about**2).mean())))
+    numbers = (f"{value:.4g}" for value in (row.min(), row.max(), row.mean(), row.std()))
     if row.size < 16 * SEGMENTS:
         return channel.name, quantity, *numbers, ""
-    lines, power = welch(about, rate_hz, nperseg=min(LINES, row.size // SEGMENTS))
+    lines, power = power_spectrum(row, rate_hz)
     return channel.name, quantity, *numbers, ", ".join(f"{f:.4g}" for f in _strongest(lines, power))
 
 
