@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,14 +41,16 @@ from workbench.rig.stepping import (
     FRICTION,
     LINEAR_DAMPER,
     LINEAR_SPRING,
+    N_PARAMETERS,
     ONE_SIDED,
     POWER_DAMPER,
     POWER_SPRING,
     USER,
+    address_of,
     hysteresis,
-    make_stepper,
     ramped,
     step_record,
+    stepper_with_laws,
 )
 from workbench.structure.domain import Between, Patch, PlaceError
 
@@ -438,10 +440,13 @@ def _step(
             participation = np.column_stack([participation, modes.phi_at(element.at)])
     driven = starts.any(axis=1) | ends.any(axis=1)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
-    parameters = np.zeros((len(points), 3))
+    of_the_users_own = any(isinstance(e, UserLaw) for e in points)
+    parameters = np.zeros((len(points), N_PARAMETERS + of_the_users_own))
     for row, element in zip(parameters, points, strict=True):
         values = LAWS[type(element)][1](element)
         row[: len(values)] = values
+        if isinstance(element, UserLaw):
+            row[-1] = address_of(element.law)
     # one type and one layout of every argument: the stepper is compiled anew for any other
     stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
     drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
@@ -450,7 +455,8 @@ def _step(
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
-    _stepper(tuple(e.law for e in points if isinstance(e, UserLaw)))(
+    step: Callable[..., None] = stepper_with_laws() if of_the_users_own else step_record
+    step(
         modes.omega,
         diagonal,
         coupling,
@@ -489,15 +495,6 @@ def _left_to_motion(
     if here.size and at_samples.size:
         known[here] -= reading[here] @ (participation @ at_samples)
     return known
-
-
-@cache
-def _stepper(laws: tuple[Callable[[float, float, Floats], float], ...]) -> Callable[..., None]:
-    if not laws:
-        return step_record
-    if len(set(laws)) > 1:
-        raise ValueError("a rig carries one law of the user's own at a time; got several")
-    return make_stepper(laws[0])
 
 
 def along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:
