@@ -5,13 +5,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.deadline import Deadline
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
-from workbench.gap.prediction.deadline import Deadline
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import Budget, budget_of, mean_square, power_in, power_of_inputs
 from workbench.gap.report.experiment import Experiment, next_experiment
