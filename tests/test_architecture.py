@@ -9,6 +9,7 @@ import workbench
 ROOT = Path(workbench.__file__).parent
 FLOORS = {
     "arrays": -1,
+    "deadline": -1,
     "threads": -1,
     "structure": 0,
     "records": 1,

@@ -23,14 +23,20 @@ def test_identified_modes_have_a_figure_of_their_shapes():
 
 
 ON = {"left": "clamped", "right": "free", "bottom": "free", "top": "free"}
-PLATE = wb.Plate(length=(0.6, 0.4), mass_per_area=8.0, bending_stiffness=170.0, poisson_ratio=0.3, edges=ON).modes(3)
+PLATE = wb.Plate(length=(0.6, 0.4), mass_per_area=8.0, bending_stiffness=170.0, poisson_ratio=0.3, edges=ON)
 BEAM = wb.Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="clamped", right="free").modes(3)
 POINTS = wb.NamedPoints(("S1", "S2", "S3"), np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3]]), ("x",) * 3)
 FRAME = wb.FiniteElements(np.eye(3), np.array([[2.0, -1, 0], [-1, 2, -1], [0, -1, 1]]), nodes=POINTS).modes(3)
 
 
-@pytest.mark.parametrize("modes", [BEAM, PLATE, FRAME], ids=["beam", "plate", "frame"])
-def test_what_is_known_on_any_domain_has_a_figure(modes):
+@pytest.fixture(scope="module")
+def plate():
+    return PLATE.modes(3, tolerance=1e-3)
+
+
+@pytest.mark.parametrize("modes", [BEAM, None, FRAME], ids=["beam", "plate", "frame"])
+def test_what_is_known_on_any_domain_has_a_figure(modes, plate):
+    modes = plate if modes is None else modes
     places = list(modes.domain.grid(4))
     sampled = wb.SampledModes(modes.omega, np.zeros(3), modes.phi(places), place_array(places))
     assert listed(sampled.positions) == places
@@ -41,10 +47,10 @@ def test_what_is_known_on_any_domain_has_a_figure(modes):
         assert any(ax.has_data() for ax in figure.axes)
 
 
-def test_the_bands_of_a_plate_are_drawn_where_they_are_wide():
-    at = np.array(PLATE.domain.grid(8))
+def test_the_bands_of_a_plate_are_drawn_where_they_are_wide(plate):
+    at = np.array(plate.domain.grid(8))
     std = np.outer(at[:, 0] / 0.6, [0.1, 0.2, 0.3])
-    bands = Bands(at, PLATE.phi(at), std, 0.5 * std, np.full(3, 3.0), 0.95)
+    bands = Bands(at, plate.phi(at), std, 0.5 * std, np.full(3, 3.0), 0.95)
     figure = plot(bands)
     below = [ax for ax in figure.axes if ax.has_data()][3:6]
     for r, ax in enumerate(below):

@@ -74,12 +74,12 @@ def test_noise_told_in_any_unit_counts_between_lines_alone():
 def test_errors_grow_where_what_is_left_is_louder():
     """Noise ten times as loud about mode 3: by the bound of even noise its squared scores would average near 6."""
     modes, h, channels = beam("acceleration")
-    h, scores = h[:, :1], []
+    h, lines, scores = h[:, :1, ::2], F[::2], []
     for seed in range(4):
         rng = np.random.default_rng(seed)
-        std = 0.002 * np.abs(h).mean() * np.where(np.abs(F - 9.8) < 2.0, 10.0, 1.0)
+        std = 0.002 * np.abs(h).mean() * np.where(np.abs(lines - 9.8) < 2.0, 10.0, 1.0)
         measured = h + std * (rng.standard_normal(h.shape) + 1j * rng.standard_normal(h.shape))
-        found = identify_transfer(measured, F, channels=channels, most_modes=4)
+        found = identify_transfer(measured, lines, channels=channels, most_modes=4)
         r = int(np.argmin(np.abs(found.modes.omega - modes.omega[2])))
         scores.append((found.modes.omega[r] - modes.omega[2]) / found.omega_std[r])
         scores.append((found.modes.zeta[r] - 0.01) / found.zeta_std[r])

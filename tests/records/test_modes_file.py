@@ -171,6 +171,7 @@ def test_shapes_that_are_stated_as_mass_normalised_and_are_not_are_refused_with_
         (arrays(frequencies_hz=np.ones(3)), r"with 3 modes; it is \(2, 2\)"),
         (arrays(names=np.array(["a"])), "2 rows of shapes need as many points; it names 1"),
         (arrays(names=np.array(["a", "a"])), "'a' twice"),
+        (arrays(omega=np.ones(2)), "holds both `frequencies_hz` and `omega`"),
         (arrays(mass=np.eye(2)), "an array 'mass' is not known; name it mass_matrix or modal_mass"),
         (arrays(modal_masses=np.ones(2)), "an array 'modal_masses' is not known; name it modal_mass if it is that"),
         (arrays(mass_matrix=np.eye(3)), r"mass matrix of 2 points must be finite, \(2, 2\); it is \(3, 3\)"),

@@ -222,6 +222,13 @@ def test_elements_at_one_place_do_what_one_of_their_strength_does(law, parts):
     np.testing.assert_allclose(several, one, atol=1e-8 * np.abs(one).max())
 
 
+def test_laws_of_the_users_own_act_beside_each_other():
+    known = (CubicSpring(4.0, 0.3), LinearDamper(2.7, 0.2))
+    own = (UserLaw(4.0, lambda w, v, p: -p[0] * w**3, (0.3,)), UserLaw(2.7, lambda w, v, p: -p[0] * v, (0.2,)))
+    one, other = (simulate(rig(elements), drive(), sample_time=DT).outputs for elements in (known, own))
+    np.testing.assert_allclose(other, one, atol=1e-8 * np.abs(one).max())
+
+
 def test_accelerations_where_damping_couples_the_modes_and_a_law_is_not_linear():
     damped = rig((CubicSpring(4.0, 50.0),), modes=beam(attachments=(PointDamper(3.0, 0.2),)).modes(6))
     beside = rig((CubicSpring(4.0, 50.0), LinearDamper(3.0, 0.2)))

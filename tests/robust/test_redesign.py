@@ -412,10 +412,15 @@ def test_more_gain_wins_back_nearly_all_that_a_limit_leaves_to_be_won(rig):
     assert found.proof.stable.all()
 
 
+@pytest.fixture(scope="module")
+def hidden_plant():
+    return find_trial_with_plant(np.random.default_rng([20301, 20]), dirt="clean", size=0.5)
+
+
 @pytest.mark.parametrize(("kind", "vibrates", "near"), [("imsc", 0.3, 1.0), ("poles", 0.6, 1.02)])
-def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(kind, vibrates, near):
+def test_a_limit_is_made_up_for_where_residual_modes_fill_the_readings(hidden_plant, kind, vibrates, near):
     """On a hidden plant: 97 % of the vibration is of modes that are not controlled, and the commands follow them."""
-    case, _, real = find_trial_with_plant(np.random.default_rng([20301, 20]), dirt="clean", size=0.5)
+    case, _, real = hidden_plant
     rig, controlled = case.rig, range(2)
     level = np.max([np.abs(r.outputs).max(axis=1) for r in case.fit], axis=0)
     test = impulse_test(rig, controlled, case.fit[0].sample_time, level=level, seed=20)

@@ -5,6 +5,7 @@ import importlib.util
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -43,6 +44,8 @@ def function(x, power=2):
 def loaded(tmp_path, source, name="mine", registered=True):
     path = tmp_path / f"{name}.py"
     path.write_text(source)
+    # bytecode of a source of the same size and second would be taken for its own
+    Path(importlib.util.cache_from_source(path)).unlink(missing_ok=True)
     spec = importlib.util.spec_from_file_location(name, path)
     module = importlib.util.module_from_spec(spec)
     if registered:

@@ -46,8 +46,8 @@ def test_a_verdict_makes_a_page(tmp_path):
     shown = page_content_in(written(tmp_path, VERDICT))
     assert shown.title == "Diagnosis of arm" and shown.lead == "A spring explains it."
     assert shown.lines == ["a note", "Strike it."]
-    assert shown.tables[0][2] == [["ground spring", "stiffness", "2.00", "0.10", 3.0]] and shown.standing == "good"
-    assert shown.tables[1][2] == [["r", 0.5, 0.02, 0.01]]
+    assert shown.tables[0][2] == [["ground spring", "stiffness", "2.00", "0.10", 3.0, ""]] and shown.standing == "good"
+    assert shown.tables[1][2] == [["r", 0.5, 0.02, 0.01, ""]]
     boxes = [mark["boxes"][0][3] for mark in shown.blocks[0]["figure"]["panels"][0]["marks"]]
     assert boxes == [0.5, 0.02, 0.01]
 

@@ -24,7 +24,7 @@ from workbench.trials.make import KINDS, OUTSIDE_KINDS, draw_kinds, make_trial, 
 from workbench.trials.scoring import score, tally
 
 QUICK = (
-    (11, ("clearance",)),  # on a beam
+    (6, ("clearance",)),  # on a beam
     (3, ("stiffness_drift", "sensor_gain")),  # on a rod, whose motion takes fewer steps
     (3, ()),
 )
@@ -173,7 +173,7 @@ def test_of_sixty_forty_hide_one_ten_a_pair_five_none_five_something_else():
 def test_labels_lie_outside_the_cases(tmp_path):
     with pytest.raises(ValueError, match="seal them elsewhere"):
         write_trials(tmp_path / "cases", tmp_path / "cases" / "labels.json", 1, 1)
-    write_trials(tmp_path / "cases", tmp_path / "labels.json", 2, 1, kinds=[(), ("sensor_gain",)])
+    write_trials(tmp_path / "cases", tmp_path / "labels.json", 2, 7, kinds=[(), ("sensor_gain",)])
     labels = json.loads((tmp_path / "labels.json").read_text(encoding="utf-8"))
     assert [e["kind"] for e in labels["case-002"]["effects"]] == ["sensor_gain"]
     for folder in (tmp_path / "cases").iterdir():

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from workbench.draw.style import COLOURS, GREY, new_figure
+from workbench.structure.printed import counted
 from workbench.trials.scoring import Reliability, Tally
 
 _FAMILY = {
@@ -84,7 +85,7 @@ def plot_reliability(points: Sequence[Reliability]) -> Figure:
     ax.errorbar(x, y, bars, fmt="o", color=COLOURS[0], capsize=3, label="± 2 standard deviations")
     for point in points:
         beside = (8, 4) if point.probability < 0.7 else (-60, -12)
-        count = f"{point.claims} claim{'s' * (point.claims != 1)}"
+        count = counted(point.claims, "claim")
         ax.annotate(count, (point.probability, point.right), beside, textcoords="offset points")
     ax.set(xlim=(-0.03, 1.03), ylim=(-0.03, 1.03), aspect="equal", xlabel="stated probability", ylabel="share right")
     ax.legend(loc="lower right", fontsize=8)

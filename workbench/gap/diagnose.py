@@ -5,19 +5,26 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.deadline import Deadline
 from workbench.gap.effects.beyond import any_beyond
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
-from workbench.gap.prediction.deadline import Deadline
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.report.budget import Budget, budget_of, mean_square, power_in, power_of_inputs
+from workbench.gap.report.budget import (
+    Budget,
+    Shrinkage,
+    budget_of,
+    mean_square,
+    measure,
+    power_in,
+    power_of_inputs,
+)
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.record_to_record import with_held_out
-from workbench.gap.report.shrinkage import Shrinkage, measure
 from workbench.gap.report.verdict import Verdict
 from workbench.gap.report.wiring import check_kept_apart, wiring
 from workbench.gap.search.attribute import Attribution, attribute, baseline

@@ -48,8 +48,8 @@ def read_modes(
     Raises:
         RecordFileError: naming the file and what would be right: no modal mass, or another one than the mass matrix
             gives, modes that are not orthogonal, shapes and frequencies that do not fit one another, complex shapes,
-            numbers that are not finite, damping in per cent, an array that is named nearly like a modal mass or a mass
-            matrix.
+            numbers that are not finite, damping in per cent, frequencies twice, an array that is named nearly like a
+            modal mass or a mass matrix.
     """
     path = Path(path)
     ending = path.suffix.lower()
@@ -89,6 +89,8 @@ def _modes_of(path: Path, arrays: Mapping[str, np.ndarray]) -> Modes:
             f"{path} needs `shapes` (n_points, n_modes) and `frequencies_hz` or `omega`; it holds"
             f" {', '.join(sorted(arrays)) or 'nothing'}"
         )
+    if {"frequencies_hz", "omega"} <= set(arrays):
+        raise RecordFileError(f"{path} holds both `frequencies_hz` and `omega`; leave one of them out")
     given = "omega" if "omega" in arrays else "frequencies_hz"
     frequencies = np.ravel(arrays[given]).astype(float)
     if not (np.isfinite(frequencies) & (frequencies >= 0)).all():

@@ -4,7 +4,9 @@ A force is positive in the direction of positive displacement w; v is the veloci
 or `Between` two: w is then the displacement of the first less that of the second, and the force on that is opposite.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from workbench.structure.domain import Where
 from workbench.structure.supports import AtPlace
@@ -115,7 +117,7 @@ class UserLaw(AtPlace):
     """
 
     at: Where
-    law: object
+    law: Callable[[float, float, Any], float]
     parameters: tuple[float, ...] = ()
 
 

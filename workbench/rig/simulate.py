@@ -1,8 +1,8 @@
 """Simulation of a rig from rest: exact where it is linear, stepped with exact modes where it is not."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -41,14 +41,16 @@ from workbench.rig.stepping import (
     FRICTION,
     LINEAR_DAMPER,
     LINEAR_SPRING,
+    N_PARAMETERS,
     ONE_SIDED,
     POWER_DAMPER,
     POWER_SPRING,
     USER,
+    address_of,
     hysteresis,
-    make_stepper,
     ramped,
     step_record,
+    stepper_with_laws,
 )
 from workbench.structure.domain import Between, Patch, PlaceError
 
@@ -422,10 +424,6 @@ def _step(
         Participations (n_modes, n_forces) of all other forces, and these at the sample instants (n_forces, n_samples).
     """
     modes = rig.modes
-    diagonal = np.diag(modes.damping).copy()
-    coupling = modes.damping - np.diag(diagonal)
-    if np.abs(coupling).max() == 0:
-        coupling = np.zeros((0, 0))
     n_samples = inputs.shape[1]
     on_substeps = _forces_on_substeps if input_hold == "zero" else _straight_forces_on_substeps
     starts, ends, at_samples = on_substeps(rig, inputs, sample_time, substeps)
@@ -438,21 +436,15 @@ def _step(
             participation = np.column_stack([participation, modes.phi_at(element.at)])
     driven = starts.any(axis=1) | ends.any(axis=1)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
-    parameters = np.zeros((len(points), 3))
-    for row, element in zip(parameters, points, strict=True):
-        values = LAWS[type(element)][1](element)
-        row[: len(values)] = values
-    # one type and one layout of every argument: the stepper is compiled anew for any other
-    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
-    drag = sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag))
-    drag_shapes, drag_weights = along(rig, 0) if drag else (np.zeros((0, modes.n_modes)), np.zeros(0))
     known, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
-    _stepper(tuple(e.law for e in points if isinstance(e, UserLaw)))(
+    step: Callable[..., None] = stepper_with_laws() if any(isinstance(e, UserLaw) for e in points) else step_record
+    damping, coupling, spread = structure_arrays(rig)
+    step(
         modes.omega,
-        diagonal,
+        damping,
         coupling,
         sample_time,
         substeps,
@@ -460,13 +452,8 @@ def _step(
         starts[driven],
         ends[driven],
         np.ascontiguousarray(participation[:, driven]),
-        stretch,
-        stretching_of(rig) if stretch else np.zeros((0, 0)),
-        np.ascontiguousarray(drag_shapes.T),
-        drag * drag_weights,
-        np.array([LAWS[type(e)][0] for e in points], dtype=np.int64),
-        np.array([modes.phi_at(e.at) for e in points]) if points else np.zeros((0, modes.n_modes)),
-        parameters,
+        *spread,
+        *law_arrays(rig, points),
         known,
         orders,
         reading,
@@ -491,13 +478,36 @@ def _left_to_motion(
     return known
 
 
-@cache
-def _stepper(laws: tuple[Callable[[float, float, Floats], float], ...]) -> Callable[..., None]:
-    if not laws:
-        return step_record
-    if len(set(laws)) > 1:
-        raise ValueError("a rig carries one law of the user's own at a time; got several")
-    return make_stepper(laws[0])
+def structure_arrays(rig: Rig) -> tuple[Floats, Floats, tuple[float, Floats, Floats, Floats]]:
+    """What acts all along, or couples the modes, as a stepper takes it: nothing is an array of no numbers.
+
+    One type and one layout of every argument: a stepper is compiled anew for any other.
+
+    Returns:
+        Damping (n_modes,) and its coupling of modes; and of what acts all along, the coefficient of stretching and
+        ∫ φ_r' φ_s' dx, shapes (n_modes, n_points) where the air drags, and the coefficient times each point's weight.
+    """
+    damping = np.diag(rig.modes.damping).copy()
+    coupling = rig.modes.damping - np.diag(damping)
+    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
+    drag = float(sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag)))
+    shapes, weights = along(rig, 0) if drag else (np.zeros((0, rig.modes.n_modes)), np.zeros(0))
+    stretching = np.ascontiguousarray(stretching_of(rig)) if stretch else np.zeros((0, 0))
+    coupling = np.ascontiguousarray(coupling) if coupling.any() else np.zeros((0, 0))
+    return damping, coupling, (stretch, stretching, np.ascontiguousarray(shapes.T), drag * weights)
+
+
+def law_arrays(rig: Rig, points: Sequence[PointElement]) -> tuple[Integers, Floats, Floats]:
+    """Kinds (n_elements,), shapes (n_elements, n_modes) and parameters of elements at points, a row each."""
+    of_the_users_own = any(isinstance(e, UserLaw) for e in points)
+    parameters = np.zeros((len(points), N_PARAMETERS + of_the_users_own))
+    for row, element in zip(parameters, points, strict=True):
+        values = LAWS[type(element)][1](element)
+        row[: len(values)] = values
+        if isinstance(element, UserLaw):
+            row[-1] = address_of(element.law)
+    shapes = np.array([rig.modes.phi_at(e.at) for e in points]).reshape(len(points), rig.modes.n_modes)
+    return np.array([LAWS[type(e)][0] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
 
 
 def along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:

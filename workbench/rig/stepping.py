@@ -8,15 +8,20 @@ which friction turns is taken in finer ones.
 
 import math
 from collections.abc import Callable
+from functools import cache
 from types import FunctionType
+from typing import Any
 
 import numpy as np
-from numba import njit
+from llvmlite import ir
+from numba import carray, cfunc, njit, types  # type: ignore[attr-defined]
+from numba.extending import intrinsic
 
 from workbench.arrays import Floats, Integers
 
 LINEAR_SPRING, LINEAR_DAMPER, CUBIC, POWER_SPRING, EVEN_SPRING, POWER_DAMPER = range(6)
 CLEARANCE, ONE_SIDED, FRICTION, BOUC_WEN, USER = range(6, 11)
+N_PARAMETERS = 3  # of a law, at most
 SETTLED = 1e-10  # of a force: what is left between it and its law
 FAST = {"reassoc", "contract", "nsz"}  # sums over the modes in any order
 # finer substeps of one in which friction turns: a force that all but jumps is far from straight over one. On a frame,
@@ -37,7 +42,7 @@ LANES = 8  # modes that are worked on at once; a number of them that is no multi
 
 @njit(cache=True, nogil=True)
 def user_law(w: float, v: float, p: Floats) -> float:
-    """Stands for the law of the user's own, until `make_stepper` puts one in its place."""
+    """Stands for the law of the user's own, until `stepper_with_laws` puts one in its place."""
     return 0.0
 
 
@@ -636,13 +641,52 @@ def step_record(
             advance(linear, finely, drives, elements, along, motion, points, work, kept)
 
 
-def make_stepper(law: Callable[[float, float, Floats], float]) -> Callable[..., None]:
-    """`step_record` with force(w, v, parameters) = `law` for the elements of kind USER, compiled for it."""
-    scope = dict(globals(), user_law=njit(nogil=True)(law))
+@intrinsic
+def _call(typing: Any, address: Any, w: Any, v: Any, p: Any) -> Any:
+    """Call the law(w, v, pointer to parameters) at an address."""
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        data = context.make_array(signature.args[3])(context, builder, values[3]).data
+        law = ir.FunctionType(ir.DoubleType(), [ir.DoubleType(), ir.DoubleType(), data.type])
+        return builder.call(builder.inttoptr(values[0], law.as_pointer()), [values[1], values[2], data])
+
+    return types.float64(types.int64, types.float64, types.float64, p), generate
+
+
+@njit(cache=True, nogil=True)
+def _law_at_address(w: float, v: float, p: Floats) -> float:
+    """The law whose address stands behind its parameters."""
+    force: float = _call(int(p[p.size - 1]), w, v, p)  # type: ignore[call-arg]
+    return force
+
+
+@cache
+def address_of(law: Callable[[float, float, Floats], float]) -> float:
+    """Where force(w, v, parameters) = `law` stands in the memory of this process, compiled."""
+    compiled = njit(nogil=True)(law)
+
+    def call(w: float, v: float, parameters: Any) -> float:
+        force: float = compiled(w, v, carray(parameters, (N_PARAMETERS,)))
+        return force
+
+    signature = types.float64(types.float64, types.float64, types.CPointer(types.float64))  # type: ignore[no-untyped-call]
+    _KEPT.append(cfunc(signature)(call))
+    return float(_KEPT[-1].address)  # below 2**53: a number holds it exactly
+
+
+_KEPT: list[Any] = []  # laws of the user's own live as long as this process
+
+
+@cache
+def stepper_with_laws() -> Callable[..., None]:
+    """`step_record` for elements of kind USER, whose rows of parameters end with the address of their law."""
+    scope = dict(globals(), user_law=_law_at_address)
     solvers = ("element_force", "solve_element", "solve_pair", "solve_in_turn")
     for name in (*solvers, "_advance_once", "advance", "step_record"):
         compiled = globals()[name]
         options = {key: value for key, value in compiled.targetoptions.items() if key != "nopython"}
-        scope[name] = njit(**options)(FunctionType(compiled.py_func.__code__, scope, name))
+        anew = FunctionType(compiled.py_func.__code__, scope, name)
+        anew.__qualname__ = f"{name}_with_laws"  # under which it is kept on disk
+        scope[name] = njit(cache=True, **options)(anew)
     stepper: Callable[..., None] = scope["step_record"]
     return stepper

@@ -104,7 +104,7 @@ class UncertainRig:
             seed: of the draws, or a generator.
 
         Raises:
-            ValueError: fewer than one, or hardly any draw is a rig that can be.
+            ValueError: fewer than one, no whole number of them, or hardly any draw is a rig that can be.
         """
         return tuple(rig for rig, _ in self.draws_with_effects(n, seed))
 
@@ -113,13 +113,13 @@ class UncertainRig:
         self, n: int, seed: int | np.random.Generator = 0
     ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
         """The same, each with the effects that make it."""
-        if n < 1:
-            raise ValueError(f"the uncertainty is sampled by 1 draw or more; got {n}")
+        if n != int(n) or n < 1:
+            raise ValueError(f"the uncertainty is sampled by a whole number of draws, 1 or more; got {n}")
         rng = np.random.default_rng(seed)
         sets = [self, *(rival for rival, _ in self.rivals)]
         shares = np.array([p for _, p in self.rivals])
         shares = np.r_[max(1.0 - shares.sum(), 0.0), shares]
-        chosen = rng.choice(len(sets), n, p=shares / shares.sum())
+        chosen = rng.choice(len(sets), int(n), p=shares / shares.sum())
         return tuple(sets[i]._drawn(rng) for i in chosen)
 
     def _drawn(self, rng: np.random.Generator) -> tuple[Rig, tuple[Effect, ...]]:

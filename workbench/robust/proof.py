@@ -147,8 +147,10 @@ def verify(
         centre: the rig whose margin is stated; the first where rigs are given.
 
     Raises:
-        ValueError: a controller or a test that does not fit the rig.
+        TypeError: no uncertain rig, no sampled controller or no test.
+        ValueError: a controller or a test that does not fit the rig, draws that are no whole number above zero.
     """
+    _check_kinds(possible, controller, test)
     if isinstance(possible, UncertainRig):
         rigs: Sequence[Rig] = drawn_with_errors(possible, draws, seed)
         centre = centre or possible.rig
@@ -193,6 +195,26 @@ def verify(
             energy=_band(found.energy),
             margin=margin,
             margin_frequency_hz=frequency,
+        )
+
+
+def _check_kinds(possible: object, controller: object, test: object) -> None:
+    """Refuse what no loop can be made of."""
+    drawn = isinstance(possible, Sequence) and len(possible) > 0 and all(isinstance(rig, Rig) for rig in possible)
+    if not (isinstance(possible, UncertainRig) or drawn):
+        raise TypeError(
+            f"a controller is verified on an UncertainRig, or on rigs drawn from it; got {type(possible).__name__}:"
+            " UncertainRig.of(verdict) is what a diagnosis leaves"
+        )
+    if not isinstance(controller, DigitalController):
+        raise TypeError(
+            f"what is verified is a sampled controller; got {type(controller).__name__}: make one of a law and an"
+            " estimator by sampled(kalman(...), sample_time)"
+        )
+    if not isinstance(test, LoopTest):
+        raise TypeError(
+            f"the third argument is the test that each loop is put through; got {type(test).__name__}: make one by"
+            " LoopTest(n_samples, sample_time, impulse_at=...), from workbench.design.loop.rig_loop"
         )
 
 

@@ -7,7 +7,7 @@ from workbench.structure.domain import Patch
 
 
 class Printed:
-    """A result with a line, headings, rows and remarks of its own."""
+    """A result with a line (empty for a table alone), headings, rows and remarks of its own."""
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         """The line that sums it up, headings, rows, and remarks below the table."""
@@ -15,10 +15,10 @@ class Printed:
 
     def __str__(self) -> str:
         line, headings, rows, remarks = self._printed()
-        table = [headings, *rows] if rows else []
+        table = [headings, *rows] if rows or not line else []
         widths = [max(len(row[k]) for row in table) for k in range(len(headings))] if table else []
         lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths)).rstrip() for row in table]
-        return "\n".join([line, *lines, *remarks])
+        return "\n".join([*([line] if line else []), *lines, *remarks])
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self._printed()[0]}>"
@@ -28,8 +28,8 @@ class Printed:
         head = "".join(f"<th>{escape(cell)}</th>" for cell in headings)
         body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
-        table = f"<table><tr>{head}</tr>{body}</table>" if rows else ""
-        return f"<p>{escape(line)}</p>{table}{below}"
+        table = f"<table><tr>{head}</tr>{body}</table>" if rows or not line else ""
+        return f"{f'<p>{escape(line)}</p>' if line else ''}{table}{below}"
 
 
 def counted(number: int, word: str) -> str:

@@ -12,12 +12,11 @@ from workbench.draw.beam import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.motion import mode_motion
 from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_poles
-from workbench.gap.effects.catalogue import in_words
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
 from workbench.study.catalogue import find_study, output_root
 from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
-from workbench.study.pages.verdict_page import STANDING_OF, case_inputs, moving_modes
+from workbench.study.pages.verdict_page import STANDING_OF, case_inputs, moving_modes, verdict_tables
 from workbench.study.runs.cases import StudyError
 
 TURN = 2.0 * np.pi
@@ -123,32 +122,13 @@ def _words(lines: list[str]) -> list[str]:
 def _verdict(content: dict[str, Any]) -> dict[str, Any]:
     """A verdict."""
     gap = {name: dict(values) for name, values in content["gap"].items()}
-    effects = [
-        [
-            effect["kind"].replace("_", " "),
-            name.replace("_", " "),
-            *to_its_error(value, effect.get("parameters_std", {}).get(name)),
-            effect.get("at", ""),
-        ]
-        for effect in [*content["effects"], *content.get("nearest", [])]
-        for name, value in effect["parameters"].items()
-    ]
-    rivals = [
-        [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
-    ]
-    gaps = [[record, *(gap[name].get(record) for name in ("before", "after", "floor"))] for record in gap["before"]]
-    tables = [
-        ("Effects", ("effect", "parameter", "value", "standard error", "x [m]"), effects),
-        ("Gap on held-out records", ("record", "before", "after", "floor"), gaps),
-        ("Rivals", ("set of effects", "probability"), rivals),
-    ]
     return {
         "title": f"Diagnosis of {content['case']}",
         "lead": _words([content["sentence"]])[0],
         "standing": STANDING_OF.get(content.get("outcome", ""), ""),
         "lines": _words([*content.get("notes", []), *filter(None, [content.get("next_experiment")])]),
-        "blocks": [block(plot_gaps(gap), "The gap before and after, over the noise floor.")] if gaps else [],
-        "tables": [table for table in tables if table[2]],
+        "blocks": [block(plot_gaps(gap), "The gap before and after, over the noise floor.")] if gap["before"] else [],
+        "tables": verdict_tables(content),
     }
 
 

@@ -1,7 +1,7 @@
 """Holding blind trials: make cases with sealed labels, diagnose them, score them."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,10 +9,9 @@ from typing import Any
 
 from joblib import Parallel, delayed
 
-from workbench.cases.case import Case, read_case
+from workbench.cases.case import read_case
 from workbench.gap.diagnose import SECONDS, diagnose
 from workbench.trials.make import write_trials
-from workbench.trials.rigs import MEMBERS
 from workbench.trials.scoring import Tally, score, score_dirty, tally
 
 
@@ -39,14 +38,10 @@ def hold_trials(
     n: int,
     seed: int,
     *,
-    like: Case | None = None,
-    structure: str = MEMBERS,
-    kinds: Sequence[Sequence[str]] | None = None,
-    dirt: str | None = None,
-    size: float | None = None,
     diagnose_case: Callable[[Path], dict[str, Any]] | None = None,
     jobs: int = 1,
     report: Callable[[str, float], None] = lambda text, share: None,
+    **hidden: Any,
 ) -> Trials:
     """Make n blind cases, diagnose each, and only then open the labels and score.
 
@@ -54,29 +49,14 @@ def hold_trials(
     that holds cases alone.
 
     Args:
-        like: the user's own case, whose nominal rig, levels, band and noise are taken; None draws benches.
-        structure: of benches that are drawn: "members" (beams and rods), "plates" or "frames".
-        kinds: what the cases hide, one entry a case; None draws them.
-        dirt: class of the small errors beside it, or "all"; see `write_trials`.
-        size: of these errors; None for each of three in turn.
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
         jobs: cases diagnosed at a time, each in a process of its own.
         report: called with (what, share done).
+        hidden: `like`, `structure`, `kinds`, `dirt` and `size` of `write_trials`: what the cases are, and hide.
     """
     with TemporaryDirectory() as cases, TemporaryDirectory() as vault:
         sealed = Path(vault) / "labels.json"
-        write_trials(
-            cases,
-            sealed,
-            n,
-            seed,
-            like=like,
-            structure=structure,
-            kinds=kinds,
-            dirt=dirt,
-            size=size,
-            report=lambda text, share: report(f"making {text}", 0.1 * share),
-        )
+        write_trials(cases, sealed, n, seed, report=lambda text, share: report(f"making {text}", 0.1 * share), **hidden)
         labels = json.loads(sealed.read_text(encoding="utf-8"))
         sealed.unlink()
         verdicts, scores, dirty = {}, {}, {}
@@ -89,7 +69,7 @@ def hold_trials(
             domain = read_case(folder).rig.modes.domain
             verdict, label = verdicts[folder.name], labels[folder.name]
             scores[folder.name] = score(verdict, label, domain=domain)
-            if dirt is not None:
+            if hidden.get("dirt") is not None:
                 dirty[folder.name] = score_dirty(verdict, label, domain=domain)
     return Trials(verdicts, labels, scores, dirty, tally(scores.values()))
 

@@ -24,7 +24,7 @@ from workbench.trials.scene import Scene, Unsuitable, extent
 NONE, UNKNOWN = "none", "unknown"
 KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
-MOST_BENCHES, MOST_DRAWS, SEEDS_TRIED = 40, 8, 20
+MOST_BENCHES, MOST_DRAWS, MOST_SEEDS = 40, 8, 100
 VISIBLE = 0.02
 SEEN = 0.03  # each effect of several must alter the response by this much beside the others
 DISTINCT = 0.1  # of the noise: what tells an effect from its limiting case must alter the readings by this much
@@ -54,38 +54,9 @@ class DirtyDraw(NamedTuple):
     kinds: tuple[str, ...]
 
 
-def make_trial(
-    seed: int,
-    *,
-    kinds: Sequence[str] = (),
-    like: Case | None = None,
-    structure: str = MEMBERS,
-    name: str = "case",
-    dirt: str = CLEAN,
-    size: float = 1.0,
-) -> tuple[Case, dict[str, Any]]:
-    """A case that hides effects of the given kinds, and its label in the words of the case format.
-
-    Args:
-        seed: the same seed makes the same case.
-        kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
-        like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
-        structure: of a bench that is drawn: "members" (beams and rods), "plates" or "frames".
-        name: of the case.
-        dirt: class of the small errors beside them, of `DIRT_CLASSES`.
-        size: of these errors, 1 for those of a careful laboratory.
-
-    Returns:
-        The case; {"title", "snr_db", "effects", "class", "size", "length", "budget", "records": {name: {"gap",
-        "noise_floor", "true_model"}}}: `true_model` is the gap that the exact model leaves, small errors and all;
-        the budget is of the validation records, as in the case format.
-
-    Raises:
-        ValueError: an unknown kind or class, or kinds that the bench cannot show.
-    """
-    case, label, _ = make_trial_with_plant(
-        seed, kinds=kinds, like=like, structure=structure, name=name, dirt=dirt, size=size
-    )
+def make_trial(seed: int, **how: Any) -> tuple[Case, dict[str, Any]]:
+    """The case and the label of `make_trial_with_plant`, with the same arguments."""
+    case, label, _ = make_trial_with_plant(seed, **how)
     return case, label
 
 
@@ -99,7 +70,25 @@ def make_trial_with_plant(
     dirt: str = CLEAN,
     size: float = 1.0,
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    """The same as `make_trial`, and the real structure, so that a controller can be tried on it."""
+    """A case that hides effects of the given kinds, its label in the words of the case format, and the real structure.
+
+    Args:
+        seed: the same seed makes the same case.
+        kinds: of `KINDS` or `OUTSIDE_KINDS`; none for a structure that is what it is taken for.
+        like: a case whose nominal rig, levels, band, noise and records are taken; None draws a bench.
+        structure: of a bench that is drawn: "members" (beams and rods), "plates" or "frames".
+        name: of the case.
+        dirt: class of the small errors beside them, of `DIRT_CLASSES`.
+        size: of these errors, 1 for those of a careful laboratory.
+
+    Returns:
+        The case; {"title", "snr_db", "effects", "class", "size", "length", "budget", "records": {name: {"gap",
+        "noise_floor", "true_model"}}}: `true_model` is the gap that the exact model leaves, small errors and all;
+        the budget is of the validation records, as in the case format; the structure, to try a controller on.
+
+    Raises:
+        ValueError: an unknown kind or class, or kinds that the bench cannot show.
+    """
     if dirt not in DIRT_CLASSES:
         raise ValueError(f"dirt {dirt!r} is none of {', '.join(DIRT_CLASSES)}")
     unknown = [kind for kind in kinds if kind not in DRAWS]
@@ -118,17 +107,6 @@ def make_trial_with_plant(
         except Unsuitable as error:
             reason = str(error)
     raise ValueError(f"no case with {' and '.join(kinds)} came about on this bench; the last draw: {reason}")
-
-
-def find_trial_with_plant(
-    rng: np.random.Generator, *, kinds: Sequence[str] = (), dirt: str = CLEAN, size: float = 1.0
-) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    """The first of `SEEDS_TRIED` seeds whose benches show the kinds, as `make_trial_with_plant` has it.
-
-    Raises:
-        ValueError: no bench of these seeds shows them.
-    """
-    return _first_possible(rng, SEEDS_TRIED, kinds, dirt=dirt, size=size)
 
 
 def _draw_effects(
@@ -418,20 +396,28 @@ def write_trials(
         name = f"case-{i + 1:03d}"
         pool = [k for k in KINDS if k not in MIMICS[draw.dirt] | NOT_ON[structure] | {"truncated_modes"}]
         how = {"like": like, "structure": structure, "name": name, "dirt": draw.dirt, "size": draw.size}
-        case, told[name], _ = _first_possible(np.random.default_rng([seed, i]), 100, draw.kinds, pool, **how)
+        case, told[name], _ = find_trial_with_plant(
+            np.random.default_rng([seed, i]), kinds=draw.kinds, others=pool, tries=MOST_SEEDS, **how
+        )
         write_case(case, folder / name)
         report(name, (i + 1) / n)
     labels.parent.mkdir(parents=True, exist_ok=True)
     labels.write_text(json.dumps(told, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
-def _first_possible(
-    rng: np.random.Generator, tries: int, kinds: Sequence[str], others: Sequence[str] = (), **how: Any
+def find_trial_with_plant(
+    rng: np.random.Generator, *, kinds: Sequence[str] = (), others: Sequence[str] = (), tries: int = 20, **how: Any
 ) -> tuple[Case, dict[str, Any], SolvedPlant]:
-    """The first of some seeds that makes a trial of the kinds; after one that does not, of kinds among the others.
+    """The first of some seeds whose bench shows the kinds; after one that does not, of kinds among the others if any.
+
+    Args:
+        rng: of the seeds.
+        kinds, how: as `make_trial_with_plant` takes them.
+        others: kinds that take their place.
+        tries: seeds.
 
     Raises:
-        ValueError: none of these seeds makes one.
+        ValueError: none of these seeds makes a trial.
     """
     for _ in range(tries):
         case_seed = int(rng.integers(2**31))

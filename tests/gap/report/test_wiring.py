@@ -10,7 +10,7 @@ from workbench.gap.report.wiring import WiringFault, check_kept_apart, mended, w
 from workbench.structure.damping import ModalDamping
 from workbench.trials.make import make_trial
 
-SEED = 4  # three actuators and a hammer, accelerometers and a velocity sensor
+SEED = 899  # three actuators and a hammer, accelerometers and a velocity sensor, on a beam of slow modes
 
 
 @pytest.fixture(scope="module")
@@ -183,7 +183,7 @@ def test_a_gain_that_is_near_a_unit_and_differs_beyond_its_error_is_said_and_not
 
 
 def test_an_input_with_a_gain_near_a_unit_is_not_mended_beside_a_turned_sign_that_is(case):
-    matrix = diagonal(4, 3, 9.80665 * 1.02) @ diagonal(4, 1, -1.0)
+    matrix = diagonal(4, 0, 9.80665 * 1.02) @ diagonal(4, 1, -1.0)
     faults = wiring(case.rig, change(case.fit, inputs=np.linalg.inv(matrix)))
     assert [(fault.kind, fault.certain) for fault in faults] == [("sign", True), ("unit", False)]
     assert "the gain is +2 % from that factor" in faults[1].sentence

@@ -13,7 +13,7 @@ from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.random_force import tonal
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import force_filter, sampled_model, whiten
-from workbench.gap.report.shrinkage import Shrinkage
+from workbench.gap.report.budget import Shrinkage
 from workbench.gap.search.fit import cost_of, fit, slopes
 from workbench.rig.elements import CubicSpring, PeriodicForce
 from workbench.rig.simulate import simulate

@@ -43,7 +43,7 @@ def off(rig: Rig) -> Rig:
 def measured(record_of):
     def make(real, name, level, seed):
         rng = np.random.default_rng(seed)
-        return record_of(real, np.repeat(level * rng.normal(size=200), 5)[None], rng, name=name, substeps=8)
+        return record_of(real, np.repeat(level * rng.normal(size=120), 5)[None], rng, name=name, substeps=8)
 
     return make
 

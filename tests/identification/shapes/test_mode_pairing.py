@@ -51,7 +51,7 @@ def test_one_of_repeated_modes_is_paired_with_the_one_it_is():
     measured = SampledModes(modes.omega[some], np.zeros(4), turned(0.1)[:, some], PLACES)
     assert pair_modes(measured, modes).model.tolist() == some
     lost = np.where(np.arange(14)[:, None] == 3, np.nan, measured.shapes)
-    with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 3 has .*nan"):
+    with pytest.raises(ValueError, match=r"shapes must be finite; of mode 1 sensor 4 has .*nan"):
         pair_modes(SampledModes(measured.omega, measured.zeta, lost, PLACES), modes)
 
 
@@ -65,5 +65,5 @@ def test_modes_at_named_points_are_paired_with_those_of_a_model():
     pairing = pair_modes(measured, model)
     assert pairing.matched.tolist() == [1, 2, 0] and pairing.model.tolist() == [0, 1, 2]
     assert str(pairing).startswith("3 modes paired") and "none of the model" not in str(pairing)
-    with pytest.raises(ValueError, match=r"sensor 1 has no place.*give its channel `at`"):
+    with pytest.raises(ValueError, match=r"sensor 2 has no place.*give its channel `at`"):
         pair_modes(SampledModes(model.omega, np.zeros(3), shapes, place_array(["S3", None, "S2"])), model)

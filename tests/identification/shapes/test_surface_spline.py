@@ -123,7 +123,7 @@ def test_what_cannot_be_drawn_is_refused(plate):
     found = sampled(plate, places, np.random.default_rng(0))
     unknown = np.where(np.arange(20)[:, None] == 7, np.nan, places)
     for positions, words in (
-        (unknown, r"sensor 7 has no place; give its channel `at`, \(x, y\)"),
+        (unknown, "sensor 8 has no place; give its channel `at`"),
         (places[:, 0], r"take sensors with places \(x, y\)"),
         (place_array([f"P{i}" for i in range(20)]), r"take sensors with places \(x, y\)"),
     ):

@@ -137,7 +137,7 @@ def test_refusals():
     with pytest.raises(ValueError, match="5 different modes"):
         fit_structure(exact, nominal, mass=one, stiffness=one, known_mass=[(1.0, 1.8)], numbers=[1, 2, 3])
     unplaced = replace(exact, modes=replace(exact.modes, positions=np.r_[np.nan, SENSORS[1:]]))
-    with pytest.raises(ValueError, match="sensor 0 has no place"):
+    with pytest.raises(ValueError, match="sensor 1 has no place"):
         fit_structure(unplaced, nominal, mass=one, stiffness=one, known_mass=[(1.0, 1.8)])
     with pytest.raises(ValueError, match="a prior needs a positive standard deviation"):
         GaussianPrior(0.0, 1.0)

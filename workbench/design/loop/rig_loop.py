@@ -10,12 +10,12 @@ import numpy as np
 
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
-from workbench.design.loop.loop_steps import ControllerArrays, LawArrays, StructureArrays, loop_record
+from workbench.design.loop.loop_steps import ControllerArrays, loop_record
 from workbench.rig.actuators import Actuator
-from workbench.rig.elements import AirDrag, MidplaneStretching, PeriodicForce, PointElement, RandomForce, UserLaw
+from workbench.rig.elements import PeriodicForce, PointElement, RandomForce, UserLaw
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.simulate import LAWS, along, participation_of, stretching_of
+from workbench.rig.simulate import law_arrays, participation_of, structure_arrays
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Where
 
@@ -128,9 +128,10 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
         *(np.zeros(shape) for _ in range(2)),
         *(np.zeros((len(points), test.n_samples)) for _ in range(3)),
     )
+    damping, coupling, spread = structure_arrays(rig)
     bounded = loop_record(
-        _structure(rig),
-        _laws(rig, points),
+        (np.array(modes.omega), damping, coupling, float(rig.stiffness_rate), *spread),
+        law_arrays(rig, points),
         np.array([_drive(a) for a in actuators]).reshape(-1, 9),
         np.ascontiguousarray(into),
         np.array([_sense(s, test.n_samples) for s in sensors]).reshape(-1, 7),
@@ -194,34 +195,6 @@ def check_fits(rig: Rig, controller: DigitalController, test: LoopTest) -> None:
 def named(parts: Sequence[P], name: str) -> P:
     """The actuator or the sensor of that name."""
     return next(part for part in parts if part.name == name)
-
-
-def _structure(rig: Rig) -> StructureArrays:
-    modes, n = rig.modes, rig.modes.n_modes
-    diagonal = np.diag(modes.damping).copy()
-    coupling = modes.damping - np.diag(diagonal)
-    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
-    drag = float(sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag)))
-    drag_shapes, drag_weights = along(rig, 0) if drag else (np.zeros((0, n)), np.zeros(0))
-    return (
-        np.array(modes.omega),
-        diagonal,
-        np.ascontiguousarray(coupling) if coupling.any() else np.zeros((0, 0)),
-        float(rig.stiffness_rate),
-        stretch,
-        np.ascontiguousarray(stretching_of(rig)) if stretch else np.zeros((0, 0)),
-        np.ascontiguousarray(drag_shapes.T),
-        drag * drag_weights,
-    )
-
-
-def _laws(rig: Rig, points: Sequence[PointElement]) -> LawArrays:
-    parameters = np.zeros((len(points), 3))
-    for row, element in zip(parameters, points, strict=True):
-        values = LAWS[type(element)][1](element)
-        row[: len(values)] = values
-    shapes = np.array([rig.modes.phi_at(e.at) for e in points]).reshape(len(points), rig.modes.n_modes)
-    return np.array([LAWS[type(e)][0] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
 
 
 def _drive(a: Actuator) -> list[float]:

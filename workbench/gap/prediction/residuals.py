@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.gap.prediction.deadline import NEVER, Deadline
+from workbench.deadline import NEVER, Deadline
 from workbench.gap.prediction.innovations import LOOSE, Follower
 from workbench.gap.prediction.unmodelled_force import ForceFilter, whiten
 from workbench.records.record import Record

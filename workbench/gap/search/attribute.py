@@ -6,6 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
+from workbench.deadline import NEVER, Deadline
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.effect import Effect, Kind, apply_all
 from workbench.gap.effects.limiting_cases import each_left_out, simpler_forms
@@ -13,7 +14,6 @@ from workbench.gap.effects.nominal import IdentifiedPrior, nominal_errors
 from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_step
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
-from workbench.gap.prediction.deadline import NEVER, Deadline
 from workbench.gap.prediction.logged_inputs import logging_noise
 from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit

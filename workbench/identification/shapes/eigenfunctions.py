@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from scipy.interpolate import BSpline
 
-from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.identification.signal.modal_estimates import check_placed, normalised_shapes
 from workbench.structure.domain import Interval
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
@@ -300,8 +300,7 @@ def check_along(sampled: SampledModes) -> None:
     Raises:
         ValueError: a sensor without a place, or with one of another kind.
     """
-    if sampled.unplaced.any():
-        raise ValueError(f"sensor {int(np.argmax(sampled.unplaced))} has no place; give its channel `at`")
+    check_placed(sampled)
     if not sampled.is_along:
         raise ValueError(
             "the sensors have no places along a bar or beam; on a plate take `surface_eigenfunctions`, at named points"

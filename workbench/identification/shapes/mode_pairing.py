@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from workbench.identification.signal.modal_estimates import check_finite, check_placed
 from workbench.structure.modes import Modes, SampledModes, mac
 from workbench.structure.printed import Printed, counted
 
@@ -75,6 +76,22 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, re
     return agreement
 
 
+def assigned(
+    first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, repeated: float = 1e-3, least: float = 0.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which shape of the second set each of the first is: rows, columns, and the agreement by `subspace_mac`.
+
+    Of repeated modes, which agree alike as a subspace, each goes to the one that is most like it by itself.
+
+    Args:
+        first, second, omega, repeated: as `subspace_mac` takes them.
+        least: agreement below it counts as none.
+    """
+    agreement = subspace_mac(first, second, omega, repeated=repeated)
+    alike = np.where(agreement >= least, agreement + ITSELF * mac(first, second), 0.0)
+    return *linear_sum_assignment(-alike), agreement
+
+
 def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, frequency: float = 0.1) -> ModePairing:
     """Match measured modes with a model of unknown scale of frequency, each at most once, by shape, then frequency.
 
@@ -91,20 +108,9 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     Raises:
         ValueError: a sensor without a place, or at one that the model does not have, a shape that is not finite.
     """
-    if measured.unplaced.any():
-        raise ValueError(
-            f"sensor {int(np.argmax(measured.unplaced))} has no place, so no shape of the model can be compared; give"
-            " its channel `at`"
-        )
-    if not np.isfinite(measured.shapes).all():
-        i, r = np.argwhere(~np.isfinite(measured.shapes))[0]
-        raise ValueError(f"shapes must be finite; of mode {r + 1} sensor {i} has {measured.shapes[i, r]}: leave it out")
-    own = model.phi(measured.positions)
-    agreement = subspace_mac(measured.shapes, own, model.omega)
-    # of repeated modes, which agree alike as a subspace, each goes to the one that is most like it by itself
-    rows, columns = linear_sum_assignment(
-        -np.where(agreement >= shape, agreement + ITSELF * mac(measured.shapes, own), 0.0)
-    )
+    check_placed(measured)
+    check_finite(measured.shapes)
+    rows, columns, agreement = assigned(measured.shapes, model.phi(measured.positions), model.omega, least=shape)
     good = agreement[rows, columns] >= shape
     rows, columns = rows[good], columns[good]
     ratio = measured.omega[rows] / model.omega[columns]

@@ -18,7 +18,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from workbench.identification.shapes.bands import BANDS, Bands
-from workbench.identification.signal.modal_estimates import ShapeEstimates, normalised_shapes
+from workbench.identification.signal.modal_estimates import ShapeEstimates, check_placed, normalised_shapes
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import FieldLike, as_field
@@ -294,8 +294,7 @@ def _scaled(
     edges: str | Mapping[str, str] | None,
 ) -> tuple[SurfaceSpline, np.ndarray]:
     """The spline, and values (n_outputs, n_modes) at the sensors that it makes mass-normalised shapes of."""
-    if sampled.unplaced.any():
-        raise ValueError(f"sensor {int(np.argmax(sampled.unplaced))} has no place; give its channel `at`, (x, y) in m")
+    check_placed(sampled)
     if sampled.positions.ndim != 2:
         raise ValueError("eigenfunctions over a rectangle take sensors with places (x, y), m; give their channels `at`")
     spline = SurfaceSpline(Rectangle(length), sampled.positions, edges or {})

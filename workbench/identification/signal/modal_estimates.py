@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from html import escape
 from typing import Protocol
 
 import numpy as np
@@ -12,6 +11,7 @@ from scipy.special import ndtri
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
 from workbench.structure.modes import SampledModes, frozen
+from workbench.structure.printed import Printed, counted
 
 SURE = 3.0  # standard errors below zero from which on a damping ratio is negative
 HEADINGS = ("mode", "frequency [Hz]", "±", "damping [%]", "±", "phase collinearity")
@@ -32,7 +32,7 @@ class ShapeEstimates(Protocol):
     def shape_covariance(self) -> np.ndarray: ...
 
 
-class ModalEstimates:
+class ModalEstimates(Printed):
     """What modes with a covariance of (ω_1..ω_n, ζ_1..ζ_n), (2 n_modes, 2 n_modes), say of their errors."""
 
     modes: SampledModes
@@ -59,14 +59,13 @@ class ModalEstimates:
         """What to print below the table."""
         return tuple(getattr(self, "remarks", ()))
 
-    def __str__(self) -> str:
-        return as_text(self, self._remarks())
+    def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
+        return "", HEADINGS, tuple(rows_of(self)), self._remarks()
 
     def __repr__(self) -> str:
-        return summary(self)
-
-    def _repr_html_(self) -> str:
-        return as_html(self, self._remarks())
+        hz = self.modes.frequencies_hz
+        first = ", ".join(f"{f:.4g}" for f in hz[:4]) + (", ..." if hz.size > 4 else "")
+        return f"{type(self).__name__}({counted(hz.size, 'mode')}{f': {first} Hz' if hz.size else ''})"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -202,30 +201,6 @@ def rounded(value: float, error: float) -> tuple[str, str]:
     return f"{value:.{digits}f}", f"{error:.{digits}f}"
 
 
-def summary(found: ModalEstimates) -> str:
-    """One line: the type, and the frequencies of its modes."""
-    hz = found.modes.frequencies_hz
-    first = ", ".join(f"{f:.4g}" for f in hz[:4]) + (", ..." if hz.size > 4 else "")
-    return f"{type(found).__name__}({hz.size} mode{'s' * (hz.size != 1)}{f': {first} Hz' if hz.size else ''})"
-
-
-def as_text(found: ModalEstimates, remarks: tuple[str, ...] = ()) -> str:
-    """The table of modes, columns right-aligned, with what there is to remark below it."""
-    table = [HEADINGS, *rows_of(found)]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = ["  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in table]
-    return "\n".join([*lines, *remarks])
-
-
-def as_html(found: ModalEstimates, remarks: tuple[str, ...] = ()) -> str:
-    """The same as a table for a notebook."""
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in HEADINGS)
-    rows = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows_of(found))
-    body = "".join(f"<tr>{row}</tr>" for row in rows)
-    below = "".join(f"<p>{escape(remark)}</p>" for remark in remarks)
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{below}"
-
-
 def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, nyquist: float) -> np.ndarray:
     """Which estimates can be modes, (n_modes,): damping not negative beyond its error, a frequency known and below
     Nyquist.
@@ -239,15 +214,34 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
+def check_placed(sampled: SampledModes) -> None:
+    """Refuse a sensor without a place.
+
+    Raises:
+        ValueError: naming it, from 1.
+    """
+    if sampled.unplaced.any():
+        raise ValueError(f"sensor {int(np.argmax(sampled.unplaced)) + 1} has no place; give its channel `at`")
+
+
+def check_finite(shapes: np.ndarray) -> None:
+    """Refuse shapes (n_sensors, n_modes) with an entry that is not finite.
+
+    Raises:
+        ValueError: naming mode and sensor, from 1.
+    """
+    if not np.isfinite(shapes).all():
+        i, r = np.argwhere(~np.isfinite(shapes))[0]
+        raise ValueError(f"shapes must be finite; of mode {r + 1} sensor {i + 1} has {shapes[i, r]}: leave it out")
+
+
 def normalised_shapes(shapes: np.ndarray) -> np.ndarray:
     """Each column turned as near the real axis as it goes, largest entry 1, first clear entry positive.
 
     Raises:
         ValueError: an entry that is not finite.
     """
-    if not np.isfinite(shapes).all():
-        i, r = np.argwhere(~np.isfinite(shapes))[0]
-        raise ValueError(f"shapes must be finite; of mode {r + 1} sensor {i + 1} has {shapes[i, r]}: leave it out")
+    check_finite(shapes)
     turned = shapes * np.exp(-0.5j * np.angle((shapes**2).sum(axis=0)))
     turned = turned / np.abs(turned).max(axis=0)
     clear = np.argmax(np.abs(turned.real) > 0.05, axis=0)

@@ -15,12 +15,12 @@ it. Both in turn until the modes stay the same.
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from time import thread_time
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from workbench.deadline import Deadline
 from workbench.structure.modes import mac
 
 State = TypeVar("State")
@@ -69,31 +69,24 @@ BY_CHANCE = (1.0 - SELECTION.same_shape) ** 2
 Progress = Callable[[str, float], None]
 
 
-class Budget:
-    """Processor time left for an identification; searches that find it spent return the best they have.
-
-    Not time by the clock: a machine that others load gives the same result.
+class Budget(Deadline):
+    """Processor time left for an identification, and which searches found it spent.
 
     Attributes:
-        seconds: of processor time of this thread allowed, from the construction on.
         progress: called as the searches go on.
         unfinished: the searches that were ended early, each once.
     """
 
     def __init__(self, seconds: float | None = None, progress: Progress | None = None) -> None:
-        if seconds is not None and not seconds > 0:
-            raise ValueError(f"identification needs time: seconds must be positive; got {seconds:g}")
-        self.seconds, self.progress = seconds, progress
+        super().__init__(seconds)
+        self.progress, self._whole = progress, self._end
         self.unfinished: list[str] = []
-        self._begun = thread_time()
-        self._end = self._whole = float("inf") if seconds is None else self._begun + seconds
 
     def spent(self, search: str) -> bool:
         """Whether the time is up; the search that asks is then noted as unfinished."""
-        now = thread_time()
         if self.progress is not None:
-            self.progress(search, min((now - self._begun) / (self._whole - self._begun), 1.0))
-        if now < self._end:
+            self.progress(search, min((self._now - self._begun) / (self._whole - self._begun), 1.0))
+        if not self.is_past:
             return False
         if search not in self.unfinished:
             self.unfinished.append(search)
@@ -101,9 +94,8 @@ class Budget:
 
     def share(self, share: float) -> "Budget":
         """A share of the time left, in (0, 1]; what it leaves unfinished counts here."""
-        part = Budget(None if self.seconds is None else share * max(self._end - thread_time(), 1e-3))
-        part.unfinished, part.progress = self.unfinished, self.progress
-        part._begun, part._whole = self._begun, self._whole
+        part = Budget(None if self.seconds is None else share * max(self._end - self._now, 1e-3), self.progress)
+        part.unfinished, part._begun, part._whole = self.unfinished, self._begun, self._whole
         return part
 
     @property

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.optimize import least_squares
 
-from workbench.identification.shapes.mode_pairing import ITSELF, repeated_modes, subspace_mac
+from workbench.identification.shapes.mode_pairing import assigned, repeated_modes
 from workbench.identification.signal.modal_estimates import rounded
-from workbench.structure.modes import Modes, frozen, mac
+from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, counted
 
 
@@ -125,8 +125,7 @@ def update_model(
         if not isinstance(modes, Modes):
             raise ValueError(f"build must return modes, as model.modes(8) does; got {type(modes).__name__}")
         own = modes.phi(places)
-        agreement = subspace_mac(measured, own, modes.omega, repeated=UPDATING.repeated)
-        rows, columns = linear_sum_assignment(-agreement - ITSELF * mac(measured, own))
+        rows, columns, agreement = assigned(measured, own, modes.omega, repeated=UPDATING.repeated)
         if rows.size < target.size or agreement[rows, columns].min() < UPDATING.least_mac:
             lost = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(

@@ -16,6 +16,7 @@ from workbench.identification.signal.searches import SECONDS, Progress
 from workbench.identification.transfer import TransferModes, identify_transfer
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
+from workbench.structure.printed import counted
 
 TURN = 2.0 * np.pi
 UNLIKELY, MOST_MODES = 0.01, 40
@@ -196,7 +197,7 @@ def of_transfer(found: TransferModes, measured: TransferFunctions) -> Identifica
         )
     band = found.frequencies_hz
     outputs, inputs = found.modes.n_outputs, len(measured.references)
-    heading = f"transfer functions of {_counted(outputs, 'output')} and {_counted(inputs, 'input')}"
+    heading = f"transfer functions of {counted(outputs, 'output')} and {counted(inputs, 'input')}"
     heading += f", {band.size} lines from {band[0]:.6g} to {band[-1]:.6g} Hz"
     content = {
         **_content(measured.output_channels, found),
@@ -223,14 +224,10 @@ def _report(
     first = records[0]
     samples = sum(record.n_samples for record in records)
     of = f" in {len(records)} records" if len(records) > 1 else ""
-    sensors = _counted(first.n_outputs, "sensor")
+    sensors = counted(first.n_outputs, "sensor")
     since = f" from {first.start_time:.6g} s on" if len(records) == 1 else ""
     heading = f"{sensors}, {samples} samples{of} at {first.sample_rate_hz:.6g} Hz{since}"
     return IdentificationReport(heading, tuple(rows_of(found)), tuple(lines), content, decays)
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}{'s' * (number > 1)}"
 
 
 def _content(channels: Sequence[Channel], found: ModalEstimates) -> dict[str, Any]:

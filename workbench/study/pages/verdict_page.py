@@ -12,6 +12,7 @@ from workbench.cases.case import Case
 from workbench.draw.gap import plot_budget, plot_responses, plot_rivals, plot_unmodelled_force, plot_where
 from workbench.draw.motion import mode_motion
 from workbench.draw.spectra import plot_distortion
+from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import label_in_words
 from workbench.gap.report.verdict import Verdict
 from workbench.identification.signal.distortion import Distortion, distortion_of
@@ -39,7 +40,6 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
     """
     nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
-    shown = verdict.to_json()
     records = (*case.fit, *case.validation)
     better = verdict.shrinkage is None or verdict.shrinkage.overall > 0
     rigs, fitted = {"nominal": verdict.nominal}, "corrected" if verdict.outcome == "explained" else "nearest"
@@ -80,29 +80,6 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             * all(d.parity_resolved for d in distortions)
         )
         figures.append((plot_distortion(distortions), seen))
-    gaps = [
-        (name, before, shown["gap"]["after"][name], shown["gap"]["floor"][name], shown["shrinkage"].get(name))
-        for name, before in shown["gap"]["before"].items()
-    ]
-    effects = [
-        (
-            effect["kind"].replace("_", " "),
-            name.replace("_", " "),
-            *to_its_error(value, effect.get("parameters_std", {}).get(name)),
-            effect.get("at", ""),
-            effect.get("input", effect.get("output", "")),
-        )
-        for effect in (
-            shown["effects"] if shown["effects"] and shown["effects"][0]["kind"] != "unknown" else shown["nearest"]
-        )
-        for name, value in effect["parameters"].items()
-    ]
-    rivals = [(r["words"], r["probability"]) for r in shown["alternatives"]]
-    tables: list[Table] = [
-        ("Gap on held-out records", ("record", "before", "after", "floor", "share closed"), gaps),
-        ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
-        ("Rivals", ("set of effects", "probability"), rivals),
-    ]
     moving = moving_modes(
         verdict.nominal, {"nominal": nominal, **({fitted: corrected} if changed and fitted in rigs else {})}
     )
@@ -115,11 +92,40 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
             *(block(figure, caption) for figure, caption in figures),
             *(moving if verdict.outcome != "none" else []),
         ],
-        tables=[table for table in tables if table[2]],
+        tables=verdict_tables(verdict.to_json()),
         inputs={} if folder is None else case_inputs(folder),
         made_by=f"workbench diagnose {folder or verdict.case}",
     )
     return write_page(path, page_content)
+
+
+def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
+    """Effects, gaps and rivals of a verdict as JSON: those of these tables that have a row."""
+    effects = [
+        [
+            effect["kind"].replace("_", " "),
+            name.replace("_", " "),
+            *to_its_error(value, effect.get("parameters_std", {}).get(name)),
+            effect.get("at", ""),
+            effect.get("input", effect.get("output", "")),
+        ]
+        for effect in [*content["effects"], *content.get("nearest", [])]
+        for name, value in effect["parameters"].items()
+    ]
+    gap, closed = content["gap"], content.get("shrinkage", {})
+    gaps = [
+        [record, *(gap[name].get(record) for name in ("before", "after", "floor")), closed.get(record, "")]
+        for record in gap["before"]
+    ]
+    rivals = [
+        [rival.get("words") or in_words(rival["kind"]), rival["probability"]] for rival in content["alternatives"]
+    ]
+    tables = [
+        ("Effects", ("effect", "parameter", "value", "standard error", "x [m]", "input or output"), effects),
+        ("Gap on held-out records", ("record", "before", "after", "floor", "share closed"), gaps),
+        ("Rivals", ("set of effects", "probability"), rivals),
+    ]
+    return [table for table in tables if table[2]]
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:

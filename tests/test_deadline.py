@@ -4,7 +4,7 @@ from time import process_time
 
 import pytest
 
-from workbench.gap.prediction.deadline import NEVER, Deadline
+from workbench.deadline import NEVER, Deadline
 from workbench.gap.prediction.workers import Workers
 
 
