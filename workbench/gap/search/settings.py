@@ -202,7 +202,7 @@ class StepwiseSettings:
     """Constants of the stepwise selection."""
 
     shorter: float = 30.0  # description length, nats, that an effect which makes errors plausible must save
-    singles: int = 3  # effects alone, as they were found without errors, that are tried as the first
+    singles: int = 3  # effects alone, the likeliest beside errors, that are tried as the first
     candidates: int = 4  # sets fitted on whole records at each step
     # finalists, near: how many of them are fitted to all records, and times the least cost of what may come first
     finalists: int = 2
