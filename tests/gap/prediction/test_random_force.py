@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scipy.signal import butter, lfilter
+from scipy.signal import butter, lfilter, lsim
 
-from workbench.gap.prediction.random_force import TONAL, _power, followed, tonal
+from workbench.gap.prediction.random_force import TONAL, _power, followed, lost_between_samples, tonal
 from workbench.gap.prediction.unmodelled_force import colour_of
 
 N = 2000
@@ -26,6 +26,17 @@ def test_a_constant_and_a_tone_can_be_predicted_and_a_random_force_cannot(memory
     assert tonal(force, 0.01) < TONAL
     assert tonal(1e-3 * force / force.std() - 1.0, 0.01) == pytest.approx(1.0, abs=1e-5)
     assert tonal(wave + 2.0, 0.01) == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("cycles", [0.05, 0.2, 0.3])
+def test_a_held_force_does_less_than_a_continuous_one(cycles):
+    fine, n = 40, 800
+    time = np.arange(n * fine) / fine  # samples
+    wave = np.sin(2.0 * np.pi * cycles * time)
+    held = np.repeat(wave[::fine], fine)
+    oscillator = ([1.0], [1.0, 0.05, (2.0 * np.pi * cycles) ** 2])
+    powers = [np.mean(lsim(oscillator, force, time)[1][n * fine // 2 :] ** 2) for force in (held, wave)]
+    assert 1.0 - lost_between_samples([wave[::fine]]) == pytest.approx(powers[0] / powers[1], rel=0.01)
 
 
 @pytest.mark.parametrize("memory", [0.0, 0.9, 0.99])

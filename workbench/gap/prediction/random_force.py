@@ -72,6 +72,8 @@ class RandomForceFit:
         left: mean square of what the smoothed force leaves of whole records, in units of the noise.
         rms_by_record: (n_records,) of the smoothed force, N: of what acted, as far as the records show.
         hidden_rms: of what the process has beyond that, N.
+        between: share of the force's power that may be the model's alone, which holds it over each sample: one that
+            acts continuously does more than that by as much.
         follows: largest share of the force that the inputs and the motion of its record account for.
         tonal: least share of the force of a record that its mean and one sinusoid account for.
     """
@@ -85,6 +87,7 @@ class RandomForceFit:
     left: float
     rms_by_record: np.ndarray
     hidden_rms: float
+    between: float
     follows: float
     tonal: float
 
@@ -93,12 +96,14 @@ class RandomForceFit:
         """Rms over all records of the force that acted, N, and the standard deviation of that.
 
         From the scatter between records; what they do not show is guessed by the colour, so that none of it or twice as
-        much may be there.
+        much may be there, and whether it acts between samples is not known.
         """
         seen, hidden = self.rms_by_record**2, self.hidden_rms**2
-        rms = float(np.sqrt(seen.mean() + hidden))
+        power = seen.mean() + hidden
         scatter = float(seen.std(ddof=1)) if seen.size > 1 else float(seen[0])
-        return rms, float(np.hypot(scatter / np.sqrt(seen.size), hidden / np.sqrt(3.0))) / (2.0 * rms)
+        guessed = np.hypot(hidden, self.between * power) / np.sqrt(3.0)  # of uniform distributions
+        rms = float(np.sqrt(power))
+        return rms, float(np.hypot(scatter / np.sqrt(seen.size), guessed)) / (2.0 * rms)
 
     @property
     def holds(self) -> bool:
@@ -196,12 +201,23 @@ def fit_random_force(
         left=float(np.sum([(((r - kalman.h @ x) / data.noise[:, None]) ** 2).sum() for r, x in both])) / n_values,
         rms_by_record=np.array([np.sqrt(np.mean(f**2)) for f in forces]),
         hidden_rms=float(np.sqrt(max(smoothed_covariance(kalman)[force, force], 0.0))),
+        between=lost_between_samples(forces),
         follows=max(
             followed(force, record.inputs, rig.modes.phi_at(at) @ np.array([m.displacement, m.velocity]))
             for force, record, m in zip(forces, data.counted, data.motions(rig), strict=True)
         ),
         tonal=min(tonal(force, data.counted[0].sample_time) for force in forces),
     )
+
+
+def lost_between_samples(forces: Sequence[np.ndarray]) -> float:
+    """Share of the power of forces (n_samples,) that a force with these spectra lacks where it acts continuously.
+
+    A force held over each sample acts as a continuous one that is weaker at every frequency by the sinc of the hold.
+    """
+    powers = [np.abs(np.fft.rfft(force)) ** 2 for force in forces]
+    kept = [float(power @ np.sinc(np.fft.rfftfreq(f.size)) ** 2) for power, f in zip(powers, forces, strict=True)]
+    return 1.0 - sum(kept) / max(float(sum(power.sum() for power in powers)), 1e-300)
 
 
 def tonal(force: np.ndarray, sample_time: float) -> float:

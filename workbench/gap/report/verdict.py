@@ -117,16 +117,15 @@ class Verdict:
                 f"{self._errors_in_words}: something may be missing that no effect of the catalogue is."
             )
         closed = "" if self.shrinkage is None else f"{100 * max(self.shrinkage.overall, 0.0):.0f} % of "
-        if any(effect.kind.remainder for effect in self.effects):
-            verb = "accounts" if len(named) == 1 else "account"
-            text = f"{words} {verb} for the gap, part of which nothing can predict."
-        elif self.outcome == "explained":
+        if self.outcome == "explained":
             shares = [self._share_of(effect) for effect in self._told]
             if len(named) == 1:
                 text = f"{words} causes {_percent(shares[0])} of the gap"
             else:
                 each = " and ".join(_percent(share) for share in shares)
                 text = f"{words} cause {_percent(sum(shares))} of the gap ({each})"
+            if any(effect.kind.remainder for effect in self.effects):
+                text += ", part of which nothing can predict"
             text += self._rest + self._not_excluded
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
