@@ -10,7 +10,7 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import IdentifiedPrior
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
-from workbench.gap.search.attribute import _as_it_stands, beside_identified
+from workbench.gap.search.attribute import _as_it_stands, _settled, beside_identified
 from workbench.gap.search.fit import fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.search import Search
@@ -72,3 +72,23 @@ def test_friction_far_below_its_smoothing_speed_is_a_damper():
     (told,) = _as_it_stands(search, found, (), 0.0).effects
     assert told.kind is damper.kind
     assert told.values["coefficient"] == pytest.approx(0.3, abs=4.0 * told.deviations["coefficient"])
+
+
+@pytest.mark.parametrize(("speed", "stated"), [(1e-5, False), (0.05, True)])
+def test_a_speed_that_the_records_do_not_tell_from_none_is_not_stated(speed, stated):
+    """However sure the slope at one point of so stiff a law makes it."""
+    nominal = identified(OMEGA)
+    friction = Effect(
+        kind_named("coulomb_friction"),
+        None,
+        {"at": "y", "force": 1.0, "smoothing_speed": speed},
+        {"force": 0.1, "smoothing_speed": 0.04 * speed},
+    )
+    rng = np.random.default_rng(5)
+    clean = simulate(friction.apply(nominal), 5.0 * rng.normal(size=(1, 600)), sample_time=0.02, name="test")
+    record = replace(clean, outputs=clean.outputs + NOISE * rng.normal(size=clean.outputs.shape))
+    data = FitData((record,), np.array([NOISE]))
+    before = data.by_channel(data.residual(nominal))
+    search = Search(nominal, data, data, data, CATALOGUE, lambda text, share: None, ALONE, before)
+    (told,) = _settled(search, fit(nominal, (friction,), data)).effects
+    assert ("smoothing_speed" in told.stated(nominal)) == stated

@@ -216,7 +216,7 @@ class Kind:
         force_laws: "displacement" or "velocity" -> values, that motion (n,) -> force (n,), where it is a law of that
             alone.
         numbers: effect, rig -> the numbers that a verdict states, by name; None for its values, a place left out.
-        settled: effect -> the same with numbers that the records do not tell from none as good as none.
+        settled: effect -> the same with numbers as good as none that records may not tell from none; itself without.
         second_channel, joined: of a kind that acts on two inputs or two outputs: what the verdict calls the other one,
             and the word between the two in its sentence.
         remark: effect, rig -> what the sentence says in brackets; None for its numbers.

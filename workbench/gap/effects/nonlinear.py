@@ -246,11 +246,13 @@ def _without_sudden(friction: Effect, _: Rig) -> dict[str, float]:
 
 
 def _sudden(friction: Effect) -> Effect:
-    """Friction that turns at once, where the records do not tell the speed over which it turns from none."""
-    if not _is_sudden(friction):
-        return friction
+    """Friction that turns at once, whose smoothing speed is as unsure as it was large."""
+    speed = friction.values["smoothing_speed"]
+    unsure = max(friction.deviations.get("smoothing_speed", 0.0), speed)
     return replace(
-        friction, values={**friction.values, "smoothing_speed": AT_ONCE * friction.values["smoothing_speed"]}
+        friction,
+        values={**friction.values, "smoothing_speed": AT_ONCE * speed},
+        deviations={**friction.deviations, "smoothing_speed": unsure},
     )
 
 

@@ -231,7 +231,7 @@ def attribute(
     if random is None:
         logged = logged or _logged(search, best, noise_of(search, best) if noise is None else noise)
         best = with_intervals(search.rig, best, within.data, workers, wide=beside is not None, logged=logged)
-        best = replace(best, effects=tuple(effect.kind.settled(effect) for effect in best.effects))
+        best = _settled(search, best)
         if outcome == "explained":
             best = _as_it_stands(within, best, seen, logged)
             outcome = outcome if any(not e.kind.first for e in best.effects) else "none"
@@ -280,8 +280,22 @@ def _as_it_stands(search: Search, best: Fit, seen: Sequence[Effect], logged: flo
         for fewer in sorted(simpler, key=lambda f: f.n_parameters):
             if not search.tells_apart(here, fewer.cost, max(best.n_parameters - fewer.n_parameters, 0)):
                 fewer = with_intervals(rig, fewer, search.data, search.workers, logged=logged)
-                settled = (e.kind.settled(e) for e in fewer.effects)
+                settled = _settled(search, fewer).effects
                 return _as_it_stands(search, replace(fewer, effects=(*seen, *settled)), seen, logged)
+    return best
+
+
+def _settled(search: Search, best: Fit) -> Fit:
+    """The fit with numbers as good as none that leave as much: no deviation at one point of a stiff law tells so."""
+    data = search.data.finely(SELECTION.fine)
+    for effect in best.effects:
+        settled = effect.kind.settled(effect)
+        if settled is effect:
+            continue
+        effects = tuple(settled if e is effect else e for e in best.effects)
+        costs = (cost_of(search.rig, each, data) for each in (best.effects, effects))
+        if not search.tells_apart(*costs, 1):
+            best = replace(best, effects=effects)
     return best
 
 
