@@ -30,7 +30,7 @@ from workbench.gap.search.record_to_record import beside_records
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Decision, Search, most_informative, promise, spread_over_kinds
 from workbench.gap.search.selection import on_whole_records, one_more
-from workbench.gap.search.settings import ATTRIBUTION, RANDOM, SEARCH, SELECTION
+from workbench.gap.search.settings import ATTRIBUTION, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -293,8 +293,8 @@ def _settled(search: Search, best: Fit) -> Fit:
         if settled is effect:
             continue
         effects = tuple(settled if e is effect else e for e in best.effects)
-        costs = (cost_of(search.rig, each, data) for each in (best.effects, effects))
-        if not search.tells_apart(*costs, 1):
+        here, there = (cost_of(search.rig, each, data) for each in (best.effects, effects))
+        if not search.tells_apart(here, there, 1):
             best = replace(best, effects=effects)
     return best
 
@@ -417,7 +417,8 @@ def _with_a_second(
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
         return alone
-    if not (beside.is_enough or search.is_over):
+    near = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
+    if not (beside.is_enough or near or search.is_over):
         random = random_beside(search, singles) or random_beside_errors(search, beside.last)
         if random is not None:
             return random

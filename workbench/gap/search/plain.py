@@ -16,7 +16,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import PLAIN, SEARCH, SELECTION
+from workbench.gap.search.settings import PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
@@ -177,7 +177,10 @@ def _one_more(search: Search, effects: tuple[Effect, ...], common: tuple[Effect,
     alike = tuple(kind for kind in search.catalogue if kind.path == "structure" and not kind.nonlinear)
     if not alike:
         return None
-    given = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly).effects
+    alone = fit(search.rig, effects, search.quick, iterations=PLAIN.plainly)
+    if alone.cost < 1.0 + STEPWISE.no_gap:  # too little for another effect
+        return None
+    given = alone.effects
     evidence = search.evidence_of(apply_all(search.rig, given))
     screened = Screening.of(replace(search, catalogue=alike), given, evidence).likeliest()
     likeliest = {effect.kind: effect for effect in reversed(screened)}  # the best of each kind

@@ -89,7 +89,7 @@ class Stepwise:
             as_likely = {f.key for f in found if f.cost < (1.0 + SEARCH.significant) * single.cost}
             if not comes_to & as_likely:
                 chosen.append(single)
-        return chosen[: STEPWISE.singles]
+        return [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
 
     def by_singles(self) -> bool:
         """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
