@@ -29,6 +29,7 @@ class Actuator:
         bias: constant force beside, N.
         direct: a measured force applied without an actuator, such as a hammer; changes of the drive leave it alone.
         direction: of the force, or the axis of the moment, where the structure has more than one at a place.
+        shape_error: (n_modes,) what each mode shape, or its slope, is here beyond that of the modes; empty for nothing.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Actuator:
     rate_limit: float = np.inf
     bias: float = 0.0
     direction: str | None = None
+    shape_error: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))

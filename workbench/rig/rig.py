@@ -3,6 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from workbench.arrays import Floats
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import Element
@@ -20,15 +22,24 @@ def derivative_of(port: Actuator | Sensor) -> int:
 
 
 def shape_of(modes: Modes, port: Actuator | Sensor) -> Floats:
-    """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain.
+    """Mode shapes, or their slopes, at an actuator or a sensor: (n_modes,), without its gain, with its `shape_error`.
 
     Raises:
         PlaceError: naming the actuator or sensor whose place or direction the structure does not have.
     """
     try:
-        return modes.phi_at(port.at, derivative_of(port), direction=port.direction)
+        shape = modes.phi_at(port.at, derivative_of(port), direction=port.direction)
     except PlaceError as error:
         raise _misplaced(port, error) from None
+    return shape + shape_error_of(port, modes.n_modes) if port.shape_error else shape
+
+
+def shape_error_of(port: Actuator | Sensor, n_modes: int) -> Floats:
+    """What the mode shapes at a port are off by (n_modes,): none of modes beyond those that its error is known of."""
+    error = np.zeros(n_modes)
+    known = port.shape_error[:n_modes]
+    error[: len(known)] = known
+    return error
 
 
 def _misplaced(port: Actuator | Sensor, error: PlaceError) -> PlaceError:

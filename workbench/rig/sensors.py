@@ -34,6 +34,7 @@ class Sensor:
         limit: readings stop at ± this.
         step: readings are multiples of this; 0 for none.
         direction: of the displacement, or the axis of the slope, where the structure has more than one at a place.
+        shape_error: (n_modes,) what each mode shape, or its slope, is here beyond that of the modes; empty for nothing.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Sensor:
     delay: float = 0.0
     crosstalk: tuple[tuple[str, float], ...] = ()
     direction: str | None = None
+    shape_error: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))

@@ -31,7 +31,7 @@ from workbench.rig.elements import (
     UserLaw,
 )
 from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response, straight_response
-from workbench.rig.rig import Rig, shape_of
+from workbench.rig.rig import Rig, shape_error_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.stepping import (
     BOUC_WEN,
@@ -269,6 +269,9 @@ def participation_of(rig: Rig) -> np.ndarray:
         except PlaceError:
             _ = [shape_of(rig.modes, rig.actuators[j]) for j in group]  # says which actuator it is
             raise
+    for j, actuator in enumerate(rig.actuators):
+        if actuator.shape_error:
+            shapes[:, j] += shape_error_of(actuator, rig.modes.n_modes)
     return shapes
 
 
@@ -404,6 +407,8 @@ def _shapes_at_sensors(rig: Rig) -> Iterator[tuple[int, list[int], np.ndarray]]:
         except PlaceError:
             _ = [shape_of(rig.modes, rig.sensors[j]) for j in here]  # says which sensor it is
             raise
+        if any(rig.sensors[j].shape_error for j in here):
+            shapes = shapes + [shape_error_of(rig.sensors[j], rig.modes.n_modes) for j in here]
         yield order, here, shapes
 
 

@@ -39,6 +39,7 @@ class _Member(Printed):
     right: End
     attachments: tuple[Attachment, ...] = ()
     damping: Damping = field(default_factory=ModalDamping)
+    frequency_errors: tuple[float, ...] = ()
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         at = self.length * np.array([0.0, 0.5, 1.0])
@@ -160,6 +161,8 @@ class _Member(Printed):
             found: Floats = segments.evaluation(x, derivative) @ coefficients
             return found
 
+        known = self.frequency_errors[:n_modes]
+        omega[: len(known)] *= np.exp(known)
         return Modes(
             omega=omega,
             damping=self._damping_matrix(omega, segments, coefficients),
@@ -289,6 +292,7 @@ class Bar(_Member):
         left, right: "fixed", "free" or an `End(translation)`.
         attachments: `PointMass`, `PointSpring`, `PointDamper`.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
+        frequency_errors: (n_modes,) logarithms of what natural frequencies are over those of the profiles.
 
     Raises:
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside, a spring or mass on a
@@ -309,6 +313,7 @@ class Bar(_Member):
             right: str | End,
             attachments: Sequence[Attachment] = (),
             damping: Damping = ...,
+            frequency_errors: Sequence[float] = (),
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -340,6 +345,7 @@ class Beam(_Member):
         attachments: `PointMass`, `PointSpring`, `PointDamper`.
         damping: `ModalDamping`, `ProportionalDamping` or `ViscousDamping`.
         tension: axial load in N, positive in tension.
+        frequency_errors: (n_modes,) logarithms of what natural frequencies are over those of the profiles.
 
     Raises:
         ValueError: a profile that is not positive, an end of unknown name, an attachment outside, buckling.
@@ -361,6 +367,7 @@ class Beam(_Member):
             attachments: Sequence[Attachment] = (),
             damping: Damping = ...,
             tension: float = 0.0,
+            frequency_errors: Sequence[float] = (),
         ) -> None: ...
 
     def __post_init__(self) -> None:

@@ -86,6 +86,7 @@ class Parameter:
         scale: a typical size, which makes the steps of a fit comparable.
         neutral: the value at which the effect changes nothing; None where no single one does.
         prior_std: standard deviation of a normal prior on the free coordinate, centred at 0; None for none.
+        sensor: the one whose readings alone it alters, by name; empty where it alters others, or the motion.
     """
 
     name: str
@@ -96,6 +97,7 @@ class Parameter:
     scale: float = 1.0
     prior_std: float | None = None
     neutral: float | None = None
+    sensor: str = ""
 
     def to_free(self, value: float) -> float:
         """From the unit to the coordinate of the fit."""

@@ -11,7 +11,9 @@ from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, Kind, Parameter
 from workbench.gap.effects.record_to_record import STIFFNESS, differing
 from workbench.gap.effects.structural import RESOLUTION, solved_once, stiffness_name
-from workbench.rig.rig import Rig
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig, derivative_of, shape_of
+from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
 from workbench.structure.domain import NamedPoints
 from workbench.structure.member import Structure
@@ -36,6 +38,8 @@ class NominalPrior:
         frequency: relative, of each natural frequency by itself.
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
+        gain: relative, of each actuator and each sensor, as far as they were calibrated.
+        shape: of each mode at each actuator and each sensor, over the rms of that mode at all of them.
         record: of a figure that differs from record to record, about a common value; see `record_to_record`.
         sample_time: s.
         late, early: names of the sensors whose delay is positive, or at most zero: where inputs are held, acceleration
@@ -49,6 +53,8 @@ class NominalPrior:
     frequency: float = 0.0
     damping: float = 0.0
     delay: float = 0.0
+    gain: float = 0.0
+    shape: float = 0.0
     record: float = 0.0
     sample_time: float = 1.0
     late: tuple[str, ...] = ()
@@ -63,8 +69,8 @@ class NominalPrior:
         return tuple(name for name in GROUPS if getattr(self, name) > 0)
 
 
-GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "record")
-OUTSIDE = ("delay", "record")  # groups that leave the modes as they are
+GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "gain", "shape", "record")
+OUTSIDE = ("delay", "gain", "shape", "record")  # groups that leave the modes as they are
 
 
 def group_of(parameter: str) -> str:
@@ -125,10 +131,12 @@ def _parameters(rig: Rig, prior: NominalPrior | IdentifiedPrior) -> tuple[Parame
 
 
 def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
-    def believed(name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf) -> Parameter:
+    def believed(
+        name: str, std: float, unit: float, low: float = -np.inf, high: float = np.inf, sensor: str = ""
+    ) -> Parameter:
         reach, unit = WIDEST * max(std, unit), unit * weight_of(name, prior)
         prior_std = max(std * weight_of(name, prior) / unit, 1e-6)
-        return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std)
+        return Parameter(name, "", max(low, -reach), min(high, reach), scale=unit, prior_std=prior_std, sensor=sensor)
 
     along = isinstance(rig.structure, Structure)
     waves = prior.waves if along else 1
@@ -146,7 +154,15 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
         for sensor in rig.sensors:
             low = JUST_LATE if sensor.name in prior.late else -MOST_AHEAD
             high = 0.0 if sensor.name in prior.early else MOST_AHEAD
-            yield believed(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high)
+            yield believed(f"delay_{sensor.name}", prior.delay, DELAY_UNIT, low, high, sensor.name)
+    if prior.gain:
+        yield from (believed(_gain(actuator), prior.gain, PROFILE_UNIT) for actuator in rig.actuators)
+        yield from (believed(_gain(sensor), prior.gain, PROFILE_UNIT, sensor=sensor.name) for sensor in rig.sensors)
+    if prior.shape:
+        ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+        for port in ports:
+            own = port.name if isinstance(port, Sensor) else ""
+            yield from (believed(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shapes(port, rig.modes.n_modes))
     if prior.record:
         yield from (believed(f"record_{name}", prior.record, PROFILE_UNIT) for name in prior.records)
 
@@ -199,6 +215,8 @@ def _off_structure(rig: Rig, prior: NominalPrior, values: dict[str, float]) -> R
     if not (frequency.any() or damping.any()):
         return rig
     stretch, more = np.exp(frequency), np.exp(damping)
+    if isinstance(structure, Structure):
+        structure = replace(structure, frequency_errors=tuple(frequency.tolist()))
     if structure is not None and isinstance(structure.damping, ModalDamping):
         structure = replace(structure, damping=ModalDamping(modes.zeta * more))
     root = np.sqrt(stretch * more)
@@ -220,11 +238,46 @@ def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, floa
         return replace(rig, modes=made.modes, structure=made.structure, actuators=made.actuators)
     rig = _solved(rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE})
     rig = differing(rig, prior.figure, deviations_of(values))
-    late = {f"delay_{s.name}": s for s in rig.sensors if values.get(f"delay_{s.name}")}
-    if not late:
-        return rig
-    delays = {s: s.delay + values[name] * prior.sample_time for name, s in late.items()}
-    return replace(rig, sensors=tuple(replace(s, delay=delays[s]) if s in delays else s for s in rig.sensors))
+    ports = (*rig.actuators, *rig.sensors)
+    units = _shape_units(rig) if prior.shape else np.zeros((len(ports), 0))
+    off = [_off_port(port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
+    n = len(rig.actuators)
+    return replace(rig, actuators=tuple(off[:n]), sensors=tuple(off[n:]))
+
+
+def _off_port(port: Any, units: Floats, prior: NominalPrior, values: dict[str, float]) -> Any:
+    """An actuator or a sensor with the errors of its calibration, its mode shapes (n_modes,) and its timing."""
+    changes: dict[str, Any] = {}
+    if gain := values.get(_gain(port), 0.0):
+        changes["gain"] = port.gain * float(np.exp(gain))
+    if units.size:
+        errors = [values.get(name, 0.0) for name in _shapes(port, units.size)]
+        changes["shape_error"] = tuple((units * errors).tolist())
+    if delay := values.get(f"delay_{port.name}", 0.0) if isinstance(port, Sensor) else 0.0:
+        changes["delay"] = port.delay + delay * prior.sample_time
+    return replace(port, **changes) if changes else port
+
+
+def _shape_units(rig: Rig) -> Floats:
+    """Rms of each mode, its displacement or its slope, at all ports of that kind: (n_ports, n_modes)."""
+    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+    shapes, kinds = np.array([shape_of(rig.modes, port) for port in ports]), [derivative_of(port) for port in ports]
+    rms = {kind: np.sqrt((shapes[np.array(kinds) == kind] ** 2).mean(axis=0)) for kind in set(kinds)}
+    return np.array([rms[kind] for kind in kinds])
+
+
+def _gain(port: Actuator | Sensor) -> str:
+    """Name of the error of its gain: an actuator and a sensor may have one name."""
+    return f"gain_{_side(port)}_{port.name}"
+
+
+def _shapes(port: Actuator | Sensor, n_modes: int) -> list[str]:
+    """Names of the errors of the mode shapes there."""
+    return [f"shape_{_side(port)}_{port.name}_{r}" for r in range(1, n_modes + 1)]
+
+
+def _side(port: Actuator | Sensor) -> str:
+    return "of" if isinstance(port, Actuator) else "at"
 
 
 def parted(errors: Effect) -> tuple[Effect, Effect | None]:

@@ -190,6 +190,16 @@ class FitData:
     def _with_its_lead(self) -> "FitData":
         return replace(self, lead=0)
 
+    @property
+    def mixes_sensors(self) -> bool:
+        """Whether values of the residual are of several sensors at once."""
+        return bool(self.whiteners) or self.follower is not None or self.given_way is not None
+
+    @cached_property
+    def sources(self) -> np.ndarray:
+        """The number of the sensor that each value of the residual is of, (n_values,)."""
+        return np.concatenate([np.repeat(np.arange(len(r.outputs)), r.n_samples) for r in self.counted])
+
     def left_beside(self, rig: Rig, follower: Follower | None) -> list[np.ndarray]:
         """Measured less predicted (n_outputs, n_samples) a record; by laws on the measured motion with a follower."""
         if follower is None or not is_stepped(rig) or rig.stiffness_rate:

@@ -19,6 +19,7 @@ from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
+from workbench.gap.search.beside_modes import beside_modes
 from workbench.gap.search.beside_random import decide_on_random, random_beside, random_beside_errors
 from workbench.gap.search.finish import finished, ranked, relocated, simplest, widened
 from workbench.gap.search.fit import Fit, cost_of, fit
@@ -422,9 +423,12 @@ def _with_a_second(
         random = random_beside(search, singles) or random_beside_errors(search, beside.last)
         if random is not None:
             return random
-    if beside.is_enough or beside.by_singles():
+    enough = beside.is_enough or beside.by_singles()
+    if enough:
         beside.run()
-        return beside.decision()
+    by_mode = None if search.is_over or (enough and beside.is_believed) else beside_modes(beside)
+    if by_mode is not None or enough:
+        return (by_mode or beside).decision()
     varied = None if search.is_over else beside_records(beside)
     if varied is not None:
         return varied.decision()

@@ -101,6 +101,9 @@ class _Problem:
         # a believed value is one more measurement: of itself, by its own standard deviation
         self.believed = [j for j, (_, p) in enumerate(self.parameters) if p.prior_std is not None]
         self.prior_std = np.array([self.parameters[j][1].prior_std for j in self.believed])
+        self.is_known = known is not None  # whether the slopes along believed values stay as they are
+        self._jacobian: Floats | None = None
+        self._normal: Floats | None = None
 
     @cached_property
     def is_coarsened(self) -> bool:
@@ -128,33 +131,82 @@ class _Problem:
         on_coarse = self.residual(free, coarsely=True) if self.is_coarsened else None
         return (residual, False) if on_coarse is None else (on_coarse, True)
 
+    def _moved(self, free: np.ndarray, j: int) -> np.ndarray:
+        """The free coordinates with one a small step away, inside its bounds."""
+        parameter = self.parameters[j][1]
+        step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
+        moved = free.copy()
+        moved[j] += step
+        if self.high[j] < moved[j]:
+            moved[j] = free[j] - step
+        return moved
+
+    def _of_sensors_alone(self, numbers: Sequence[int]) -> list[list[tuple[int, np.ndarray]]]:
+        """Groups of numbers of different sensors, which one move tells apart, each with the values it alters.
+
+        None where values mix the readings of several sensors.
+        """
+        both = (e for e in (*self.effects, *self.held) if e.kind.path == "sensor" and isinstance(e.target, tuple))
+        if self.data.mixes_sensors or any(both) or any(sensor.crosstalk for sensor in self.rig.sensors):
+            return []
+        names = [sensor.name for sensor in self.rig.sensors]
+        sources = self.data.sources
+        by_sensor: dict[str, list[int]] = {}
+        for j in numbers:
+            by_sensor.setdefault(self.parameters[j][1].sensor, []).append(j)
+        own = {names.index(name): each for name, each in by_sensor.items() if name}
+        rows = {row: np.flatnonzero(sources == row) for row in own}
+        most = max(map(len, own.values()), default=0)
+        groups = [[(each[k], rows[row]) for row, each in own.items() if k < len(each)] for k in range(most)]
+        believed = {j: np.array([self.data.n_values + i]) for i, j in enumerate(self.believed)}
+        none = np.zeros(0, int)
+        return [[(j, np.concatenate([at, believed.get(j, none)])) for j, at in group] for group in groups]
+
     def jacobian(self, free: np.ndarray, residual: np.ndarray, coarsely: bool) -> np.ndarray:
-        """Differences from the residual that `near` gives."""
+        """Differences from the residual that `near` gives; the next call overwrites them."""
 
         def column(j: int) -> np.ndarray:
-            parameter = self.parameters[j][1]
-            step = 0.01 * self.steps[j] if parameter.logarithmic or parameter.name in COORDINATES else self.steps[j]
-            moved = free.copy()
-            moved[j] += step
-            if self.high[j] < moved[j]:
-                moved[j] = free[j] - step
+            moved = self._moved(free, j)
             beside = self.residual(moved, coarsely=coarsely)
             if beside is None:
                 moved[j] = 2.0 * free[j] - moved[j]
                 beside = self.residual(moved, coarsely=coarsely)
             return np.zeros_like(residual) if beside is None else (beside - residual) / (moved[j] - free[j])
 
-        fresh = [j for j in range(len(self.parameters)) if self.known is None or j not in self.believed]
-        jacobian = np.zeros((residual.size, len(self.parameters)), order="F")
+        if self._jacobian is None:
+            self._jacobian = np.zeros((residual.size, len(self.parameters)), order="F")
+            if self.known is not None:
+                self._jacobian[: len(self.known), self.believed] = self.known
+        jacobian = self._jacobian
+        fresh = [j for j in range(len(self.parameters)) if not self.is_known or j not in self.believed]
+        jacobian[:, fresh] = 0.0
+        for group in self._of_sensors_alone(fresh):
+            moved = free.copy()
+            for j, _ in group:
+                moved[j] = self._moved(free, j)[j]
+            beside = self.residual(moved, coarsely=coarsely)
+            if beside is None:
+                continue
+            for j, rows in group:
+                jacobian[rows, j] = (beside[rows] - residual[rows]) / (moved[j] - free[j])
+            fresh = [j for j in fresh if all(j != done for done, _ in group)]
         for j, found in zip(fresh, self.workers.map(column, fresh), strict=True):
             jacobian[:, j] = found
-        n_values = residual.size - len(self.believed)
-        if self.known is not None:
-            jacobian[:n_values, self.believed] = self.known
-            jacobian[n_values:, self.believed] = np.diag(1.0 / self.prior_std)
-        elif self.chord:
-            self.known = jacobian[:n_values, self.believed]
+        if self.is_known:
+            jacobian[residual.size - len(self.believed) :, self.believed] = np.diag(1.0 / self.prior_std)
+        self.is_known = self.is_known or self.chord
         return jacobian
+
+    def normal(self, jacobian: np.ndarray) -> np.ndarray:
+        """Jᵀ J; the part of sensitivities that are known is multiplied once."""
+        if not self.is_known or self._normal is None:
+            self._normal = jacobian.T @ jacobian
+            return self._normal
+        fresh = np.setdiff1d(np.arange(jacobian.shape[1]), self.believed)
+        product = self._normal.copy()
+        product[:, fresh] = jacobian.T @ jacobian[:, fresh]
+        product[fresh] = product[:, fresh].T
+        return product
 
 
 def parameters_of(rig: Rig, effects: Sequence[Effect]) -> list[tuple[int, Parameter]]:
@@ -187,7 +239,7 @@ def slopes(
         raise ValueError("the rig cannot be simulated with these effects")
     jacobian = problem.jacobian(problem.start, *problem.near(problem.start, residual))
     if wide:
-        problem.steps = -problem.steps
+        jacobian, problem.steps = jacobian.copy(), -problem.steps
         jacobian = 0.5 * (jacobian + problem.jacobian(problem.start, *problem.near(problem.start, residual)))
     return residual[: data.n_values], jacobian[: data.n_values]
 
@@ -239,7 +291,7 @@ def fit(
             break
         nearly, coarsely = problem.near(free, residual)
         jacobian = problem.jacobian(free, nearly, coarsely)
-        normal, gradient = jacobian.T @ jacobian, jacobian.T @ residual
+        normal, gradient = problem.normal(jacobian), jacobian.T @ residual
         diagonal = np.maximum(np.diag(normal), 1e-12 * max(np.diag(normal).max(), 1e-300))
         improved: np.ndarray | None = None
         for _ in range(7):

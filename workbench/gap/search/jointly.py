@@ -15,6 +15,12 @@ from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT, SELECTION
 
 
+def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
+    """Whether a careful laboratory could have a nominal model with these errors; those of damping where they count."""
+    widest = ((group, size) for group, size in JOINT.widest if damping or group != "damping")
+    return all(getattr(errors.target, group) < JOINT.plausible * size for group, size in widest)
+
+
 @dataclass(frozen=True, eq=False)
 class Step:
     """Effects beside nominal errors, fitted together.
@@ -46,7 +52,7 @@ class Step:
     @property
     def is_plausible(self) -> bool:
         """Whether a careful laboratory could have a nominal model with these errors."""
-        return all(getattr(self.errors.target, group) < JOINT.plausible * widest for group, widest in JOINT.widest)
+        return are_plausible(self.errors)
 
     def description(self, noise_power: np.ndarray, *, of_errors_alone: bool = False) -> float:
         """Description length, nats, of what is left above that noise and of the errors."""

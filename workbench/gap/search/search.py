@@ -41,6 +41,8 @@ class Search:
         held: effects that every candidate stands beside, as they are.
         logged: noise of the logged inputs, as a share of their rms, beside which residuals are seen.
         differs: the figure of the nominal model that may differ from record to record; empty for none.
+        by_mode: whether frequencies and shapes of the nominal modes are off by themselves, at every actuator and sensor,
+            not by smooth variations of mass and stiffness.
     """
 
     rig: Rig
@@ -54,6 +56,7 @@ class Search:
     held: tuple[Effect, ...] = ()
     logged: float = 0.0
     differs: str = ""
+    by_mode: bool = False
 
     @property
     def is_over(self) -> bool:
@@ -158,13 +161,15 @@ class Search:
     @property
     def prior(self) -> NominalPrior:
         """What the nominal model may be off by before any record is seen."""
-        structured = isinstance(self.rig.structure, Structure)
+        structured, by_mode = isinstance(self.rig.structure, Structure), self.by_mode
         return NominalPrior(
-            stiffness=0.02 if structured else 0.0,
-            mass=0.02,
-            frequency=0.0 if structured else 0.005,
+            stiffness=0.02 if structured and not by_mode else 0.0,
+            mass=0.0 if by_mode else 0.02,
+            frequency=0.0 if structured and not by_mode else 0.005,
             damping=0.2,
             delay=0.1,
+            gain=0.01,
+            shape=0.01 if by_mode else 0.0,
             record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,
             records=tuple(record.name for record in self.data.records) if self.differs else (),

@@ -158,6 +158,8 @@ class JointSettings:
         ("frequency", 0.01),
         ("damping", 0.25),
         ("delay", 0.5),
+        ("gain", 0.02),
+        ("shape", 0.05),
         ("record", 0.02),
     )
     # share of the widest that errors of a careful laboratory keep within; where they are larger, an effect that makes
@@ -170,6 +172,8 @@ class JointSettings:
         ("frequency", 0.001),
         ("damping", 0.1),
         ("delay", 0.1),
+        ("gain", 0.002),
+        ("shape", 0.002),
         ("record", 0.001),
     )
     decisive: float = 300.0  # description length, nats, of a factor e in the power that is left above the noise
@@ -223,6 +227,9 @@ class StepwiseSettings:
     ahead: float = 0.005  # share of the cost one sample ahead that the best candidate must take away to be tried at all
     simpler: float = 0.05  # share by which a set may leave more above the noise and still be taken for being simpler
     needless: float = 0.3  # likewise, for a set with one effect less
+    # share of the nominal gap's power from which on errors of each mode, small as they are, cannot be what is missing
+    of_modes: float = 0.1
+    halved: float = 0.5  # share of what others leave above the noise that makes errors of each mode worth a search
     explained: float = 0.01  # share of the nominal gap's power above the noise that an explanation may leave
     further: float = 1e-3  # likewise, that a further effect is looked for to explain
     in_part: float = 0.2  # likewise, for effects that are named although something else is there

@@ -21,7 +21,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
-from workbench.gap.search.jointly import Step, fit_jointly, measured, on_their_sides, opened
+from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened
 from workbench.gap.search.plain import COMMON, in_place_of_errors, one_late
 from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
 from workbench.gap.search.selection import fitted_ahead, one_more
@@ -60,7 +60,7 @@ class Stepwise:
         self.is_beyond = False
         search.report("small errors of the nominal model", 0.4)
         self.steps: list[Step] = []
-        self.steps.append(self._afresh(()))
+        self.steps.append(self.afresh(()))
         self._with_input_noise(self.last)
 
     @property
@@ -75,7 +75,7 @@ class Stepwise:
     @cached_property
     def _alone(self) -> list[Step]:
         """The likeliest single effects beside errors that start from none, best first."""
-        found = self.search.workers.map(self._afresh, [f.effects for f in self._likeliest_alone()])
+        found = self.search.workers.map(self.afresh, [f.effects for f in self._likeliest_alone()])
         return sorted((s for s in found if not self._is_timing(s)), key=lambda s: s.fit.cost)
 
     def _likeliest_alone(self) -> list[Fit]:
@@ -113,12 +113,12 @@ class Stepwise:
         self.steps.append(self._finely(self.last))
         return True
 
-    def run(self) -> None:
-        """Add effects as long as each takes most of what is left above the noise; once."""
+    def run(self, most: int = STEPWISE.most) -> None:
+        """Add effects as long as each takes most of what is left above the noise, at most so many; once."""
         if self.is_run:
             return
         self.is_run = True
-        while len(self.last.effects) < STEPWISE.most and not (self.is_enough and self._is_spotless):
+        while len(self.last.effects) < most and not (self.is_enough and self._is_spotless):
             if self.search.is_over:
                 break
             before = self.last
@@ -241,6 +241,11 @@ class Stepwise:
     def is_quiet(self) -> bool:
         """Whether next to nothing is left but noise of sensors and logged inputs."""
         return self.last.excess(self.last.noise_power) < STEPWISE.no_gap * float(self.last.noise_power.mean())
+
+    @property
+    def is_believed(self) -> bool:
+        """Whether a careful model may have the errors of the last set, those of damping apart: it is hardly known."""
+        return self.plain is not None or are_plausible(self.last.errors, damping=False)
 
     @property
     def is_settled(self) -> bool:
@@ -448,7 +453,7 @@ class Stepwise:
             [effects for effects in sets if can_be(self.search.rig, effects)],
         )
 
-    def _afresh(self, effects: tuple[Effect, ...]) -> Step:
+    def afresh(self, effects: tuple[Effect, ...]) -> Step:
         """The effects beside errors that start from none, fitted to all records.
 
         Where frequencies are off, motions of whole records run out of step, and the way is told one sample ahead.
@@ -462,7 +467,7 @@ class Stepwise:
         if again.target.late != none.target.late:
             ahead = min(ahead, self._ahead(others, again), key=lambda each: each.cost)
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
-        if found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
+        if search.by_mode or found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
             return found
         return min(found, fit_jointly(search, effects, none), key=lambda s: s.fit.cost)
 
@@ -477,7 +482,7 @@ class Stepwise:
         Errors that were fitted before an effect was there have bent to it, and may be in another valley, so they start
         from none; and only where that does not explain the records, from what they were, too.
         """
-        fresh = self._afresh(step.effects)
+        fresh = self.afresh(step.effects)
         if self.explains(fresh):
             return fresh
         return min(fresh, fit_jointly(self.search, step.effects, step.errors, rounds=2), key=lambda s: s.fit.cost)
