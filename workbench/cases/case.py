@@ -347,9 +347,9 @@ def _sensor(entry: dict[str, Any], at: Place, modes: Modes) -> Sensor:
     quantity = entry.get("quantity")
     if quantity not in MEASURED:
         raise CaseError(f"{where}: quantity is one of {', '.join(MEASURED)}; got {shown(quantity)}")
-    noise = number(entry, "noise_std", where, low=0.0)
-    if noise == 0:
-        raise CaseError(f"{where}: noise_std must be positive; the diagnosis weights every residual by it")
+    noise = number(entry, "noise_std", where, low=0.0) if "noise_std" in entry else 0.0
+    if noise == 0 and "noise_std" in entry:
+        raise CaseError(f"{where}: noise_std must be positive; leave it out where it is not known")
     direction = _direction(entry, MEASURED[quantity][0] == 1, where)
     sensor = Sensor(entry["name"], at, quantity, noise_std=noise, direction=direction)
     _check_stands(sensor, modes, where)

@@ -1,6 +1,7 @@
 """The diagnosis from end to end: rig and records in, verdict out."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from workbench.gap.effects.effect import Effect, Kind, apply_all, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, IdentifiedPrior
 from workbench.gap.localisation.force_localisation import locate_force
 from workbench.gap.localisation.where import locate
+from workbench.gap.prediction.noise import noise_guessed
 from workbench.gap.prediction.workers import Workers
 from workbench.gap.report.budget import (
     Budget,
@@ -65,7 +67,7 @@ def diagnose(
     The search sees `records` alone; `validation` is opened once, after the last fit, to measure the shrinkage.
 
     Args:
-        rig: nominal; its sensors carry noise_std.
+        rig: nominal; for a sensor without noise_std, what lies under the peaks of its spectrum is taken.
         records: with the rig's inputs and outputs, in its order.
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
@@ -84,7 +86,7 @@ def diagnose(
 
     Raises:
         ValueError: records that do not fit the rig or cannot be of it, a validation record that repeats one to be
-            fitted, modes that are not those of the structure, or sensors without noise_std.
+            fitted, or modes that are not those of the structure.
     """
     deadline = Deadline(None if seconds is None else SEARCH_SHARE * seconds)
     for record in (*records, *validation):
@@ -94,6 +96,10 @@ def diagnose(
     check_modes(rig)
     check_records(rig, records, settle=settle)
     check_kept_apart(records, validation)
+    silent = [sensor.name for sensor in rig.sensors if not sensor.noise_std]
+    if silent:
+        each = zip(rig.sensors, noise_guessed(rig, records), strict=True)
+        rig = replace(rig, sensors=tuple(replace(s, noise_std=s.noise_std or float(guess)) for s, guess in each))
     faults = () if settle else wiring(rig, records)
     sharing = Workers.at_hand() if workers is None else Workers(workers)
     report("looking for the unmodelled force", 0.02)
@@ -144,7 +150,15 @@ def diagnose(
             budget=budget,
             experiment=_next(rig, attribution, sharing),
             tolerance=tolerance,
-            notes=(*(fault.sentence for fault in faults), *_notes(attribution, outcome, budget, seconds)),
+            notes=(
+                *(fault.sentence for fault in faults),
+                *(
+                    [f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."]
+                    if silent
+                    else []
+                ),
+                *_notes(attribution, outcome, budget, seconds),
+            ),
         )
 
 

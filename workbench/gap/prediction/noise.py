@@ -6,7 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from workbench.arrays import Floats
+from workbench.arrays import Flags, Floats
+from workbench.records.record import Record
+from workbench.rig.rig import Rig
+from workbench.rig.simulate import predict
 
 
 @dataclass(frozen=True)
@@ -20,6 +23,7 @@ class NoiseSettings:
     alike: float = 1.3  # times the power of the quietest record: noise as strong in two records
     same: float = 1.1  # likewise: what differs from it by chance alone
     loud: float = 0.5  # of the mean square: peaks that hold less are not worth leaving out
+    flat: float = 0.6  # likewise, of a spectrum that has none: 0.8 and more of white noise in 1400 samples
 
 
 NOISE = NoiseSettings()
@@ -43,6 +47,24 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     noise = np.where(same, whole, 0.0).sum(axis=0) / same.sum(axis=0)
     power: Floats = np.where(alike | (under > NOISE.loud * whole[0]), noise, under)
     return np.sqrt(power)
+
+
+def is_flat(residuals: Sequence[np.ndarray]) -> Flags:
+    """Whether the spectrum of each sensor (n_outputs,) has no peaks in any record: then it is noise, however loud."""
+    shares = np.array([_under_peaks(residual) / (residual**2).mean(axis=1) for residual in residuals])
+    flat: Flags = shares.min(axis=0) > NOISE.flat
+    return flat
+
+
+def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
+    """Standard deviation of each sensor's noise (n_outputs,) before anything is known of the gap, at most.
+
+    It lies under the peaks of what was measured, and of what the rig leaves of that.
+    """
+    measured = noise_found([record.outputs for record in records])
+    left = noise_found([record.outputs - predict(rig, record) for record in records])
+    guess: Floats = np.minimum(measured, left)
+    return guess
 
 
 def _under_peaks(residual: Floats) -> Floats:

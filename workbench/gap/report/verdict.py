@@ -11,7 +11,7 @@ from workbench.gap.effects.catalogue import in_words
 from workbench.gap.effects.effect import ALL, COORDINATES, Effect, names_in
 from workbench.gap.effects.nominal import NOMINAL_ERRORS
 from workbench.gap.localisation.where import Where
-from workbench.gap.report.budget import Budget, Shrinkage, labels_of
+from workbench.gap.report.budget import REMARKED, Budget, Shrinkage, labels_of
 from workbench.gap.report.experiment import Experiment
 from workbench.gap.report.readiness import Readiness
 from workbench.gap.report.record_to_record import RecordToRecord
@@ -103,7 +103,8 @@ class Verdict:
         named = [_described(effect, self.nominal) for effect in self._told]
         words = " and ".join(named)
         if self.outcome == "none":
-            if self.nominal_errors is None and self.where.beyond_noise == 0:
+            louder = self.budget.noise_ratio > REMARKED and self.budget.unexplained < SHOWN
+            if self.nominal_errors is None and (self.where.beyond_noise == 0 or louder):
                 return "There is no gap beyond the noise of the sensors."
             if self.nominal_errors is None:
                 below = f", below the tolerance of {100.0 * self.tolerance:g} %" if self.tolerance else ""

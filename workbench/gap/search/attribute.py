@@ -15,7 +15,7 @@ from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.logged_inputs import logging_noise
-from workbench.gap.prediction.noise import noise_found
+from workbench.gap.prediction.noise import is_flat, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -201,6 +201,8 @@ def attribute(
     ahead: list[Fit] = []
     if not seen and _is_small(found.nominal, tolerance):
         decision = Decision("none", start)
+    elif not search.explains(start) and is_flat(evidence.residuals).all():
+        decision = Decision("none", start, noise=noise_found(evidence.residuals))
     elif free_nominal and not search.explains(start):
         decision = _beside_nominal_errors(search, tolerance)
     elif not search.explains(start) and not _of_one_sensor(start):
@@ -235,7 +237,10 @@ def attribute(
         best = _settled(search, best)
         if outcome == "explained":
             best = _as_it_stands(within, best, seen, logged)
-            outcome = outcome if any(not e.kind.first for e in best.effects) else "none"
+            named = [e for e in best.effects if not e.kind.first]
+            # no number of it is known: something is there, and that is all
+            vague = any(not e.stands_out(search.rig) for e in named if e not in seen)
+            outcome = "none" if not named else "unknown" if vague else outcome
     if noise is None:
         noise = noise_of(search, best) if random is None else search.data.noise
     report("done", 1.0)

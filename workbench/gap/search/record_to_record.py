@@ -8,6 +8,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.record_to_record import differing, figures_of
+from workbench.gap.search.fit import finite_residual
 from workbench.gap.search.jointly import Step
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import RECORDS
@@ -38,8 +39,10 @@ class Deviations:
         return bool(self.values[j] - self.values[i] > RECORDS.sure * np.hypot(self.spread[i], self.spread[j]))
 
 
-def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviations:
+def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviations | None:
     """The deviation of each record that leaves least of it, of a few that are tried and a parabola between them.
+
+    None where the structure cannot have one of them: a beam that is free at both ends bears no compression.
 
     Its standard deviation is that of a linear fit, from the scatter of its gradient over blocks of the record.
 
@@ -52,7 +55,9 @@ def deviations(search: Search, effects: Sequence[Effect], figure: str) -> Deviat
     ends = np.cumsum([record.outputs.size for record in data.counted])[:-1]
     residuals = []  # by deviation tried, by record
     for deviation in RECORDS.tried:
-        residual = data.residual(differing(rig, figure, dict.fromkeys(names, deviation)))
+        residual = finite_residual(differing(rig, figure, dict.fromkeys(names, deviation)), (), data)
+        if residual is None:
+            return None
         residuals.append(np.split(residual, ends))
     costs = np.array([[float(r @ r) / r.size for r in each] for each in residuals])
     least = [_least(cost) for cost in costs.T]
@@ -95,7 +100,8 @@ def likeliest(search: Search, step: Step) -> Deviations | None:
         return None
     noise = float(step.noise_power.mean())
     found = [deviations(search, step.fit.effects, figure) for figure in figures_of(search.rig)]
-    promising = [d for d in found if d.is_sure and d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
+    sure = [d for d in found if d is not None and d.is_sure]
+    promising = [d for d in sure if d.in_common - d.left > RECORDS.enough * (d.in_common - noise)]
     return min(promising, key=lambda d: d.left * (RECORDS.clearly if d is found[0] else 1.0), default=None)
 
 

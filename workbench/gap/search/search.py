@@ -41,7 +41,7 @@ class Search:
         held: effects that every candidate stands beside, as they are.
         logged: noise of the logged inputs, as a share of their rms, beside which residuals are seen.
         differs: the figure of the nominal model that may differ from record to record; empty for none.
-        by_mode: whether frequencies and shapes of the nominal modes are off by themselves, at every actuator and sensor,
+        by_mode: whether frequencies and shapes of the nominal modes are off by themselves, the latter at every port,
             not by smooth variations of mass and stiffness.
     """
 

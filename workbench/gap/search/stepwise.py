@@ -450,7 +450,7 @@ class Stepwise:
         """Sets that can be, beside errors that start as those of a step, fitted to the most telling records."""
         return self.search.workers.map(
             lambda effects: fit_jointly(self.search, effects, step.errors, rounds=2, known=known),
-            [effects for effects in sets if can_be(self.search.rig, effects)],
+            [effects for effects in sets if can_be(self.search.rig, (*effects, step.errors))],
         )
 
     def afresh(self, effects: tuple[Effect, ...]) -> Step:
