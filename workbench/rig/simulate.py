@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -54,18 +53,18 @@ from workbench.rig.stepping import (
 )
 from workbench.structure.domain import Between, Patch, PlaceError
 
-LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
-    LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
-    LinearDamper: (LINEAR_DAMPER, lambda e: (e.coefficient,)),
-    CubicSpring: (CUBIC, lambda e: (e.stiffness,)),
-    PowerSpring: (POWER_SPRING, lambda e: (e.force, e.reference, e.exponent)),
-    EvenSpring: (EVEN_SPRING, lambda e: (e.force, e.reference, e.exponent)),
-    PowerDamper: (POWER_DAMPER, lambda e: (e.force, e.reference, e.exponent)),
-    Clearance: (CLEARANCE, lambda e: (e.stiffness, e.gap)),
-    OneSidedStop: (ONE_SIDED, lambda e: (e.stiffness, e.gap)),
-    CoulombFriction: (FRICTION, lambda e: (e.force, e.smoothing_speed, e.offset)),
-    BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
-    UserLaw: (USER, lambda e: e.parameters),
+LAWS: dict[type[PointElement], int] = {
+    LinearSpring: LINEAR_SPRING,
+    LinearDamper: LINEAR_DAMPER,
+    CubicSpring: CUBIC,
+    PowerSpring: POWER_SPRING,
+    EvenSpring: EVEN_SPRING,
+    PowerDamper: POWER_DAMPER,
+    Clearance: CLEARANCE,
+    OneSidedStop: ONE_SIDED,
+    CoulombFriction: FRICTION,
+    BoucWen: BOUC_WEN,
+    UserLaw: USER,
 }
 QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
@@ -502,12 +501,11 @@ def law_arrays(rig: Rig, points: Sequence[PointElement]) -> tuple[Integers, Floa
     of_the_users_own = any(isinstance(e, UserLaw) for e in points)
     parameters = np.zeros((len(points), N_PARAMETERS + of_the_users_own))
     for row, element in zip(parameters, points, strict=True):
-        values = LAWS[type(element)][1](element)
-        row[: len(values)] = values
+        row[: len(element.parameters)] = element.parameters
         if isinstance(element, UserLaw):
             row[-1] = address_of(element.law)
     shapes = np.array([rig.modes.phi_at(e.at) for e in points]).reshape(len(points), rig.modes.n_modes)
-    return np.array([LAWS[type(e)][0] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
+    return np.array([LAWS[type(e)] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
 
 
 def along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:
