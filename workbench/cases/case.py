@@ -21,7 +21,7 @@ from workbench.cases.tables import (
     text,
 )
 from workbench.records.files import read_record
-from workbench.records.limits import RecordFileError, check_size
+from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
 from workbench.records.record import HOLDS, Channel, Record
 from workbench.rig.actuators import Actuator, piezo_patch
@@ -437,7 +437,7 @@ def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
     try:
-        check_size(file)
+        check_file(file)
         arrays = load_arrays(file) if file.suffix == ".npz" else _signals(read_record(file))
     except RecordFileError as error:
         raise CaseError(str(error)) from error

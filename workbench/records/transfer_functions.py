@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from workbench.records.assembly import legible
 from workbench.records.confined import load_confined
-from workbench.records.limits import RecordFileError
+from workbench.records.limits import RecordFileError, check_file
 from workbench.records.record import Channel, Record
 from workbench.records.units import split_unit, unit_named
 from workbench.structure.modes import frozen
@@ -262,8 +262,7 @@ def read_transfer(
         RecordFileError: a file that cannot be read, lacks an array, or has another number of columns.
     """
     path = Path(path)
-    if not path.is_file():
-        raise RecordFileError(f"{path}: there is no such file")
+    check_file(path)
     arrays = load_confined("workbench.records.mat_file", path)
     for name in (matrix, sample_rate):
         if name not in arrays:

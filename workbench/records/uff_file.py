@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pyuff
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import DEFAULT, Limits, RecordFileError
+from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_functions import DESCRIPTION
 
@@ -21,11 +22,7 @@ TRANSFER = 4  # func_type of the format
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
-
-
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """What the file holds, by name."""
-    return load_confined(__name__, path, limits)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:

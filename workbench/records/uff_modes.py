@@ -4,6 +4,7 @@ Data set 164 says how many of its units a metre and a newton are. Shapes stay as
 displacements; coordinates become m, rotations rad a metre, and modal masses kg.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +20,7 @@ COMPLEX = (5, 6)  # data_type of both formats
 MOTIONS = (0, 1, 8)  # kinds of result that are shapes: unknown, general, displacement; others are forces, stresses, ...
 ALIKE = 1e-4  # of the coordinates: data set 15 writes six digits, 2411 sixteen
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-
-
-def arrays(path: Path) -> dict[str, np.ndarray]:
-    """The modes of the file, by the names that `modes_file` knows."""
-    return load_confined(__name__, path)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
