@@ -42,16 +42,7 @@ TABLES = ("title", "input_hold", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
-PLATE = (
-    "kind",
-    "length",
-    "mass_per_area",
-    "bending_stiffness",
-    "poisson_ratio",
-    "edges",
-    "damping_ratio",
-    "modes",
-)
+PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")

@@ -19,8 +19,7 @@ VerdictPath = Annotated[
 Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")]
 # a bracket that opens a word would be taken for markup of the help text
 RigPath = Annotated[
-    Path,
-    typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one."),
+    Path, typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one.")
 ]
 ImpulseAt = Annotated[
     str | None,

@@ -35,12 +35,10 @@ def place(
     peak_force: Annotated[float, typer.Option(help="Force limit of each actuator, N.")] = math.inf,
     condition: Annotated[float, typer.Option(help="Limit of the condition number of B (Frobenius).")] = math.inf,
     forbid: Annotated[
-        list[str] | None,
-        typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate."),
+        list[str] | None, typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate.")
     ] = None,
     at: Annotated[
-        str | None,
-        typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names."),
+        str | None, typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names.")
     ] = None,
     grid: Annotated[
         float | None, typer.Option(metavar="M", help="Candidates on a grid over a plate, so far apart, m.")

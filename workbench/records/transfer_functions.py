@@ -242,12 +242,7 @@ def _points(
 
 
 def read_transfer(
-    path: str | Path,
-    *,
-    positions: Sequence[float],
-    quantity: str,
-    matrix: str = "yspec",
-    sample_rate: str = "freq",
+    path: str | Path, *, positions: Sequence[float], quantity: str, matrix: str = "yspec", sample_rate: str = "freq"
 ) -> Record:
     """Impulse responses from the transfer functions of a MAT file, one column a point.
 

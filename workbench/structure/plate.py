@@ -316,11 +316,7 @@ def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]
     )
 
 
-ROTATIONAL = {
-    PointMass: "rotary_inertia",
-    PointSpring: "rotational_stiffness",
-    PointDamper: "rotational_coefficient",
-}
+ROTATIONAL = {PointMass: "rotary_inertia", PointSpring: "rotational_stiffness", PointDamper: "rotational_coefficient"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -70,12 +70,7 @@ class ElementModes:
 
 
 def element_modes(
-    member: Structure,
-    places: np.ndarray,
-    n_modes: int,
-    *,
-    altered: Alterations = AS_NOMINAL,
-    elements: int = ELEMENTS,
+    member: Structure, places: np.ndarray, n_modes: int, *, altered: Alterations = AS_NOMINAL, elements: int = ELEMENTS
 ) -> ElementModes:
     """The lowest modes of an altered member, K v = ω² M v, with a node at every place.
 

@@ -32,12 +32,7 @@ CUBICS = (  # of the place t in an element: value and slope at its left node, th
 
 
 def plate_modes(
-    plate: Plate,
-    places: Sequence[Any],
-    n_modes: int,
-    *,
-    altered: Alterations = AS_NOMINAL,
-    elements: int = ELEMENTS,
+    plate: Plate, places: Sequence[Any], n_modes: int, *, altered: Alterations = AS_NOMINAL, elements: int = ELEMENTS
 ) -> ElementModes:
     """The lowest modes of an altered plate, K v = ω² M v.
 

@@ -208,10 +208,7 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     for part in _parts(n):
         drift = (_polynomials(np.arange(part.start, part.stop), n, degree)[:, 1:] @ weights).T
         outputs[:, part] -= drift
-        lowest, topmost = (
-            np.minimum(lowest, drift.min(axis=1)),
-            np.maximum(topmost, drift.max(axis=1)),
-        )
+        lowest, topmost = (np.minimum(lowest, drift.min(axis=1)), np.maximum(topmost, drift.max(axis=1)))
     return Drift(replace(record, outputs=outputs), frozen(topmost - lowest))
 
 
