@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.arrays import Floats
+from workbench.arrays import symmetric_root
 from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
@@ -85,22 +85,16 @@ def draw_modes(
     rng = np.random.default_rng(seed)
     n = modes.n_modes
     centre = np.r_[modes.omega, modes.zeta]
-    drawn = centre + scale * rng.standard_normal((count, 2 * n)) @ _root(modes.covariance).T
+    drawn = centre + scale * rng.standard_normal((count, 2 * n)) @ symmetric_root(modes.covariance).T
     mixing = np.zeros((count, n, n))
     if shape_covariance is not None and positions is not None:
         at = modes.phi(positions)
         known = np.linalg.pinv(at)
         for r, covariance in enumerate(np.asarray(shape_covariance, float)):
             largest = np.abs(at[:, r]).max()
-            error = largest * rng.standard_normal((count, len(at))) @ _root(covariance).T
+            error = largest * rng.standard_normal((count, len(at))) @ symmetric_root(covariance).T
             mixing[:, :, r] = scale * error @ known.T
     return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
-
-
-def _root(covariance: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(covariance)
-    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
 
 
 def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:

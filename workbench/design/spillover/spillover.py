@@ -22,6 +22,7 @@ from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
+from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed
 
@@ -158,12 +159,10 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
     edges = np.concatenate(
         [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(events[:-1], events[1:], pieces)] + [[final_time]]
     )
-    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
-    width = 0.5 * np.diff(edges)[:, None]
-    at = (edges[:-1, None] + width * (1 + points)).ravel()
+    at, weights = gauss_between(edges, GAUSS_POINTS)
     response = motion(modes, law, state, at, stretches)
     power = (input_matrix(modes, law.actuators) @ response.forces) * response.modal[modes.n_modes :]
-    return Spillover(power @ (width * weights).ravel(), law.controlled, final_time)
+    return Spillover(power @ weights, law.controlled, final_time)
 
 
 def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
