@@ -115,11 +115,6 @@ class Interval:
         """Gauss-Legendre points (n,), m, and weights (n,), m: ∫ f dx = Σ w f."""
         return gauss_between(np.array([0.0, self.length]), n)
 
-    def distance(self, one: Place, other: Place) -> float:
-        """Between two places, m."""
-        x, y = self.locate([one, other])
-        return float(abs(x - y))
-
     def separation(self, one: Where, other: Where) -> float:
         """Distance between two places over the length."""
         return abs(float(one) - float(other)) / self.length  # type: ignore[arg-type]
@@ -253,11 +248,6 @@ class Rectangle:
         a, b = self.length
         x, y = np.meshgrid(0.5 * a * (points + 1.0), 0.5 * b * (points + 1.0), indexing="ij")
         return np.column_stack([x.ravel(), y.ravel()]), 0.25 * a * b * np.outer(weights, weights).ravel()
-
-    def distance(self, one: Place, other: Place) -> float:
-        """Between two places, m."""
-        p, q = self.locate([one, other])
-        return float(np.hypot(*(p - q)))
 
     def separation(self, one: Where, other: Where) -> float:
         """Distance between two places over the diagonal."""
@@ -440,15 +430,6 @@ class NamedPoints:
             PlaceError: always.
         """
         raise PlaceError("named points have no shapes between them to integrate; describe the structure as a member")
-
-    def distance(self, one: Place, other: Place) -> float:
-        """Between two points, m.
-
-        Raises:
-            PlaceError: positions are not known.
-        """
-        i, j = self.locate([one, other])
-        return float(np.linalg.norm(self._positions[i] - self._positions[j]))
 
     def separation(self, one: Where, other: Where) -> float:
         """0 for the same place and 1 for another: there is no way from one to the other."""
