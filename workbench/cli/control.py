@@ -66,8 +66,8 @@ def observed(
         ValueError: an estimator that is none, a law that switches, or no such output.
     """
     from workbench.design.estimation.controller import filtered
+    from workbench.design.estimation.modal_filter import filter_on
     from workbench.design.estimation.observers import kalman, luenberger
-    from workbench.design.estimation.surface_filter import filter_on
     from workbench.design.laws.law import Law
     from workbench.design.spillover.comparison import OBSERVER_POLES
     from workbench.rig.sensors import MEASURED

@@ -67,8 +67,8 @@ def identify(
     for line in found.lines:
         say(f"  {line.replace('`seconds`', '--seconds')}")
     if page is not None:
-        from workbench.study.identification_page import identification_page
         from workbench.study.pages.page import write_page
+        from workbench.study.report import identification_page
 
         made_by = " ".join(["workbench identify", *map(str, records)])
         say(f"  page {short(write_page(page, identification_page(found, read, made_by=made_by)))}")

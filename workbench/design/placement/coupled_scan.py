@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
+from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
-from workbench.design.estimation.surface_filter import filter_of_mass
+from workbench.design.estimation.modal_filter import filter_of_mass
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.design.placement.places import as_places
 from workbench.structure.domain import Interval, Place, Rectangle, listed, same_place

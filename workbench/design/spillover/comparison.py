@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.design.estimation.controller import Controller, filtered
+from workbench.design.estimation.modal_filter import filter_on
 from workbench.design.estimation.observers import luenberger
-from workbench.design.estimation.surface_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
