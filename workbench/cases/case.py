@@ -23,7 +23,7 @@ from workbench.cases.tables import (
 from workbench.records.files import read_record
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
-from workbench.records.record import HOLDS, Channel, Record
+from workbench.records.record import HOLDS, Record
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig, derivative_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -407,15 +407,8 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> R
             raise CaseError(
                 f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?"
             )
-    return Record(
-        sample_time=sample_time,
-        outputs=np.array([arrays[s.name] for s in rig.sensors]),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=np.array([arrays[a.name] for a in rig.actuators]),
-        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
-        input_hold=_hold(entry, where),
-        name=name,
-    )
+    inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
+    return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
 
 
 def _signals(record: Record) -> dict[str, np.ndarray]:

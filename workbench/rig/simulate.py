@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from workbench.arrays import Floats, Integers
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
 from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
 from workbench.rig.between_samples import BetweenSamples, Step
@@ -114,15 +114,8 @@ def simulate(
             f"inputs must have shape ({len(rig.actuators)} actuators, n_samples); got {inputs.shape}. Is time last?"
         )
     motion = move(rig, inputs, sample_time=sample_time, substeps=substeps, input_hold=input_hold)
-    return Record(
-        sample_time=sample_time,
-        outputs=read(rig, motion, sample_time=sample_time),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=inputs,
-        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
-        input_hold=input_hold,
-        name=name,
-    )
+    outputs = read(rig, motion, sample_time=sample_time)
+    return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=input_hold)
 
 
 def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
