@@ -15,7 +15,7 @@ from workbench.records.confined import load_confined
 from workbench.records.limits import RecordFileError, check_file
 from workbench.records.record import Channel, Record
 from workbench.records.units import split_unit, unit_named
-from workbench.structure.modes import frozen
+from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed, counted, place_text
 
 # Names, in small letters, under which programs keep the lines, the sample rate, and where the points are.
@@ -56,8 +56,8 @@ class TransferFunctions(Printed):
     name: str = "transfer functions"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", frozen(self.values, complex))
-        object.__setattr__(self, "frequencies_hz", frozen(self.frequencies_hz))
+        freeze(self, "values", dtype=complex)
+        freeze(self, "frequencies_hz")
         shape = (len(self.output_channels), len(self.references), self.frequencies_hz.size)
         if self.values.shape != shape:
             raise ValueError(

@@ -40,6 +40,14 @@ def frozen(array: ArrayLike, dtype: type = float) -> np.ndarray:
     return copy
 
 
+def freeze(owner: object, *names: str, dtype: type | None = float) -> None:
+    """Make fields of a frozen type read-only copies, for its `__post_init__`; no dtype for places, numbers or names."""
+    for name in names:
+        value = getattr(owner, name)
+        kind = dtype or (object if np.asarray(value).dtype.kind in "OU" else float)
+        object.__setattr__(owner, name, frozen(value, kind))
+
+
 def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
     """A = [0 I; -S -C] of q'' + C q' + S q = f, states (q_1..q_n, q_1'..q_n'): (2 n_modes, 2 n_modes), rad/s.
 
@@ -305,10 +313,9 @@ class SampledModes(Printed):
     positions: np.ndarray
 
     def __post_init__(self) -> None:
-        named = np.asarray(self.positions).dtype.kind in "OU"
-        for name, dtype in (("omega", float), ("zeta", float), ("shapes", complex)):
-            object.__setattr__(self, name, frozen(getattr(self, name), dtype))
-        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+        freeze(self, "omega", "zeta")
+        freeze(self, "shapes", dtype=complex)
+        freeze(self, "positions", dtype=None)
         n, m = self.omega.size, len(self.positions)
         if self.zeta.shape != (n,) or self.shapes.shape != (m, n):
             raise ValueError(

@@ -17,7 +17,7 @@ from workbench.arrays import Floats
 from workbench.structure.domain import Between, Domain, NamedPoints, Where, position
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.supports import HELD
 
 ELEMENTS = 240
@@ -65,8 +65,7 @@ class ElementModes:
     gram: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("omega", "shapes", "gram"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "omega", "shapes", "gram")
 
 
 def element_modes(

@@ -17,7 +17,7 @@ from scipy.interpolate import BSpline, RBFInterpolator, make_interp_spline
 from workbench.arrays import Floats
 from workbench.structure.domain import NamedPoints, Place, Rectangle, same_place
 from workbench.structure.member import Structure
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.plate import Membrane, Plate
 from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import FieldLike, Profile, ProfileLike, as_field, as_profile
@@ -48,10 +48,8 @@ class ModalFilter(Printed):
     designed_by: Callable[[Modes, Sequence[int]], "ModalFilter"] | None = None
 
     def __post_init__(self) -> None:
-        named = np.asarray(self.positions).dtype.kind in "OU"
-        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
-        for name in ("displacement", "slope"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "positions", dtype=None)
+        freeze(self, "displacement", "slope")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         n_modes, n_sensors = self.displacement.shape

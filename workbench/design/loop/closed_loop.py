@@ -14,7 +14,7 @@ from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import place_text
 
 UNSEEN = 1e-9
@@ -72,8 +72,7 @@ class Response:
     modes: Modes
 
     def __post_init__(self) -> None:
-        for name in ("time", "modal", "forces"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "time", "modal", "forces")
 
     def displacement(self, x: ArrayLike) -> Floats:
         """w(x, t): (n_points, n_times)."""

@@ -22,7 +22,7 @@ from workbench.design.placement.places import as_places, coordinates, least_dist
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Rectangle, centred_at, listed, reach
-from workbench.structure.modes import Modes, frozen, modal_state_matrix
+from workbench.structure.modes import Modes, freeze, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
 SINGULAR_SHARE = 1e-14
@@ -63,9 +63,8 @@ class Placement(Printed):
     spacing: float = np.inf
 
     def __post_init__(self) -> None:
-        dtype = object if np.asarray(self.positions).dtype.kind in "OU" else float
-        object.__setattr__(self, "positions", frozen(self.positions, dtype))
-        object.__setattr__(self, "by_mode", frozen(self.by_mode))
+        freeze(self, "positions", dtype=None)
+        freeze(self, "by_mode")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         count = len(self.positions)

@@ -19,7 +19,7 @@ from workbench.arrays import Floats
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.task import extent, participation_along
 from workbench.rig.actuators import Actuator
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import Printed
 
 GRID = 4_001  # places at which the largest curvature of the participation is looked for
@@ -47,8 +47,7 @@ class FeedbackTask:
     spacing: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gain", frozen(self.gain))
-        object.__setattr__(self, "state", frozen(self.state))
+        freeze(self, "gain", "state")
         if self.gain.ndim != 2 or self.gain.shape[0] != self.gain.shape[1]:
             raise DesignError(f"the feedback gain must be square, one row a pair; got shape {self.gain.shape}")
         if self.state.shape != (2 * self.modes.n_modes,):

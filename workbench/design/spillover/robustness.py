@@ -15,7 +15,7 @@ from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.threads import one_blas_thread
 
 LEAST_OMEGA = 1e-3
@@ -34,8 +34,7 @@ class Robustness:
     work: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "margins", frozen(self.margins))
-        object.__setattr__(self, "work", frozen(self.work))
+        freeze(self, "margins", "work")
 
     @property
     def share(self) -> float:

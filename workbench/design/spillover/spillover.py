@@ -23,7 +23,7 @@ from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import gauss_between
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
 GAUSS_POINTS = 12
@@ -44,7 +44,7 @@ class Spillover(Printed):
     final_time: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "by_mode", frozen(self.by_mode))
+        freeze(self, "by_mode")
 
     @property
     def residual(self) -> tuple[int, ...]:
