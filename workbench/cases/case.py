@@ -1,5 +1,6 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -165,9 +166,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     else:
         structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
-    actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]"), modes) for e in inputs)
-    sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]"), modes) for e in outputs)
-    return Rig(modes, actuators, sensors, structure=structure)
+    return _rig_of(modes, inputs, outputs, lambda e, where: _place(e, structure.length, where), structure)
 
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
@@ -188,13 +187,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     )
     modes = structure.modes(count(table, "modes", MOST_MODES))
 
-    def pair(entry: dict[str, Any], where: str) -> Place:
-        x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2).tolist()
-        return x, y
-
-    actuators = tuple(_actuator(e, pair(e, "[[input]]"), modes) for e in inputs)
-    sensors = tuple(_sensor(e, pair(e, "[[output]]"), modes) for e in outputs)
-    return Rig(modes, actuators, sensors, structure=structure)
+    return _rig_of(modes, inputs, outputs, lambda e, where: tuple(numbers(e, "at", where, 2).tolist()), structure)
 
 
 def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
@@ -224,8 +217,7 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         )
     points = NamedPoints(tuple(e["name"] for e in (*inputs, *outputs)))
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
-    actuators = tuple(_actuator(e, e["name"], modes) for e in inputs)
-    return Rig(modes, actuators, tuple(_sensor(e, e["name"], modes) for e in outputs))
+    return _rig_of(modes, inputs, outputs, lambda e, _: e["name"])
 
 
 def _rig_at_points(
@@ -239,12 +231,20 @@ def _rig_at_points(
     file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
     points, values = read_points(file, omega.size)
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
+    return _rig_of(modes, inputs, outputs, lambda e, where: text(e, "point", where))
 
-    def point(entry: dict[str, Any], where: str) -> Place:
-        return text(entry, "point", f"{where} {entry['name']!r}")
 
-    actuators = tuple(_actuator(e, point(e, "[[input]]"), modes) for e in inputs)
-    return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]"), modes) for e in outputs))
+def _rig_of(
+    modes: Modes,
+    inputs: list[dict[str, Any]],
+    outputs: list[dict[str, Any]],
+    place: Callable[[dict[str, Any], str], Place],
+    structure: Structure | Plate | None = None,
+) -> Rig:
+    """The rig of these inputs and outputs; `place` takes where an entry stands out of it."""
+    actuators = tuple(_actuator(e, place(e, f"[[input]] {e['name']!r}"), modes) for e in inputs)
+    sensors = tuple(_sensor(e, place(e, f"[[output]] {e['name']!r}"), modes) for e in outputs)
+    return Rig(modes, actuators, sensors, structure=structure)
 
 
 def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
@@ -287,9 +287,9 @@ def _direction(entry: dict[str, Any], turning: bool, where: str) -> str | None:
 
 
 def _place(entry: dict[str, Any], length: float, where: str) -> float:
-    at = number(entry, "at", f"{where} {entry['name']!r}")
+    at = number(entry, "at", where)
     if not 0 <= at <= length:
-        raise CaseError(f"{where} {entry['name']!r}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
+        raise CaseError(f"{where}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
     return at
 
 
