@@ -142,9 +142,7 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     Raises:
         ValueError: times that do not increase from zero or later, a state of another size or not finite.
     """
-    time = np.asarray(time, float)
-    if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
-        raise ValueError("times must increase, from zero or later")
+    time = checked_times(time)
     sizes = (2 * loop.modes.n_modes, loop.matrix.shape[0])
     if np.shape(state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(state).all():
         more = f", or ({sizes[1]},) with the controller" if sizes[1] > sizes[0] else ""
@@ -157,6 +155,18 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     motion = modal if modal.shape[0] == 2 * loop.modes.n_modes else modal[: 2 * loop.modes.n_modes]
     fed = np.flatnonzero(loop.feedback.any(axis=0))
     return Response(time, motion, loop.feedback[:, fed] @ modal[fed], loop.modes)
+
+
+def checked_times(time: ArrayLike) -> Floats:
+    """Instants (n_times,) as an array.
+
+    Raises:
+        ValueError: times that do not increase from zero or later.
+    """
+    found = np.asarray(time, float)
+    if found.ndim != 1 or found.size == 0 or (np.diff(found) <= 0).any() or found[0] < 0:
+        raise ValueError("times must increase, from zero or later")
+    return found
 
 
 def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -6,6 +6,7 @@ astray does not do that: no missing effect turns a sign, multiplies by 1000, or 
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +17,8 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
 from workbench.structure.damping import ModalDamping
 
-Mend = Callable[[Rig, Sequence[Record]], tuple[Rig, tuple[Record, ...]]]
+Mended = tuple[Rig, tuple[Record, ...]]
+Mend = Callable[[Rig, Sequence[Record]], Mended]
 
 WIDE_GAP = 0.3  # root mean square per standard deviation of a channel from which it may be wired wrongly: a turned sign
 # leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
@@ -139,7 +141,7 @@ def _repeated(records: Sequence[Record]) -> list[WiringFault]:
                     "repeated record",
                     f"The records {first} and {second} hold the same samples: leave {second} out of case.toml.",
                     np.nan,
-                    _without_record(second),
+                    partial(_without_record, second),
                 )
             )
     return faults
@@ -169,7 +171,7 @@ def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
                 f"The outputs {one.name} and {other.name} hold the same samples, and the model agrees better with"
                 f" {rig.sensors[kept].name}: measure {rig.sensors[copy].name} again, or leave it out.",
                 np.nan,
-                _without_output(rig.sensors[copy].name),
+                partial(_without_output, rig.sensors[copy].name),
             )
         )
     return faults
@@ -269,7 +271,7 @@ def _scaled_outputs(
         sentence = f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
         if not certain:
             sentence = _doubtful(f"{who} {what}{rest}", gains[outputs] / factor - 1.0)
-        mend = _outputs_times(dict.fromkeys(names, 1.0 / factor))
+        mend = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
         faults.append(WiringFault(kind, sentence, closes, mend, certain))
     return faults
 
@@ -310,7 +312,7 @@ def _exchanged_outputs(
         if closes >= CLOSED:
             one, other = rig.sensors[i].name, rig.sensors[j].name
             sentence = f"The outputs {one} and {other} are exchanged: swap them in case.toml."
-            return [WiringFault("exchanged outputs", sentence, closes, _outputs_swapped(one, other))]
+            return [WiringFault("exchanged outputs", sentence, closes, partial(_exchanged, "outputs", one, other))]
     return []
 
 
@@ -323,7 +325,7 @@ def _exchanged_inputs(
         if n > MOST_CHANNELS and j != i + 1:
             continue
         one, other = rig.actuators[i].name, rig.actuators[j].name
-        mend = _inputs_swapped(one, other)
+        mend = partial(_exchanged, "inputs", one, other)
         closes = _closes(gap, before, wide, *mend(rig, records))
         if closes >= CLOSED:
             sentence = f"The inputs {one} and {other} are exchanged: swap them in case.toml."
@@ -358,7 +360,7 @@ def _scaled_inputs(
     wrong = {p: factor for p, factor in known.items() if factor is not None}
     if not wrong or (len(wrong) == acting.size and len(set(wrong.values())) == 1):
         return []
-    mend = _inputs_times({rig.actuators[p].name: factor for p, factor in wrong.items()})
+    mend = partial(_inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
     closes = _closes(gap, before, wide, *mend(rig, records))
     if closes < CLOSED:
         return []
@@ -376,7 +378,8 @@ def _scaled_inputs(
         if not certain:
             sentence = _doubtful(what, gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
-        faults.append(WiringFault(kind, sentence, closes, _inputs_times(dict.fromkeys(names, factor)), certain))
+        own = partial(_inputs_times, dict.fromkeys(names, factor))
+        faults.append(WiringFault(kind, sentence, closes, own, certain))
     return faults
 
 
@@ -404,7 +407,7 @@ def _quantities(
         closed = gap.closed(before, gap.power([_predict(_relabelled(rig, set(names), quantity), r) for r in records]))
         what = _one(f"{_named('output', names)} are {quantity}, not {said}", names)
         sentence = f'{what}: write quantity = "{quantity}" in case.toml.'
-        mend = _quantity_set(frozenset(names), quantity)
+        mend = partial(_quantity_set, frozenset(names), quantity)
         faults.append(WiringFault("quantity", sentence, float(closed[outputs].min()), mend))
     return faults
 
@@ -435,7 +438,7 @@ def _rates(
         times = ", ".join(dict.fromkeys(f"{records[i].sample_time / factor:.6g}" for i in at))
         what = _one(f"{who} are sampled at {RATES[factor]} the stated rate", names)
         sentence = f"{what}: write sample_time = {times} s."
-        mend = _rate_times(None if every else frozenset(names), factor)
+        mend = partial(_rate_times, None if every else frozenset(names), factor)
         whole = _closes(gap, before, wide, *mend(rig, records)) if every else np.nan
         faults.append(WiringFault("sample rate", sentence, whole, mend))
     return faults
@@ -452,11 +455,11 @@ def _structure(
             f"The damping looks like per cent where a ratio is meant: divide it by 100 (the largest would be"
             f" {zeta / 100:.4g}, not {zeta:.4g})."
         )
-        tries.append(("damping", sentence, _modes_times(1.0, 0.01)))
+        tries.append(("damping", sentence, partial(_modes_times, 1.0, 0.01)))
     if rig.structure is None:
         for factor, words in ((TURN, "Hz where rad/s is"), (1.0 / TURN, "rad/s where Hz is")):
             sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
-            tries.append(("frequency", sentence, _modes_times(factor, 1.0)))
+            tries.append(("frequency", sentence, partial(_modes_times, factor, 1.0)))
     found = [
         WiringFault(kind, sentence, _closes(gap, before, wide, *mend(rig, records)), mend)
         for kind, sentence, mend in tries
@@ -493,62 +496,36 @@ def _one(sentence: str, names: Sequence[str]) -> str:
     return sentence
 
 
-# --- mends
+# --- mends: of (rig, records), once all before these is given
 
 
-def _without_record(name: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        return rig, tuple(record for record in records if record.name != name)
-
-    return mend
+def _without_record(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    return rig, tuple(record for record in records if record.name != name)
 
 
-def _without_output(name: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
-        return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
-
-    return mend
+def _without_output(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
+    return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
 
 
-def _outputs_times(factors: dict[str, float]) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        by = np.array([factors.get(sensor.name, 1.0) for sensor in rig.sensors])
-        sensors = tuple(replace(s, noise_std=abs(f) * s.noise_std) for s, f in zip(rig.sensors, by, strict=True))
-        return replace(rig, sensors=sensors), tuple(replace(r, outputs=by[:, None] * r.outputs) for r in records)
-
-    return mend
+def _outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Mended:
+    by = np.array([factors.get(sensor.name, 1.0) for sensor in rig.sensors])
+    sensors = tuple(replace(s, noise_std=abs(f) * s.noise_std) for s, f in zip(rig.sensors, by, strict=True))
+    return replace(rig, sensors=sensors), tuple(replace(r, outputs=by[:, None] * r.outputs) for r in records)
 
 
-def _inputs_times(factors: dict[str, float]) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
-        return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
-
-    return mend
+def _inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Mended:
+    by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
+    return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
 
 
-def _swapped(names: Sequence[str], one: str, other: str) -> list[int]:
+def _exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    """Two "inputs" or two "outputs"."""
+    names = [port.name for port in (rig.actuators if side == "inputs" else rig.sensors)]
     order = list(range(len(names)))
     i, j = names.index(one), names.index(other)
     order[i], order[j] = j, i
-    return order
-
-
-def _outputs_swapped(one: str, other: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        order = _swapped([sensor.name for sensor in rig.sensors], one, other)
-        return rig, tuple(replace(record, outputs=record.outputs[order]) for record in records)
-
-    return mend
-
-
-def _inputs_swapped(one: str, other: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        order = _swapped([actuator.name for actuator in rig.actuators], one, other)
-        return rig, tuple(replace(record, inputs=record.inputs[order]) for record in records)
-
-    return mend
+    return rig, tuple(replace(record, **{side: getattr(record, side)[order]}) for record in records)
 
 
 def _relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
@@ -556,30 +533,20 @@ def _relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
     return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in named else s for s in rig.sensors))
 
 
-def _quantity_set(names: frozenset[str], quantity: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        return _relabelled(rig, names, quantity), tuple(records)
-
-    return mend
+def _quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    return _relabelled(rig, names, quantity), tuple(records)
 
 
-def _rate_times(names: frozenset[str] | None, factor: float) -> Mend:
+def _rate_times(names: frozenset[str] | None, factor: float, rig: Rig, records: Sequence[Record]) -> Mended:
     """Of the named records, or of all."""
-
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        return rig, tuple(
-            replace(r, sample_time=r.sample_time / factor) if names is None or r.name in names else r for r in records
-        )
-
-    return mend
+    return rig, tuple(
+        replace(r, sample_time=r.sample_time / factor) if names is None or r.name in names else r for r in records
+    )
 
 
-def _modes_times(omega: float, zeta: float) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        modes = replace(rig.modes, omega=omega * rig.modes.omega, damping=omega * zeta * rig.modes.damping)
-        structure = rig.structure
-        if structure is not None and isinstance(structure.damping, ModalDamping):
-            structure = replace(structure, damping=ModalDamping(zeta * np.asarray(structure.damping.zeta, float)))
-        return replace(rig, modes=modes, structure=structure), tuple(records)
-
-    return mend
+def _modes_times(omega: float, zeta: float, rig: Rig, records: Sequence[Record]) -> Mended:
+    modes = replace(rig.modes, omega=omega * rig.modes.omega, damping=omega * zeta * rig.modes.damping)
+    structure = rig.structure
+    if structure is not None and isinstance(structure.damping, ModalDamping):
+        structure = replace(structure, damping=ModalDamping(zeta * np.asarray(structure.damping.zeta, float)))
+    return replace(rig, modes=modes, structure=structure), tuple(records)
