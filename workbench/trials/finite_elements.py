@@ -14,7 +14,7 @@ from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functi
 from skfem.helpers import d, dd
 
 from workbench.arrays import Floats
-from workbench.structure.domain import Between, Domain, NamedPoints, Where, position
+from workbench.structure.domain import Between, NamedPoints, Where, position
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, freeze
@@ -149,18 +149,14 @@ def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations
     """
     _check_no_member(altered)
     points = nominal.domain
-    moving = [(name, value) for at, value in altered.masses for name in _moving(points, at)]
+    every = points.translations if isinstance(points, NamedPoints) else lambda at: (at,)  # all directions of a node
+    moving = [(name, value) for at, value in altered.masses for name in every(at)]
     stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
     _add(stiffness, [(nominal.phi_at(at), value) for at, value in altered.springs])
     _add(mass, [(nominal.phi_at(at), value) for at, value in moving])
     values, vectors = eigh(stiffness, mass)
     shapes = np.array([nominal.phi_at(at) for at in places]).reshape(-1, nominal.n_modes) @ vectors
     return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros_like(mass))
-
-
-def _moving(domain: Domain, at: Any) -> tuple[Any, ...]:
-    """Where a mass at a place moves: at a named point in every direction of its node."""
-    return domain.translations(at) if isinstance(domain, NamedPoints) else (at,)
 
 
 def _check_no_member(altered: Alterations) -> None:
