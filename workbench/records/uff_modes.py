@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyuff
 
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
+from workbench.records.uff_file import data_sets
 
 NORMAL_MODE = 2  # analysis_type of both formats
 AT_NODES = 1  # dataset_location of 2414
@@ -25,8 +25,7 @@ arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """Frequencies, damping, modal masses and shapes at nodes; to be called in a process of its own."""
-    sets = pyuff.UFF(str(path)).read_sets()
-    sets = sets if isinstance(sets, list) else [sets]
+    sets = data_sets(path)
     modes = [_of_55(s) if s["type"] == 55 else _of_2414(s) for s in sets if _is_mode(path, s)]
     if not modes:
         raise RecordFileError(

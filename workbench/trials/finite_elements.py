@@ -69,20 +69,19 @@ class ElementModes:
 
 
 def element_modes(
-    member: Structure, places: np.ndarray, n_modes: int, *, altered: Alterations = AS_NOMINAL, elements: int = ELEMENTS
+    member: Structure, places: np.ndarray, n_modes: int, *, altered: Alterations = AS_NOMINAL
 ) -> ElementModes:
     """The lowest modes of an altered member, K v = ω² M v, with a node at every place.
 
     Args:
         places: (n_places,) where shapes are wanted, m.
-        elements: evenly spaced ones, to which the special places add theirs.
     """
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
     special += [at + side * width / 2 for at, width, _ in altered.losses for side in (-1, 1)]
     profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
     special += [*member.mass_per_length.breaks, *profile.breaks, *(part.at for part in member.attachments)]
-    nodes = _nodes(np.array(special, float), member.length, elements)
+    nodes = _nodes(np.array(special, float), member.length)
     basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
     strain, mass, slopes, strain_energy = _matrices(basis, member, altered)
     beside = (member.tension + altered.tension if isinstance(member, Beam) else 0.0) * slopes.tolil()
@@ -171,13 +170,13 @@ def _add(matrix: Floats, parts: list[tuple[Floats, float]]) -> None:
         matrix += value * np.outer(row, row)
 
 
-def _nodes(special: np.ndarray, length: float, elements: int) -> np.ndarray:
+def _nodes(special: np.ndarray, length: float) -> np.ndarray:
     """Even nodes and the special ones; an even node beside a special one gives way, so no element is a sliver."""
     special = np.unique(np.r_[0.0, special[(special > 0) & (special < length)], length])
     special = special[np.r_[True, np.diff(special) > 1e-9 * length]]
-    even = np.linspace(0.0, length, elements + 1)
+    even = np.linspace(0.0, length, ELEMENTS + 1)
     distance = np.abs(even[:, None] - special[None, :]).min(axis=1)
-    return np.sort(np.r_[special, even[distance > 0.3 * length / elements]])
+    return np.sort(np.r_[special, even[distance > 0.3 * length / ELEMENTS]])
 
 
 def _node(nodes: np.ndarray, at: float) -> int:
