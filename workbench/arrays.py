@@ -12,5 +12,4 @@ Flags = NDArray[np.bool_]
 def symmetric_root(matrix: np.ndarray) -> Floats:
     """R with R Rᵀ = matrix, a covariance say, which rounding or close modes may have made singular."""
     values, vectors = np.linalg.eigh(matrix)
-    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

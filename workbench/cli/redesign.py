@@ -130,5 +130,4 @@ def redesign(
 def _largest(records: "Sequence[Record]") -> "Floats":
     import numpy as np
 
-    level: Floats = np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
-    return level
+    return np.asarray(np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0))

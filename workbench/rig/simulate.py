@@ -570,8 +570,7 @@ def _lagged(truth: np.ndarray, time_constant: float, sample_time: float, *, sett
     new = 1.0 - (1.0 - fade) / ratio
     old = (1.0 - fade) / ratio - fade
     first = truth[0] if settled else 0.0
-    filtered: np.ndarray = lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0]
-    return filtered
+    return np.asarray(lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0])
 
 
 def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:

@@ -98,8 +98,7 @@ class Interval:
                 f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}; give a place"
                 " on it"
             )
-        inside: Floats = np.clip(x, 0.0, self.length)
-        return inside
+        return np.asarray(np.clip(x, 0.0, self.length))
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Places, derivative along x and sign of a displacement (derivative 0), slope (1) and so on."""
@@ -175,8 +174,7 @@ class Rectangle:
             raise PlaceError(
                 f"(x, y) = ({x:g}, {y:g}) lies outside the structure, 0 to {a:g} by 0 to {b:g}; give a place on it"
             )
-        inside: Floats = np.clip(xy, 0.0, extent)
-        return inside
+        return np.asarray(np.clip(xy, 0.0, extent))
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Places, derivatives along x and y and sign of a displacement, a slope about an axis, or (i, j) as it is."""

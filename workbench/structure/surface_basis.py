@@ -134,8 +134,7 @@ class Functions:
         """(n_places, n_functions) ∂_x^i ∂_y^j at places (n_places, 2), with (i, j) = derivatives."""
         x = self.x_axis.values(places[:, 0], derivatives[0])
         y = self.y_axis.values(places[:, 1], derivatives[1])
-        values: np.ndarray = np.einsum("pjr,pj->pr", np.tensordot(x, self.coefficients, axes=(1, 0)), y)
-        return values
+        return np.asarray(np.einsum("pjr,pj->pr", np.tensordot(x, self.coefficients, axes=(1, 0)), y))
 
     def on_grid(self, x_axis: Axis, y_axis: Axis, derivatives: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(n_x, n_y, n_functions) at the Gauss points of two axes, its own or others."""

@@ -128,8 +128,7 @@ def matrix_modes(
 
     def row(where: Where) -> Floats:
         first, *second = points.locate(list(where) if isinstance(where, Between) else where)
-        shape: Floats = rows[first] - rows[second].sum(axis=0)
-        return shape
+        return np.asarray(rows[first] - rows[second].sum(axis=0))
 
     _add(stiffness, [(row(at), value) for at, value in altered.springs])
     _add(mass, [(row(name), value) for at, value in altered.masses for name in points.translations(at)])

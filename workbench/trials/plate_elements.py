@@ -156,10 +156,8 @@ def _row(x: _Cubics, y: _Cubics, at: Any) -> Floats:
         left, right = at.x - 0.5 * at.width, at.x + 0.5 * at.width
         bottom, top = at.y - 0.5 * at.height, at.y + 0.5 * at.height
         across_x = np.kron(x.at(right, 1) - x.at(left, 1), y.integral(bottom, top))
-        row: Floats = across_x + np.kron(x.integral(left, right), y.at(top, 1) - y.at(bottom, 1))
-        return row
-    at_point: Floats = np.kron(x.at(at[0]), y.at(at[1])).astype(float)
-    return at_point
+        return np.asarray(across_x + np.kron(x.integral(left, right), y.at(top, 1) - y.at(bottom, 1)))
+    return np.asarray(np.kron(x.at(at[0]), y.at(at[1])).astype(float))
 
 
 def _square(row: Floats) -> csc_array:

@@ -296,5 +296,4 @@ def _held(modes: Modes, domain: Rectangle, at: np.ndarray) -> Floats:
     rim = np.array(along)
     rim = rim[modes.are_still(rim)]
     distance = np.linalg.norm(rim[:, None] - at, axis=2).min(axis=1, initial=np.inf)
-    apart: Floats = rim[distance > SAME * domain.size]
-    return apart
+    return np.asarray(rim[distance > SAME * domain.size])

@@ -241,8 +241,7 @@ class _Expansion:
         size, strength = np.abs(b), np.abs(gain)
 
         def products(one: Floats, other: Floats) -> Floats:
-            product: Floats = np.einsum("ij,pir,pjs->prs", strength, one, other)
-            return product
+            return np.asarray(np.einsum("ij,pir,pjs->prs", strength, one, other))
 
         second = products(curved, size) + products(size, curved) + products(moved, moved)
         change = products(moved, size) + products(size, moved) + products(moved, moved)
@@ -267,5 +266,4 @@ def _curvature(task: FeedbackTask) -> Floats:
     """Largest second derivative of a pair's participation in each mode anywhere, (n_modes,)."""
     grid = np.linspace(*task.reach, GRID)
     bend = participation_along(task.modes, task.actuator, grid, 2)
-    most: Floats = np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0)
-    return most
+    return np.asarray(np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0))

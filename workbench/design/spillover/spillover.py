@@ -94,8 +94,7 @@ def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Comp
     values, vectors = np.linalg.eig(loop)
     if np.linalg.cond(vectors) < 1e6:
         weights = -(law.gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
-        transform: Complexes = weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None]))
-        return transform
+        return np.asarray(weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None])))
     eye = np.eye(loop.shape[0])
     return np.array([-law.gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
 
@@ -182,8 +181,7 @@ def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
     for _ in range(halvings):
         moments = moments + transition @ moments @ transition.T
         transition = transition @ transition
-    balanced: Floats = scale[:, None] * moments * scale
-    return balanced
+    return np.asarray(scale[:, None] * moments * scale)
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:

@@ -200,8 +200,7 @@ class _Gap:
         count = sum(y.shape[1] for y in self.measured)
         with np.errstate(over="ignore", invalid="ignore"):
             left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
-        power: Floats = np.nan_to_num(left / count / self.scale, nan=np.inf)
-        return power
+        return np.asarray(np.nan_to_num(left / count / self.scale, nan=np.inf))
 
     def closed(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed."""

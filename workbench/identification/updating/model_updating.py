@@ -73,8 +73,7 @@ class UpdatedModel(Printed):
     @property
     def std(self) -> np.ndarray:
         """(n_parameters,) standard errors."""
-        deviations: np.ndarray = np.sqrt(np.diag(self.covariance))
-        return deviations
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def update_model(
@@ -141,8 +140,7 @@ def update_model(
         return columns, agreement[rows, columns], quotients
 
     def residuals(logarithms: np.ndarray) -> np.ndarray:
-        difference: np.ndarray = (paired(build(first * np.exp(logarithms)))[2] - target) / deviation
-        return difference
+        return np.asarray((paired(build(first * np.exp(logarithms)))[2] - target) / deviation)
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
         steps = UPDATING.step * np.eye(first.size)
