@@ -34,7 +34,7 @@ INSIDE = {
 ENGINES = {
     "casadi": {"design/placement/placement.py"},
     "matplotlib": {"draw/"},
-    "pyuff": {"records/uff_file.py", "records/uff_modes.py"},
+    "pyuff": {"records/uff_file.py"},
     "nptdms": {"records/tdms_file.py"},
     "h5py": {"records/hdf5_file.py"},
     "typer": {"cli/"},

@@ -1,5 +1,6 @@
 """A case folder: a nominal model, and records measured on the real structure."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,9 +22,9 @@ from workbench.cases.tables import (
     text,
 )
 from workbench.records.files import read_record
-from workbench.records.limits import RecordFileError, check_size
+from workbench.records.limits import RecordFileError, check_file
 from workbench.records.npz_file import arrays as load_arrays
-from workbench.records.record import HOLDS, Channel, Record
+from workbench.records.record import HOLDS, Record
 from workbench.rig.actuators import Actuator, piezo_patch
 from workbench.rig.rig import Rig, derivative_of
 from workbench.rig.sensors import MEASURED, Sensor
@@ -42,16 +43,7 @@ TABLES = ("title", "input_hold", "structure", "input", "output", "record")
 MEMBER = ("kind", "length", "mass_per_length", "left", "right", "damping_ratio", "modes")
 STRUCTURES = {"beam": (*MEMBER, "bending_stiffness", "tension"), "rod": (*MEMBER, "axial_stiffness")}
 MODAL = ("kind", "natural_frequencies_hz", "damping_ratios", "rigid_damping", "points")
-PLATE = (
-    "kind",
-    "length",
-    "mass_per_area",
-    "bending_stiffness",
-    "poisson_ratio",
-    "edges",
-    "damping_ratio",
-    "modes",
-)
+PLATE = ("kind", "length", "mass_per_area", "bending_stiffness", "poisson_ratio", "edges", "damping_ratio", "modes")
 EDGES = ("left", "right", "bottom", "top")
 SINGLE = ("kind", "mass", "damping", "stiffness")
 INPUT, OUTPUT = ("name", "kind"), ("name", "quantity", "noise_std")
@@ -174,9 +166,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     else:
         structure = Bar(axial_stiffness=profile(table, "axial_stiffness"), **common)
     modes = structure.modes(count(table, "modes", MOST_MODES), tolerance=1e-9)
-    actuators = tuple(_actuator(e, _place(e, structure.length, "[[input]]"), modes) for e in inputs)
-    sensors = tuple(_sensor(e, _place(e, structure.length, "[[output]]"), modes) for e in outputs)
-    return Rig(modes, actuators, sensors, structure=structure)
+    return _rig_of(modes, inputs, outputs, lambda e, where: _place(e, structure.length, where), structure)
 
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
@@ -197,13 +187,7 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     )
     modes = structure.modes(count(table, "modes", MOST_MODES))
 
-    def pair(entry: dict[str, Any], where: str) -> Place:
-        x, y = numbers(entry, "at", f"{where} {entry['name']!r}", 2).tolist()
-        return x, y
-
-    actuators = tuple(_actuator(e, pair(e, "[[input]]"), modes) for e in inputs)
-    sensors = tuple(_sensor(e, pair(e, "[[output]]"), modes) for e in outputs)
-    return Rig(modes, actuators, sensors, structure=structure)
+    return _rig_of(modes, inputs, outputs, lambda e, where: tuple(numbers(e, "at", where, 2).tolist()), structure)
 
 
 def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
@@ -233,8 +217,7 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         )
     points = NamedPoints(tuple(e["name"] for e in (*inputs, *outputs)))
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
-    actuators = tuple(_actuator(e, e["name"], modes) for e in inputs)
-    return Rig(modes, actuators, tuple(_sensor(e, e["name"], modes) for e in outputs))
+    return _rig_of(modes, inputs, outputs, lambda e, _: e["name"])
 
 
 def _rig_at_points(
@@ -248,12 +231,20 @@ def _rig_at_points(
     file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
     points, values = read_points(file, omega.size)
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
+    return _rig_of(modes, inputs, outputs, lambda e, where: text(e, "point", where))
 
-    def point(entry: dict[str, Any], where: str) -> Place:
-        return text(entry, "point", f"{where} {entry['name']!r}")
 
-    actuators = tuple(_actuator(e, point(e, "[[input]]"), modes) for e in inputs)
-    return Rig(modes, actuators, tuple(_sensor(e, point(e, "[[output]]"), modes) for e in outputs))
+def _rig_of(
+    modes: Modes,
+    inputs: list[dict[str, Any]],
+    outputs: list[dict[str, Any]],
+    place: Callable[[dict[str, Any], str], Place],
+    structure: Structure | Plate | None = None,
+) -> Rig:
+    """The rig of these inputs and outputs; `place` takes where an entry stands out of it."""
+    actuators = tuple(_actuator(e, place(e, f"[[input]] {e['name']!r}"), modes) for e in inputs)
+    sensors = tuple(_sensor(e, place(e, f"[[output]] {e['name']!r}"), modes) for e in outputs)
+    return Rig(modes, actuators, sensors, structure=structure)
 
 
 def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
@@ -296,9 +287,9 @@ def _direction(entry: dict[str, Any], turning: bool, where: str) -> str | None:
 
 
 def _place(entry: dict[str, Any], length: float, where: str) -> float:
-    at = number(entry, "at", f"{where} {entry['name']!r}")
+    at = number(entry, "at", where)
     if not 0 <= at <= length:
-        raise CaseError(f"{where} {entry['name']!r}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
+        raise CaseError(f"{where}: at = {at:g} is outside the structure, which runs 0 to {length:g}")
     return at
 
 
@@ -416,15 +407,8 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> R
             raise CaseError(
                 f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?"
             )
-    return Record(
-        sample_time=sample_time,
-        outputs=np.array([arrays[s.name] for s in rig.sensors]),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=np.array([arrays[a.name] for a in rig.actuators]),
-        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
-        input_hold=_hold(entry, where),
-        name=name,
-    )
+    inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
+    return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
 
 
 def _signals(record: Record) -> dict[str, np.ndarray]:
@@ -437,7 +421,7 @@ def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise CaseError(f"{where}: there is no file {file}")
     try:
-        check_size(file)
+        check_file(file)
         arrays = load_arrays(file) if file.suffix == ".npz" else _signals(read_record(file))
     except RecordFileError as error:
         raise CaseError(str(error)) from error

@@ -5,25 +5,25 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.possible import CasePath, VerdictPath, Workers, predicted, record_of
-from workbench.cli.predict import Draws, Rate, RecordName, Seed
-from workbench.cli.terminal import JsonPath, PagePath, guarded, progress_bar, reporter, say, short, write_json
+from workbench.cli import options
+from workbench.cli.possible import predicted, record_of
+from workbench.cli.terminal import check_target, guarded, reporting, say, short, tell, write_json
 
 LOG = "tests.csv"
 
 
 @guarded
 def check(
-    case: CasePath,
-    record: RecordName,
-    verdict: VerdictPath = None,
-    sample_rate_hz: Rate = None,
-    draws: Draws = 200,
-    seed: Seed = 0,
-    workers: Workers = None,
+    case: options.CasePath,
+    record: options.RecordName,
+    verdict: options.VerdictPath = None,
+    sample_rate_hz: options.SampleRate = None,
+    draws: options.Draws = 200,
+    seed: options.Seed = 0,
+    workers: options.Workers = None,
     log: Annotated[Path | None, typer.Option(help=f"Log of tests; CASE/{LOG} unless given.")] = None,
-    json_path: JsonPath = None,
-    page: PagePath = None,
+    json_path: options.JsonPath = None,
+    page: options.PagePath = None,
 ) -> None:
     """Check whether a new record lies inside the bands that the corrected model predicts, and log it.
 
@@ -34,7 +34,6 @@ def check(
     from workbench.cases.case import read_case
     from workbench.robust.check import check_length, check_prediction, log_test, read_log
     from workbench.study.pages.prediction_page import prediction_page
-    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     log = case / LOG if log is None else log
@@ -45,14 +44,12 @@ def check(
     fitted = [one.name for one in found.fit if np.array_equal(one.outputs, measured.outputs)]
     if fitted:
         raise ValueError(f"record {fitted[0]!r} was fitted, so it is no test of the model; check one that was not")
-    with progress_bar() as progress:
-        report = reporter(progress, "reading")
+    with reporting("reading") as report:
         prediction = predicted(found, measured, verdict, draws=draws, seed=seed, workers=workers, report=report)
     result = check_prediction(prediction, measured)
-    head, *rest = str(result).splitlines()
-    say(head, bold=True)
-    for line in (*rest, *prediction.notes):
-        say(line)
+    tell(result)
+    for note in prediction.notes:
+        say(note)
     log_test(log, result)
     tests = {test["record"]: test for test in read_log(log)}  # of a record that was checked again, the last
     held = sum(test["holds"] == "yes" for test in tests.values())

@@ -1,9 +1,9 @@
 """The controller that options describe: law, modes and estimator, for `export` and `redesign` alike."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
+from workbench.cli.options import DAMPING, ESTIMATORS
 
 if TYPE_CHECKING:
     from workbench.design.estimation.controller import Controller
@@ -12,23 +12,20 @@ if TYPE_CHECKING:
     from workbench.rig.rig import Rig
     from workbench.structure.domain import Where
 
-ESTIMATORS = ("luenberger", "kalman", "modal-filter")
-DAMPING = 0.1  # unless given
 
-LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
-Control = Annotated[
-    int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
-]
-LawWeight = Annotated[
-    float | None, typer.Option("--weight", help="Control weight R: force against motion; in place of --damping.")
-]
-Damping = Annotated[
-    float | None, typer.Option(help=f"Damping ratio of the controlled modes; {DAMPING:g} unless given.")
-]
-Disturbance = Annotated[
-    float,
-    typer.Option(help="For the Kalman filter: intensity of white modal forces; noise is as the outputs state it."),
-]
+def check_rate(rate_hz: float | None) -> None:
+    """Refuse a rate at which no controller runs.
+
+    Raises:
+        ValueError: a rate that is not positive and finite.
+    """
+    if rate_hz is not None and not 0 < rate_hz < float("inf"):
+        raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
+
+
+def count_of(rig: "Rig", control: int | None) -> int:
+    """The number of controlled modes: as given, or as many as actuators; where there are none the law says so."""
+    return max(sum(not a.direct for a in rig.actuators), 1) if control is None else control
 
 
 def law_from(
@@ -69,8 +66,8 @@ def observed(
         ValueError: an estimator that is none, a law that switches, or no such output.
     """
     from workbench.design.estimation.controller import filtered
+    from workbench.design.estimation.modal_filter import filter_on
     from workbench.design.estimation.observers import kalman, luenberger
-    from workbench.design.estimation.surface_filter import filter_on
     from workbench.design.laws.law import Law
     from workbench.design.spillover.comparison import OBSERVER_POLES
     from workbench.rig.sensors import MEASURED

@@ -3,10 +3,10 @@
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, read_structure_rig
-from workbench.cli.terminal import JsonPath, console, guarded, say, write_json
+from workbench.cli import options
+from workbench.cli.rig_file import impulse_place, read_structure_rig
+from workbench.cli.terminal import check_target, guarded, say, show_table, write_json
 from workbench.structure.printed import place_text
 
 if TYPE_CHECKING:
@@ -17,22 +17,20 @@ PERIODS = 20  # of the first mode, over which the work is counted unless a time 
 
 @guarded
 def design(
-    rig: RigPath,
-    control: Annotated[
-        int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
-    ] = None,
-    weight: Weight = 1.0,
+    rig: options.RigPath,
+    control: options.Control = None,
+    weight: options.Weight = 1.0,
     damping: Annotated[
         float | None, typer.Option(help="Also design by pole assignment, with this damping ratio.")
     ] = None,
     errors: Annotated[
         float | None, typer.Option(help="Robustness to a hundred models perturbed by this share; 0.05 is 5 %.")
     ] = None,
-    impulse_at: ImpulseAt = None,
+    impulse_at: options.ImpulseAt = None,
     final_time: Annotated[
         float | None, typer.Option(help=f"Time until which work is counted, s; {PERIODS} periods of mode 1.")
     ] = None,
-    json_path: JsonPath = None,
+    json_path: options.JsonPath = None,
 ) -> None:
     """Compare IMSC with coupled control: cost, effort, spillover, and stability on the full plant.
 
@@ -45,7 +43,6 @@ def design(
     from workbench.design.loop.closed_loop import impulse_state
     from workbench.design.spillover.comparison import compare, laws_of, through_sensors
     from workbench.design.spillover.robustness import perturbed_modes, stable_share
-    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     found = read_structure_rig(rig)
@@ -58,24 +55,22 @@ def design(
     laws, refused = laws_of(modes, n, actuators, weight=weight, damping=damping)
     end = final_time or PERIODS * 2.0 * np.pi / modes.omega[modes.omega > 0][0]
     rows = compare(modes, laws, state, weight=weight, final_time=end)
-    table = Table("law", "cost", "effort", "peak force", "W_C", "W_R", "largest W_r", "loop", box=None, pad_edge=False)
+    shown = []
     for row in rows:
         numbers = (row.cost, row.effort, row.peak_force, row.work.controlled_total, row.work.residual_total)
         most = "" if row.most_excited is None else f"mode {row.most_excited + 1}"
         fastest = row.poles.real.max()
         stable = "stable" if fastest < 0 else "unstable" if fastest > 0 else "undamped poles"
-        table.add_row(row.law.name, *(f"{value:.5g}" for value in numbers), most, stable)
+        shown.append((row.law.name, *(f"{value:.5g}" for value in numbers), most, stable))
     say(f"{n} of {modes.n_modes} modes controlled, unit impulse at {modes.domain.text(at)}, R = {weight:g}", bold=True)
     for why in refused:
         say(f"  {why}")
-    console.print(table)
+    show_table(("law", "cost", "effort", "peak force", "W_C", "W_R", "largest W_r", "loop"), shown)
     tried = through_sensors(modes, laws, [s.at for s in found.sensors], found.structure)
     say("with displacement and velocity sensors at the places of the outputs:", bold=True)
     heads = ["controller", "margin [1/s]", "residual mode that limits it", "path"]
-    sensed = Table(
-        *heads, *([] if errors is None else [f"stable with models {errors:.2g} off"]), box=None, pad_edge=False
-    )
-    written = []
+    heads += [] if errors is None else [f"stable with models {errors:.2g} off"]
+    sensed, written = [], []
     for controller, explained, why in tried:
         if controller is None or explained is None:
             say(f"  {why}")
@@ -83,7 +78,7 @@ def design(
         share = None if perturbed is None else stable_share(perturbed, controller)
         robust = [] if share is None else [f"{share:.0%}"]
         margin = f"{explained.margin:.3g}" + ("" if explained.loop.stable else " unstable")
-        sensed.add_row(controller.name, margin, *_limit(explained), *robust)
+        sensed.append((controller.name, margin, *_limit(explained), *robust))
         written.append(
             {
                 "design": controller.name,
@@ -94,7 +89,7 @@ def design(
                 "poles_imag": explained.poles.imag,
             }
         )
-    console.print(sensed)
+    show_table(heads, sensed)
     write_json(
         json_path,
         {

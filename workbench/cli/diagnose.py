@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
+from workbench.cli import options
 from workbench.cli.possible import write_verdict
-from workbench.cli.terminal import JsonPath, PagePath, guarded, names_in, progress_bar, reporter, say, short
+from workbench.cli.terminal import check_target, guarded, names_in, reporting, say, short
 
 SHOWN_RIVALS = 3
 
@@ -30,8 +31,8 @@ def diagnose(
         str,
         typer.Option(metavar="INPUT,OUTPUT", help="With --nominal: an input and the output at its place, for scale."),
     ] = "",
-    json_path: JsonPath = None,
-    page: PagePath = None,
+    json_path: options.JsonPath = None,
+    page: options.PagePath = None,
     free_nominal: Annotated[
         bool, typer.Option("--free-nominal", help="Re-estimate the nominal frequencies and damping with every effect.")
     ] = False,
@@ -57,7 +58,6 @@ def diagnose(
     from workbench.gap.report.wiring import check_kept_apart, mended, wiring
     from workbench.study.measured_case import measured_case
     from workbench.study.pages.verdict_page import verdict_page
-    from workbench.study.runs.whole_file import check_target
 
     check_target(json_path)
     if (case is None) == (nominal is None):
@@ -86,7 +86,7 @@ def diagnose(
     if mend:
         rig, fit = mended(faults, found.rig, found.fit)
         found = replace(found, rig=rig, fit=fit, validation=mended(faults, found.rig, found.validation)[1])
-    with progress_bar() as progress:
+    with reporting("reading") as report:
         verdict = run(
             found.rig,
             found.fit,
@@ -95,7 +95,7 @@ def diagnose(
             free_nominal=free_nominal,
             workers=workers,
             seconds=seconds,
-            report=reporter(progress, "reading"),
+            report=report,
         )
     say(verdict.sentence, bold=True)
     shown = verdict.to_json()

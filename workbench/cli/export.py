@@ -5,24 +5,24 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_from, observed
-from workbench.cli.rig_file import RigPath
-from workbench.cli.terminal import guarded, say, short
+from workbench.cli import options
+from workbench.cli.control import check_rate, count_of, law_from, observed
+from workbench.cli.terminal import check_target, guarded, say, short, tell
 
 
 @guarded
 def export(
-    rig: RigPath,
+    rig: options.RigPath,
     rate_hz: Annotated[float, typer.Option(help="Sampling rate at which the controller is to run.")],
     to: Annotated[Path, typer.Option(metavar="FILE", help="File to write: NAME.c (with NAME.h), NAME.py or NAME.mat.")],
-    law: LawName = "imsc",
-    control: Control = None,
-    weight: LawWeight = None,
-    damping: Damping = None,
+    law: options.LawName = "imsc",
+    control: options.Control = None,
+    weight: options.LawWeight = None,
+    damping: options.Damping = None,
     estimator: Annotated[
-        str, typer.Option(metavar="|".join(ESTIMATORS), help="Observer or modal filter that the law acts on.")
-    ] = ESTIMATORS[0],
-    disturbance: Disturbance = 1.0,
+        str, typer.Option(metavar="|".join(options.ESTIMATORS), help="Observer or modal filter that the law acts on.")
+    ] = options.ESTIMATORS[0],
+    disturbance: options.Disturbance = 1.0,
     computing_delay_ms: Annotated[
         float, typer.Option(help="From a reading to the first effect of its command, beside the actuators' delays.")
     ] = 0.0,
@@ -36,21 +36,15 @@ def export(
     from workbench.cases.case import read_rig
     from workbench.design.export.export import export as hand_over
     from workbench.rig.sensors import MEASURED
-    from workbench.study.runs.whole_file import check_target
 
     check_target(to)
-    if not 0 < rate_hz < float("inf"):
-        raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
+    check_rate(rate_hz)
     found = read_rig(rig / "case.toml" if rig.is_dir() else rig)
-    count = max(len([a for a in found.actuators if not a.direct]), 1) if control is None else control
-    chosen = law_from(found, law, count, weight, damping)
+    chosen = law_from(found, law, count_of(found, control), weight, damping)
     unread = [s.name for s in found.sensors if MEASURED[s.quantity][1] > 1]
     observer = observed(found, chosen, estimator, disturbance=disturbance, sample_time=1.0 / rate_hz)
     design = hand_over(found.modes, observer, to, sample_rate_hz=rate_hz, computing_delay=1e-3 * computing_delay_ms)
-    head, *rest = str(design).splitlines()
-    say(head, bold=True)
-    for line in rest:
-        say(line)
+    tell(design)
     if unread:
         say(f"  not read, as accelerations: {', '.join(unread)}")
     say(f"  written to {short(to)}" + (f" and {short(to.with_suffix('.h'))}" if to.suffix == ".c" else ""))

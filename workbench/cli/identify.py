@@ -5,20 +5,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from workbench.cli.terminal import (
-    JsonPath,
-    Memory,
-    console,
-    guarded,
-    names_in,
-    progress_bar,
-    reporter,
-    say,
-    short,
-    write_json,
-)
+from workbench.cli import options
+from workbench.cli.terminal import check_target, guarded, names_in, reporting, say, short, show_table, write_json
 
 
 @guarded
@@ -27,9 +16,7 @@ def identify(
         list[Path], typer.Argument(help="Files of the same sensors: .csv, .txt, .npz, .mat, .h5, .uff, .tdms, .wav.")
     ],
     modes: Annotated[int | None, typer.Option(help="Number of modes; estimated unless given.")] = None,
-    sample_rate_hz: Annotated[
-        float | None, typer.Option(help="Sampling rate, where the file has no time axis.")
-    ] = None,
+    sample_rate_hz: options.SampleRate = None,
     start: Annotated[
         float | None, typer.Option(help="Time at which the free decay begins, s; detected unless given.")
     ] = None,
@@ -45,12 +32,12 @@ def identify(
         typer.Option(metavar="LOW HIGH", help="Frequency band of transfer functions to fit."),
     ] = None,
     seconds: Annotated[float, typer.Option(help="Processor time to search for, s.")] = 30.0,
-    memory: Memory = 1.0,
+    memory: options.Memory = 1.0,
     page: Annotated[
         Path | None,
         typer.Option("--page", help="HTML file to write: shapes, MAC, stabilisation diagram, frequency response."),
     ] = None,
-    json_path: JsonPath = None,
+    json_path: options.JsonPath = None,
 ) -> None:
     """Identify modes from free decays, driven or ambient records, or transfer functions, with standard errors.
 
@@ -60,13 +47,10 @@ def identify(
     from workbench.records.files import read_measured
     from workbench.records.limits import Limits
     from workbench.study.pages.identification_report import identification_report
-    from workbench.study.runs.whole_file import check_target
 
-    check_target(json_path)
-    check_target(page)
+    check_target(json_path, page)
     limits = Limits.of_gib(memory)
-    with progress_bar() as progress:
-        report = reporter(progress, "reading")
+    with reporting("reading") as report:
         read = [
             read_measured(path, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=limits)
             for path in records
@@ -78,18 +62,13 @@ def identify(
         )
     as_read = dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ()))
     found = replace(found, lines=(*found.lines, *(f"as read: {remark}" for remark in as_read)))
-    table = Table(box=None, pad_edge=False)
-    for heading in HEADINGS:
-        table.add_column(heading, justify="right" if "[" in heading else "left", no_wrap=True)
-    for row in found.rows:
-        table.add_row(*row)
     say(found.heading, bold=True)
-    console.print(table)
+    show_table(HEADINGS, found.rows, right=[heading for heading in HEADINGS if "[" in heading])
     for line in found.lines:
         say(f"  {line.replace('`seconds`', '--seconds')}")
     if page is not None:
-        from workbench.study.identification_page import identification_page
         from workbench.study.pages.page import write_page
+        from workbench.study.report import identification_page
 
         made_by = " ".join(["workbench identify", *map(str, records)])
         say(f"  page {short(write_page(page, identification_page(found, read, made_by=made_by)))}")

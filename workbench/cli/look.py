@@ -4,20 +4,18 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from workbench.cli.terminal import Memory, PagePath, console, guarded, names_in, say, short
+from workbench.cli import options
+from workbench.cli.terminal import guarded, names_in, say, short, show_table
 
 
 @guarded
 def look(
     file: Annotated[Path, typer.Argument(help="Measured file: .csv, .txt, .npz, .mat, .h5, .uff, ...")],
-    sample_rate_hz: Annotated[
-        float | None, typer.Option(help="Sampling rate, where the file has no time axis.")
-    ] = None,
+    sample_rate_hz: options.SampleRate = None,
     inputs: Annotated[str, typer.Option(metavar="NAME,NAME", help="Channels that are inputs.")] = "",
-    memory: Memory = 1.0,
-    page: PagePath = None,
+    memory: options.Memory = 1.0,
+    page: options.PagePath = None,
 ) -> None:
     """Show what a measured file holds: channels, rate, length, levels, spectrum, faults, and the command to go on with.
 
@@ -30,13 +28,8 @@ def look(
 
     measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=Limits.of_gib(memory))
     seen = look_at(measured, file)
-    table = Table(box=None, pad_edge=False)
-    for heading in HEADINGS:
-        table.add_column(heading, justify="left" if heading in HEADINGS[:2] else "right", no_wrap=True)
-    for row in seen.rows:
-        table.add_row(*row)
     say(seen.heading, bold=True)
-    console.print(table)
+    show_table(HEADINGS, seen.rows, right=HEADINGS[2:])
     for remark in seen.remarks:
         say(f"  {remark}")
     say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', seen.page_content))}")

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from workbench.cli.rig_file import ImpulseAt, RigPath, Weight, impulse_place, place_in, read_structure_rig, typed_place
-from workbench.cli.terminal import JsonPath, console, guarded, progress_bar, reporter, say, short, write_json
+from workbench.cli import options
+from workbench.cli.rig_file import impulse_place, place_in, read_structure_rig, typed_place
+from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
 from workbench.structure.domain import Domain, Interval, NamedPoints, Place, Rectangle, listed, middle
 from workbench.structure.printed import place_text
 
@@ -24,10 +24,10 @@ WRITTEN = ("positions", "residual_work", "by_mode", "effort", "peak_force", "con
 
 @guarded
 def place(
-    rig: RigPath,
+    rig: options.RigPath,
     control: Annotated[int, typer.Option(help="Number of controlled modes, lowest first, and of actuators.")],
-    weight: Weight = 1.0,
-    impulse_at: ImpulseAt = None,
+    weight: options.Weight = 1.0,
+    impulse_at: options.ImpulseAt = None,
     effort: Annotated[
         float, typer.Option(help="Effort limit: times that of even spacing on a beam, else of the rig's actuators.")
     ] = 1.5,
@@ -35,12 +35,10 @@ def place(
     peak_force: Annotated[float, typer.Option(help="Force limit of each actuator, N.")] = math.inf,
     condition: Annotated[float, typer.Option(help="Limit of the condition number of B (Frobenius).")] = math.inf,
     forbid: Annotated[
-        list[str] | None,
-        typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate."),
+        list[str] | None, typer.Option(metavar="FROM:TO", help="Zone without actuators, m; X,Y:X,Y on a plate.")
     ] = None,
     at: Annotated[
-        str | None,
-        typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names."),
+        str | None, typer.Option(metavar="PLACES", help="Candidates, m (X,Y;X,Y on a plate) or names.")
     ] = None,
     grid: Annotated[
         float | None, typer.Option(metavar="M", help="Candidates on a grid over a plate, so far apart, m.")
@@ -51,7 +49,7 @@ def place(
     picture: Annotated[
         Path | None, typer.Option("--figure", help="Draw the placement to this file (.png, .svg, .pdf).")
     ] = None,
-    json_path: JsonPath = None,
+    json_path: options.JsonPath = None,
 ) -> None:
     """Place actuators for the least spillover work, within the limits of a rig; its piezo patches, where it has some.
 
@@ -64,10 +62,8 @@ def place(
     from workbench.design.placement.placement import nodes_of_mode, placement_task
     from workbench.design.placement.placement import place_actuators as least_work
     from workbench.design.placement.task import patch_of
-    from workbench.study.runs.whole_file import check_target
 
-    check_target(json_path)
-    check_target(picture)
+    check_target(json_path, picture)
     if proof is not None and not 0 < proof < 1:
         raise ValueError(f"--proof is a share between 0 and 1; got {proof:g}")
     found = read_structure_rig(rig)
@@ -76,8 +72,7 @@ def place(
     candidates = _candidates(domain, at, grid)
     if proof is not None and isinstance(domain, Rectangle) and candidates is None:
         raise ValueError("--proof on a plate is among candidate places; give --grid M, so far apart, or --at PLACES")
-    with progress_bar() as progress:
-        report = reporter(progress, "placing actuators")
+    with reporting("placing actuators") as report:
         task = placement_task(modes, control, impulse_at=struck, weight=weight, actuator=patch_of(found))
         if isinstance(domain, Interval):
             usual = task.placed(modes.length * np.arange(1, control + 1) / (control + 1), "evenly spaced")
@@ -111,25 +106,17 @@ def place(
     nodes = nodes_of_mode(modes, control) if isinstance(domain, Interval) else None
     if nodes is not None and nodes.size == control:
         rows.append(task.placed(nodes, f"nodes of mode {control + 1}"))
-    table = Table(
-        "points" if isinstance(domain, NamedPoints) else "places [m]",
-        "W_R",
-        "effort",
-        "peak force",
-        "condition of B",
-        "",
-        box=None,
-        pad_edge=False,
-    )
+    shown = []
     for row in rows:
         where = ("; " if isinstance(domain, Rectangle) else ", ").join(map(place_text, listed(row.positions)))
         numbers = (row.residual_work, row.effort, row.peak_force, row.condition)
-        table.add_row(where, *(f"{value:.5g}" for value in numbers), row.status)
+        shown.append((where, *(f"{value:.5g}" for value in numbers), row.status))
     say(
         f"{control} of {modes.n_modes} modes controlled, unit impulse at {domain.text(struck)}, R = {weight:g}",
         bold=True,
     )
-    console.print(table)
+    where = "points" if isinstance(domain, NamedPoints) else "places [m]"
+    show_table((where, "W_R", "effort", "peak force", "condition of B", ""), shown)
     if certificate is not None:
         say(f"  {certificate}")
     if picture is not None:

@@ -4,10 +4,9 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 
 from workbench.cli.terminal import errors, short
 from workbench.records.record import Record
@@ -18,12 +17,6 @@ if TYPE_CHECKING:
     from workbench.gap.report.verdict import Verdict
     from workbench.robust.posterior import UncertainRig
     from workbench.robust.prediction import Prediction
-
-CasePath = Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")]
-VerdictPath = Annotated[
-    Path | None, typer.Option(help="Verdict that `workbench diagnose --json` wrote; diagnosed now unless given.")
-]
-Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")]
 
 
 def possible_rig(
@@ -51,9 +44,7 @@ def possible_rig(
                 f" --as-wired --json {kept.name}`, and give that file as --verdict"
             )
     errors.print(f"  no --verdict: the case is diagnosed first, which takes up to {SECONDS:g} s of processor time")
-    found = diagnose(
-        case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report
-    )  # fmt: skip
+    found = diagnose(case.rig, case.fit, validation=case.validation, name=case.name, workers=workers, report=report)
     write_verdict(found, kept)
     errors.print(f"  {found.sentence}")
     errors.print(f"  verdict    {short(kept)}: with --verdict {short(kept)} the next command need not diagnose")

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
-from workbench.cli.control import ESTIMATORS, Control, Damping, Disturbance, LawName, LawWeight, law_from, observed
-from workbench.cli.possible import CasePath, VerdictPath, Workers, possible_rig
-from workbench.cli.rig_file import ImpulseAt, impulse_place
-from workbench.cli.terminal import JsonPath, PagePath, console, guarded, progress_bar, reporter, say, short, write_json
+from workbench.cli import options
+from workbench.cli.control import check_rate, count_of, law_from, observed
+from workbench.cli.possible import possible_rig
+from workbench.cli.rig_file import impulse_place
+from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,21 +20,23 @@ if TYPE_CHECKING:
 
 @guarded
 def redesign(
-    case: CasePath,
-    verdict: VerdictPath = None,
-    law: LawName = "imsc",
-    control: Control = None,
-    weight: LawWeight = None,
-    damping: Damping = None,
+    case: options.CasePath,
+    verdict: options.VerdictPath = None,
+    law: options.LawName = "imsc",
+    control: options.Control = None,
+    weight: options.LawWeight = None,
+    damping: options.Damping = None,
     estimator: Annotated[
         str | None,
-        typer.Option(metavar="|".join(ESTIMATORS), help="Estimator in use; a Kalman filter tuned to it unless given."),
+        typer.Option(
+            metavar="|".join(options.ESTIMATORS), help="Estimator in use; a Kalman filter tuned to it unless given."
+        ),
     ] = None,
-    disturbance: Disturbance = 1.0,
+    disturbance: options.Disturbance = 1.0,
     rate_hz: Annotated[
         float | None, typer.Option("--rate-hz", help="Rate of the controller; that of the records unless given.")
     ] = None,
-    impulse_at: ImpulseAt = None,
+    impulse_at: options.ImpulseAt = None,
     aim: Annotated[
         str | None,
         typer.Option(
@@ -53,14 +55,14 @@ def redesign(
         int,
         typer.Option(min=1, max=10_000, help="Samples of the uncertain model on which both controllers are verified."),
     ] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")] = 0,
-    workers: Workers = None,
+    seed: options.Seed = 0,
+    workers: options.Workers = None,
     to: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="The controller to use: NAME.c (with NAME.h), NAME.py or NAME.mat."),
     ] = None,
-    json_path: JsonPath = None,
-    page: PagePath = None,
+    json_path: options.JsonPath = None,
+    page: options.PagePath = None,
 ) -> None:
     """Redesign the controller on the model that a diagnosis corrected, and verify both over its uncertainty.
 
@@ -75,20 +77,16 @@ def redesign(
     from workbench.robust.redesign import AIMS
     from workbench.robust.redesign import redesign as run
     from workbench.study.pages.redesign_page import redesign_page
-    from workbench.study.runs.whole_file import check_target
 
-    check_target(json_path)
-    check_target(to)
+    check_target(json_path, to)
     if to is not None:
         check_name(to)
     if aim not in (None, *AIMS):
         raise ValueError(f"--aim is {' or '.join(AIMS)}; got {aim!r}")
-    if rate_hz is not None and not 0 < rate_hz < float("inf"):
-        raise ValueError(f"--rate-hz is the rate of the controller, above 0 Hz; got {rate_hz:g}")
+    check_rate(rate_hz)
     found = read_case(case)
     rig, records = found.rig, (*found.fit, *found.validation)
-    # with no actuator at all the law says so
-    count = max(len([a for a in rig.actuators if not a.direct]), 1) if control is None else control
+    count = count_of(rig, control)
     controlled = controlled_indices(rig.modes, count)
     struck = None if impulse_at is None else impulse_place(rig, impulse_at)
     sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
@@ -97,8 +95,7 @@ def redesign(
     in_use: Design = own
     if estimator is not None:
         in_use = observed(rig, own, estimator, disturbance=disturbance, sample_time=sample_time)
-    with progress_bar() as progress:
-        report = reporter(progress, "reading")
+    with reporting("reading") as report:
         possible, _ = possible_rig(
             found, verdict, workers=workers, report=lambda what, share: report(what, 0.7 * share)
         )
@@ -115,10 +112,8 @@ def redesign(
         )
     say(f"{result.advice} {result.promise}".rstrip(), bold=True)
     say(result.figures)
-    table = Table("step", "what", "loss", "kept", box=None, pad_edge=False)
-    for step in result.steps:
-        table.add_row(step.name, step.what, step.lost, "yes" if step.kept else "no")
-    console.print(table)
+    steps = [(step.name, step.what, step.lost, "yes" if step.kept else "no") for step in result.steps]
+    show_table(("step", "what", "loss", "kept"), steps)
     if result.relocation is not None:
         say(f"  {result.relocation.sentence}")
     for note in result.notes:
@@ -135,5 +130,4 @@ def redesign(
 def _largest(records: "Sequence[Record]") -> "Floats":
     import numpy as np
 
-    level: Floats = np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
-    return level
+    return np.asarray(np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0))

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.terminal import PagePath, guarded, say, short
+from workbench.cli import options
+from workbench.cli.terminal import guarded, say, short
 
 
 @guarded
@@ -13,7 +14,7 @@ def report(
     what: Annotated[
         str, typer.Argument(help="JSON file written by this command, a case folder, or a study that has run.")
     ],
-    page: PagePath = None,
+    page: options.PagePath = None,
 ) -> None:
     """Write one self-contained page about a study, a case or a result: figures to zoom, animated shapes, no network.
 

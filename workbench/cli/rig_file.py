@@ -2,26 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Domain, Interval, NamedPoints, Patch, Place, PlaceError
-
-# a bracket that opens a word would be taken for markup of the help text
-RigPath = Annotated[
-    Path,
-    typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one."),
-]
-ImpulseAt = Annotated[
-    str | None,
-    typer.Option(
-        metavar="PLACE",
-        help="Place of the impulse: m (X,Y on a plate), a point or an input by name; the hammer's unless given.",
-    ),
-]
-Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]
 
 
 def read_structure_rig(path: Path) -> Rig:

@@ -3,22 +3,21 @@
 import json
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
 
 FAILURE, BAD_INPUT = 1, 2
 OPTIONS = {"sample_rate_hz": "--sample-rate-hz", "n_modes": "--modes", "band_hz": "--band-hz"}  # by argument
 WIDE = 150  # columns of a table that goes to a file or a pipe
 
-JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
-Memory = Annotated[float, typer.Option(help="Memory that reading a file may take, GiB.")]
-PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
 
 # no text is markup: rich would take the unit in "acceleration [m/s^2]" for a style and drop it
 console = Console(soft_wrap=True, highlight=False, markup=False)
@@ -88,17 +87,50 @@ def progress_bar() -> Progress:
     )
 
 
-def reporter(progress: Progress, first: str) -> Callable[[str, float], None]:
+@contextmanager
+def reporting(first: str) -> Iterator[Callable[[str, float], None]]:
     """A `report(what, share)` that moves a progress bar, never backwards."""
-    task = progress.add_task(first, total=1.0)
     furthest = 0.0
+    with progress_bar() as progress:
+        task = progress.add_task(first, total=1.0)
 
-    def report(what: str, share: float) -> None:
-        nonlocal furthest
-        furthest = max(furthest, share)
-        progress.update(task, description=what, completed=furthest)
+        def report(what: str, share: float) -> None:
+            nonlocal furthest
+            furthest = max(furthest, share)
+            progress.update(task, description=what, completed=furthest)
 
-    return report
+        yield report
+
+
+def tell(result: object) -> None:
+    """Print a result, its first line bold."""
+    head, *rest = str(result).splitlines()
+    say(head, bold=True)
+    for line in rest:
+        say(line)
+
+
+def show_table(headings: Sequence[str], rows: Iterable[Sequence[str]], *, right: Collection[str] = ()) -> None:
+    """Print a table; where the columns under some headings are flush right, no cell is broken into lines."""
+    table = Table(box=None, pad_edge=False)
+    for heading in headings:
+        table.add_column(heading, justify="right" if heading in right else "left", no_wrap=bool(right))
+    for row in rows:
+        table.add_row(*row)
+    console.print(table)
+
+
+def check_target(*paths: Path | None) -> None:
+    """Refuse a place where nothing can be written, before the work that is to be written there.
+
+    Raises:
+        ValueError: a folder, or a file in a folder that is not there.
+    """
+    for path in filter(None, paths):
+        if path.is_dir():
+            raise ValueError(f"{path} is a folder; name a file in it")
+        if not path.parent.is_dir():
+            raise ValueError(f"{path}: there is no folder {path.parent}; make it first")
 
 
 def write_json(path: Path | None, content: Mapping[str, Any]) -> None:

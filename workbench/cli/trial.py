@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from workbench.cli.terminal import JsonPath, guarded, progress_bar, reporter, say, short, write_json
+from workbench.cli import options
+from workbench.cli.terminal import check_target, guarded, reporting, say, short, write_json
 
 
 @guarded
@@ -13,7 +14,7 @@ def trial(
     case: Annotated[Path, typer.Argument(help="Case folder: its rig, sensors, levels and noise are used.")],
     cases: Annotated[int, typer.Option(help="Number of blind cases to make, diagnose and score.")] = 30,
     seed: Annotated[int, typer.Option(help="Seed of the random cases.")] = 0,
-    json_path: JsonPath = None,
+    json_path: options.JsonPath = None,
     picture: Annotated[Path, typer.Option(help="File of the confusion matrix.")] = Path("out/trial.png"),
 ) -> None:
     """Score the diagnosis on blind cases of your own rig: made, diagnosed, and only then compared with the truth.
@@ -22,15 +23,14 @@ def trial(
     """
     from workbench.cases.case import read_case
     from workbench.draw.trials import plot_confusion
-    from workbench.study.runs.whole_file import check_target
     from workbench.trials.hold import hold_trials
 
     check_target(json_path)
     if cases < 1:
         raise ValueError(f"--cases must be at least 1; got {cases}")
     found = read_case(case)
-    with progress_bar() as progress:
-        held = hold_trials(cases, seed, like=found, report=reporter(progress, "making cases"))
+    with reporting("making cases") as report:
+        held = hold_trials(cases, seed, like=found, report=report)
     for family, (right, of) in held.tally.shares.items():
         say(f"  {family:<8} {right} of {of} named correctly")
     say(f"  places   {held.tally.misplaced} of {held.tally.placed} more than 2 % of the length off")
@@ -39,6 +39,5 @@ def trial(
             say(f"  {name}: hidden {one['hidden']}, named {one['told']}")
     picture.parent.mkdir(parents=True, exist_ok=True)
     plot_confusion(held.tally).savefig(picture)
-    if json_path is not None:
-        write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})
+    write_json(json_path, {"labels": held.labels, "verdicts": held.verdicts, "scores": held.scores})
     say(f"  picture  {short(picture)}")

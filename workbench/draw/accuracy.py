@@ -122,8 +122,7 @@ def size_and_errors(rows: Sequence[Mapping[str, Any]], errors: np.ndarray) -> Fi
     right.hist(errors.T, edges, density=True, label=("frequency", "damping"), color=COLOURS[:2], alpha=0.8)
     normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
     right.plot(x, normal, color=GREY, lw=3, alpha=0.7, label="a method that attains the bound")
-    right.set_xlabel("error of a mode [standard errors of the bound]")
-    right.set_ylabel("density")
+    right.set(xlabel="error of a mode [standard errors of the bound]", ylabel="density")
     right.legend(loc="upper left")
     return figure
 
@@ -147,8 +146,7 @@ def records_errors(errors: Mapping[str, np.ndarray], summary: Mapping[str, Mappi
         text = f"{totals['over_bound']:.2f} times {least}\n{100 * totals['inside']:.0f} % in their intervals"
         ax.text(4.15, row, text, va="center", fontsize=8.5)
     ax.set_yticks(range(len(errors)), list(errors))
-    ax.set_ylim(len(errors) - 0.5, -0.5)
-    ax.set_xlim(-4.0, 6.2)
+    ax.set(ylim=(len(errors) - 0.5, -0.5), xlim=(-4.0, 6.2))
     ax.set_xticks(range(-4, 5, 2))
     ax.set_xlabel("error of a frequency or damping ratio [standard errors by the Cramér-Rao bound]")
     handles = [

@@ -241,8 +241,7 @@ def plot_scaling(times: dict[str, dict[int, float]], slopes: dict[str, float]) -
     for (name, series), colour, mark in zip(times.items(), COLOURS, "osD^v", strict=False):
         label = f"{name}: slope {slopes[name]:.1f}"
         ax.loglog(list(series), list(series.values()), mark + "-", color=colour, label=label)
-    ax.set(xlabel="number of modes", ylabel="time to design [s]")
-    ax.set_title("time to design: independent modes and coupled")
+    ax.set(xlabel="number of modes", ylabel="time to design [s]", title="time to design: independent modes and coupled")
     ax.legend()
     return figure
 
@@ -321,7 +320,6 @@ def plot_feedback_index(places: np.ndarray, index: np.ndarray, found: dict[int, 
     for (count, best), colour in zip(found.items(), COLOURS[1:], strict=False):
         axes[0].axhline(best.index, color=colour, linestyle="--", label=f"best of {count}: E = {best.index:.4f}")
         axes[1].plot(best.positions, np.full(best.positions.size, count), "s", color=colour, markersize=9)
-    axes[0].set(ylabel="energy integral E [J s]")
-    axes[0].set_title("direct velocity feedback by collocated piezo pairs")
+    axes[0].set(ylabel="energy integral E [J s]", title="direct velocity feedback by collocated piezo pairs")
     axes[0].legend()
     return figure

@@ -38,8 +38,7 @@ def plot_responses(rigs: Mapping[str, Rig], records: Sequence[Record]) -> Figure
         ax.plot(time, record.outputs[j, piece], color=COLOURS[6], label="measured", linewidth=2.6, alpha=0.35)
         for (name, values), colour, style in zip(outputs.items(), (COLOURS[1], COLOURS[0]), ("--", "-")):
             ax.plot(time, values[j, piece], color=colour, label=name, linestyle=style)
-        ax.set_title(f"record {record.name}, sensor {channel.name}")
-        ax.set_ylabel(in_units(channel.quantity, channel.unit))
+        ax.set(title=f"record {record.name}, sensor {channel.name}", ylabel=in_units(channel.quantity, channel.unit))
         ax.legend(loc="upper right", ncols=3)
     axes[-1, 0].set_xlabel("time [s]")
     return figure
@@ -179,8 +178,7 @@ def plot_unmodelled_force(verdict: Verdict) -> Figure:
         if law is not None:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")
             ax.legend()
-    axes[0].set_ylabel("unmodelled force [N]")
-    axes[0].set_title("unmodelled force, no law assumed")
+    axes[0].set(ylabel="unmodelled force [N]", title="unmodelled force, no law assumed")
     return figure
 
 

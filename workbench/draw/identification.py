@@ -49,8 +49,7 @@ def eigenfunction(found: Modes, exact: Modes, *, mode: int, positions: np.ndarra
     top.set_ylabel(f"φ{mode + 1}(x), mass-normalised")
     top.legend(ncols=3)
     bottom.plot(x, sign * identified - truth, color=COLOURS[0])
-    bottom.set_ylabel("difference")
-    bottom.set_xlabel("x")
+    bottom.set(ylabel="difference", xlabel="x")
     return figure
 
 
@@ -93,8 +92,7 @@ def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz:
             zorder=3,
         )
     figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
-    ax.set_xlabel("frequency, Hz")
-    ax.set_ylabel("model order (modes)")
+    ax.set(xlabel="frequency, Hz", ylabel="model order (modes)")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(loc="outside upper right")
     return figure
@@ -149,14 +147,11 @@ def placement_on_shapes(modes: Modes, placements: Mapping[str, Any], *, n_contro
             color=colour,
             label=label,
         )
-    left.set_xlabel("x / length")
-    left.set_ylabel("mode shape; actuators below")
+    left.set(xlabel="x / length", ylabel="mode shape; actuators below")
     left.legend(loc="upper center", ncols=2)
-    right.set_yscale("log")
-    right.set_ylim(1e-12, None)
+    right.set(yscale="log", ylim=(1e-12, None))
     right.set_xticks(number)
-    right.set_xlabel("residual mode")
-    right.set_ylabel("residual work")
+    right.set(xlabel="residual mode", ylabel="residual work")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 
@@ -174,8 +169,7 @@ def order_found(rows: Sequence[Mapping[str, Any]]) -> Figure:
         shown = np.array(values) != 0
         ax.plot(level[shown], np.array(values)[shown], marker, color=colour, label=f"{label} ({abs(sum(values))})")
     ax.axhline(0.0, color=GREY, lw=0.8)
-    ax.set_xlabel("signal-to-noise ratio [dB]")
-    ax.set_ylabel("modes of a structure\nerrors below the line")
+    ax.set(xlabel="signal-to-noise ratio [dB]", ylabel="modes of a structure\nerrors below the line")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0))
     return figure

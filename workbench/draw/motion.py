@@ -70,10 +70,7 @@ def response_motion(
 
 
 def mode_motion(
-    modes: Mapping[str, Modes | SampledModes],
-    *,
-    actuators: Sequence[Actuator] = (),
-    sensors: Sequence[Sensor] = (),
+    modes: Mapping[str, Modes | SampledModes], *, actuators: Sequence[Actuator] = (), sensors: Sequence[Sensor] = ()
 ) -> dict[str, Any]:
     """Mode shapes in motion, one mode at a time; several sets of modes over each other, each scaled to one.
 
@@ -119,10 +116,7 @@ def mode_motion(
 
 
 def _net_motion(
-    spots: "Net",
-    modes: Mapping[str, Modes | SampledModes],
-    actuators: Sequence[Actuator],
-    sensors: Sequence[Sensor],
+    spots: "Net", modes: Mapping[str, Modes | SampledModes], actuators: Sequence[Actuator], sensors: Sequence[Sensor]
 ) -> dict[str, Any]:
     size = np.ptp(spots.rest, axis=0).max()
     tracks: list[dict[str, Any]] = []

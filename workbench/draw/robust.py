@@ -38,8 +38,7 @@ def plot_redesign(result: Redesign) -> Figure:
             right.plot([low, high], [y, y], color=colour, linewidth=2)
     right.axvline(0.0, color=GREY, linewidth=0.8)
     right.set_yticks(rows, [f"mode {r + 1}" for r in result.controlled])
-    right.set(xlabel="closed-loop damping ratio [%]", ylim=(len(rows) - 0.5, -0.5))
-    right.set_title("median and 95 % interval")
+    right.set(xlabel="closed-loop damping ratio [%]", ylim=(len(rows) - 0.5, -0.5), title="median and 95 % interval")
     right.legend(fontsize=8)
     return figure
 

@@ -100,13 +100,7 @@ def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
     """Excited lines, odd and even lines that are not, and noise, a column a record and a row an output."""
     rows = distortions[0].channels[:OUTPUTS_SHOWN]
     figure, axes = new_figure(
-        len(rows),
-        len(distortions),
-        width=10,
-        height=1.0 + 2.3 * len(rows),
-        sharex=True,
-        sharey="row",
-        squeeze=False,
+        len(rows), len(distortions), width=10, height=1.0 + 2.3 * len(rows), sharex=True, sharey="row", squeeze=False
     )
     for column, found in zip(axes.T, distortions, strict=True):
         shown = found.frequencies_hz < BEYOND * found.frequencies_hz[found.excited].max()

@@ -25,7 +25,7 @@ from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.modal_estimates import (
-    ModalEstimates,
+    ParticipatingModes,
     credible,
     normalised_shapes,
     time_derivatives,
@@ -50,7 +50,7 @@ DRIVEN = DrivenSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Driven(ModalEstimates):
+class Driven(ParticipatingModes):
     """Modes with their participation factors: H(s) = {D + Σ_r [c_r l_r^T / (s - λ_r) + conjugate]} diag(e^{-sτ_i}).
 
     Attributes:
@@ -74,10 +74,6 @@ class Driven(ModalEstimates):
         output_channels, input_channels: of the records.
     """
 
-    modes: SampledModes
-    covariance: np.ndarray
-    vector_covariance: np.ndarray
-    participation: np.ndarray
     feedthrough: np.ndarray
     feedthrough_std: np.ndarray
     delays: np.ndarray
@@ -93,34 +89,15 @@ class Driven(ModalEstimates):
     input_channels: tuple[Channel, ...]
 
     @property
-    def shape_covariance(self) -> np.ndarray:
-        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
-        return self.vector_covariance[:, : self.modes.n_outputs, : self.modes.n_outputs]
-
-    @property
-    def shape_std(self) -> np.ndarray:
-        """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        return self._vector_std[:, : self.modes.n_outputs].T
-
-    @property
     def participation_std(self) -> np.ndarray:
         """Standard error of participation factors (n_modes, n_inputs), rms of real and imaginary part."""
         real, imaginary = np.split(self._vector_std[:, self.modes.n_outputs :], 2, axis=1)
         return np.asarray(np.sqrt(0.5 * (real**2 + imaginary**2)))
 
     @property
-    def _vector_std(self) -> np.ndarray:
-        return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)))
-
-    @property
     def noise_std(self) -> np.ndarray:
         """Of each output (n_outputs,), root mean square over the records."""
         return np.asarray(np.sqrt((self.noise**2).mean(axis=0)))
-
-    @property
-    def residues(self) -> np.ndarray:
-        """c_r l_r^T, (n_modes, n_outputs, n_inputs) complex."""
-        return np.asarray(np.einsum("jr,ri->rji", self._measured_shapes, self.participation))
 
     @property
     def _measured_shapes(self) -> np.ndarray:

@@ -19,7 +19,12 @@ from workbench.identification.input_output.modal_fit import Fit, projected, sett
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
 from workbench.identification.input_output.peak_shape import PEAKS, one_for_two, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
-from workbench.identification.signal.modal_estimates import SURE, ModalEstimates, normalised_shapes, time_derivatives
+from workbench.identification.signal.modal_estimates import (
+    SURE,
+    ParticipatingModes,
+    normalised_shapes,
+    time_derivatives,
+)
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
@@ -46,7 +51,7 @@ TRANSFER = TransferSettings()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class TransferModes(ModalEstimates):
+class TransferModes(ParticipatingModes):
     """Modes of transfer functions.
 
     Attributes:
@@ -70,10 +75,6 @@ class TransferModes(ModalEstimates):
         remarks: what is doubtful, and what was left undone where the time was up.
     """
 
-    modes: SampledModes
-    covariance: np.ndarray
-    vector_covariance: np.ndarray
-    participation: np.ndarray
     misfit: np.ndarray
     evidence: np.ndarray
     converged: bool
@@ -83,17 +84,6 @@ class TransferModes(ModalEstimates):
     fitted: np.ndarray
     frequencies_hz: np.ndarray
     remarks: tuple[str, ...] = ()
-
-    @property
-    def shape_covariance(self) -> np.ndarray:
-        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
-        return self.vector_covariance[:, : self.modes.n_outputs, : self.modes.n_outputs]
-
-    @property
-    def shape_std(self) -> np.ndarray:
-        """Standard error of the real part of each shape (n_outputs, n_modes)."""
-        n_outputs = self.modes.n_outputs
-        return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)[:, :n_outputs].T))
 
 
 def coherence_noise(transfer: ArrayLike, coherence: ArrayLike, *, averages: int) -> np.ndarray:

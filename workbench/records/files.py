@@ -12,7 +12,7 @@ from types import ModuleType
 from workbench.arrays import Floats
 from workbench.records import csv_file, hdf5_file, mat_file, npz_file, tdms_file, uff_file, wav_file
 from workbench.records.assembly import KEY, checksum, legible, record_of
-from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_size, unreadable
+from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_file, reading
 from workbench.records.named_arrays import signals_of
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions, complex_columns, holds_transfer, transfer_of
@@ -81,12 +81,8 @@ def read_measured(
     """
     path = Path(path)
     module = _format(path)
-    if not path.is_file():
-        raise RecordFileError(f"{path}: there is no such file")
-    if path.stat().st_size == 0:
-        raise RecordFileError(f"{path} is empty")
-    check_size(path)
-    try:
+    check_file(path)
+    with reading(path):
         if module is csv_file:
             time, signals, header = csv_file.read(path, limits)
             arrays = complex_columns(path, signals)
@@ -95,10 +91,6 @@ def read_measured(
             if not holds_transfer(arrays):
                 time, signals, header = signals_of(path, arrays)
                 arrays = {}
-    except RecordFileError:
-        raise
-    except Exception as error:  # every reader of another's file has its own ways to fail
-        raise unreadable(path, error) from error
     if holds_transfer(arrays):
         if inputs:
             raise RecordFileError(f"{path} holds transfer functions, which name no inputs; leave them out")

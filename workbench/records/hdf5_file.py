@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,10 @@ import h5py
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import BYTES_PER_NUMBER, DEFAULT, Limits, RecordFileError, check_counts
+from workbench.records.limits import BYTES_PER_NUMBER, Limits, RecordFileError, check_counts
 from workbench.records.named_arrays import HEADER, numbered
 
-
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """What the file holds, by name."""
-    return load_confined(__name__, path, limits)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:

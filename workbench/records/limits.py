@@ -1,7 +1,8 @@
 """What a file may hold, how long it may take to read, and the error that every reader and writer raises."""
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,17 @@ def unreadable(path: Path, error: Exception) -> RecordFileError:
     text = next(iter(str(error).splitlines()), "") or type(error).__name__
     shown = "".join(c if c.isprintable() else "?" for c in text[:LONGEST]) + ("..." if len(text) > LONGEST else "")
     return RecordFileError(f"{path} cannot be read as {path.suffix[1:].upper()}: {shown}")
+
+
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Read another's file inside this: whatever a reader fails by becomes a `RecordFileError`."""
+    try:
+        yield
+    except RecordFileError:
+        raise
+    except Exception as error:  # every reader of another's file has its own ways to fail
+        raise unreadable(path, error) from error
 
 
 @dataclass(frozen=True)
@@ -76,13 +88,17 @@ class Deadline:
             )
 
 
-def check_size(path: Path) -> None:
-    """Refuse a file too large to read.
+def check_file(path: Path) -> None:
+    """Refuse a file that is not there, is empty, or is too large to read.
 
     Raises:
-        RecordFileError: more than `MOST_BYTES`.
+        RecordFileError: no file, no bytes, or more than `MOST_BYTES`.
     """
+    if not path.is_file():
+        raise RecordFileError(f"{path}: there is no such file")
     size = path.stat().st_size
+    if size == 0:
+        raise RecordFileError(f"{path} is empty")
     if size > MOST_BYTES:
         raise RecordFileError(
             f"{path} has {size / 2**30:.3g} GiB; at most {MOST_BYTES / 2**30:g} GiB are read: cut the record or take"

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,11 @@ from scipy.io import loadmat, savemat, whosmat
 
 from workbench.records import hdf5_file
 from workbench.records.confined import load_confined
-from workbench.records.limits import DEFAULT, Limits, check_counts
+from workbench.records.limits import Limits, check_counts
 from workbench.records.named_arrays import HEADER, numbered
 
 NUMERIC = ("double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)))
-
-
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """What the file holds, by name."""
-    return load_confined(__name__, path, limits)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from workbench.arrays import Floats
 from workbench.records import hdf5_file, mat_file, npz_file, uff_modes
-from workbench.records.limits import RecordFileError, check_size, unreadable
+from workbench.records.limits import RecordFileError, check_file, reading
 from workbench.structure.domain import NamedPoints
 from workbench.structure.modes import Modes
 
@@ -59,15 +59,9 @@ def read_modes(
         raise RecordFileError(
             f"{path}: the ending {ending!r} names no format of modes; use one of {', '.join(FORMATS)}"
         )
-    if not path.is_file():
-        raise RecordFileError(f"{path}: there is no such file")
-    check_size(path)
-    try:
+    check_file(path)
+    with reading(path):
         arrays = FORMATS[ending].arrays(path)
-    except RecordFileError:
-        raise
-    except Exception as error:  # every reader of another's file has its own ways to fail
-        raise unreadable(path, error) from error
     given = {"modal_mass": modal_mass, "damping_ratios": damping_ratios}
     try:
         return _modes_of(path, {**arrays, **{k: np.asarray(v, float) for k, v in given.items() if v is not None}})

@@ -9,7 +9,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts, unreadable
+from workbench.records.limits import DEFAULT, Deadline, Limits, RecordFileError, check_counts, reading
 from workbench.records.named_arrays import HEADER
 
 ENDING = ".npy"
@@ -23,29 +23,24 @@ def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
         RecordFileError: no archive, a damaged one, a pickle, or more than the limits allow.
     """
     deadline = Deadline(path, limits)
-    try:
-        with zipfile.ZipFile(path) as archive:
-            members = archive.infolist()
-            names = [member.filename.removesuffix(ENDING) for member in members]
-            if len(set(names)) != len(names):
-                raise RecordFileError(f"{path} is damaged: it holds an array twice")
-            check_counts(path, len(members), 0, limits)
-            n_numbers = 0
-            for member in members:
-                with archive.open(member) as file:
-                    n_numbers += _numbers(path, member, *_declared(file))
-                check_counts(path, len(members), n_numbers, limits)
-                deadline.check()
-            found = {}
-            for name, member in zip(names, members):
-                with archive.open(member) as file:
-                    found[name] = npy.read_array(file, allow_pickle=False)
-                deadline.check()
-            return found
-    except RecordFileError:
-        raise
-    except Exception as error:  # damaged archives fail in many ways
-        raise unreadable(path, error) from error
+    with reading(path), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        names = [member.filename.removesuffix(ENDING) for member in members]
+        if len(set(names)) != len(names):
+            raise RecordFileError(f"{path} is damaged: it holds an array twice")
+        check_counts(path, len(members), 0, limits)
+        n_numbers = 0
+        for member in members:
+            with archive.open(member) as file:
+                n_numbers += _numbers(path, member, *_declared(file))
+            check_counts(path, len(members), n_numbers, limits)
+            deadline.check()
+        found = {}
+        for name, member in zip(names, members):
+            with archive.open(member) as file:
+                found[name] = npy.read_array(file, allow_pickle=False)
+            deadline.check()
+        return found
 
 
 def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:

@@ -1,21 +1,22 @@
 """TDMS, as LabVIEW writes it: one channel a signal, its unit and sample instants among its properties."""
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_counts
+from workbench.records.limits import Limits, RecordFileError, check_counts
 
-
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """The channels of numbers, units in brackets behind their names, and `t` where the file has sample instants."""
-    return load_confined(__name__, path, limits)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The same, sizes known first; to be called in a process of its own."""
+    """The channels of numbers, units in brackets behind their names, and `t` where the file has sample instants.
+
+    Sizes are known first; to be called in a process of its own.
+    """
     from nptdms import TdmsFile
 
     with TdmsFile.open(path) as file:

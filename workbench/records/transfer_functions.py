@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike
 
 from workbench.records.assembly import legible
 from workbench.records.confined import load_confined
-from workbench.records.limits import RecordFileError
+from workbench.records.limits import RecordFileError, check_file
 from workbench.records.record import Channel, Record
 from workbench.records.units import split_unit, unit_named
-from workbench.structure.modes import frozen
+from workbench.structure.modes import freeze
 from workbench.structure.printed import Printed, counted, place_text
 
 # Names, in small letters, under which programs keep the lines, the sample rate, and where the points are.
@@ -56,8 +56,8 @@ class TransferFunctions(Printed):
     name: str = "transfer functions"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "values", frozen(self.values, complex))
-        object.__setattr__(self, "frequencies_hz", frozen(self.frequencies_hz))
+        freeze(self, "values", dtype=complex)
+        freeze(self, "frequencies_hz")
         shape = (len(self.output_channels), len(self.references), self.frequencies_hz.size)
         if self.values.shape != shape:
             raise ValueError(
@@ -242,12 +242,7 @@ def _points(
 
 
 def read_transfer(
-    path: str | Path,
-    *,
-    positions: Sequence[float],
-    quantity: str,
-    matrix: str = "yspec",
-    sample_rate: str = "freq",
+    path: str | Path, *, positions: Sequence[float], quantity: str, matrix: str = "yspec", sample_rate: str = "freq"
 ) -> Record:
     """Impulse responses from the transfer functions of a MAT file, one column a point.
 
@@ -262,8 +257,7 @@ def read_transfer(
         RecordFileError: a file that cannot be read, lacks an array, or has another number of columns.
     """
     path = Path(path)
-    if not path.is_file():
-        raise RecordFileError(f"{path}: there is no such file")
+    check_file(path)
     arrays = load_confined("workbench.records.mat_file", path)
     for name in (matrix, sample_rate):
         if name not in arrays:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pyuff
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import DEFAULT, Limits, RecordFileError
+from workbench.records.limits import Limits, RecordFileError
 from workbench.records.named_arrays import HEADER
 from workbench.records.transfer_functions import DESCRIPTION
 
@@ -21,20 +22,14 @@ TRANSFER = 4  # func_type of the format
 MARK = b"    -1"
 BINARY = re.compile(rb"^ +58b ", re.MULTILINE)
 OURS = ('{"kind"', '"kind":', '"name":')
-
-
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """What the file holds, by name."""
-    return load_confined(__name__, path, limits)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """The signals of all data sets 58, their instants and their header; to be called in a process of its own."""
     if not _whole(path.read_bytes()):
         raise RecordFileError(f"{path} is damaged: its last data set has no end")
-    sets = pyuff.UFF(str(path)).read_sets()
-    sets = sets if isinstance(sets, list) else [sets]
-    sets = [s for s in sets if s.get("type") == 58]
+    sets = [s for s in data_sets(path) if s.get("type") == 58]
     if not sets:
         raise RecordFileError(f"{path} holds no data set 58")
     transfer = [s for s in sets if s["func_type"] == TRANSFER]
@@ -64,6 +59,12 @@ def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
         raise RecordFileError(f"{path} is damaged: its description of the record is missing")
     header = (record or {}) | {"channels": channels}
     return arrays | {HEADER: np.array(json.dumps(header))}
+
+
+def data_sets(path: Path) -> list[dict[str, Any]]:
+    """All data sets of a universal file."""
+    sets = pyuff.UFF(str(path)).read_sets()
+    return sets if isinstance(sets, list) else [sets]
 
 
 def _whole(data: bytes) -> bool:

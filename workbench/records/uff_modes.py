@@ -4,14 +4,15 @@ Data set 164 says how many of its units a metre and a newton are. Shapes stay as
 displacements; coordinates become m, rotations rad a metre, and modal masses kg.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyuff
 
 from workbench.records.confined import load_confined
 from workbench.records.limits import Limits, RecordFileError
+from workbench.records.uff_file import data_sets
 
 NORMAL_MODE = 2  # analysis_type of both formats
 AT_NODES = 1  # dataset_location of 2414
@@ -19,17 +20,12 @@ COMPLEX = (5, 6)  # data_type of both formats
 MOTIONS = (0, 1, 8)  # kinds of result that are shapes: unknown, general, displacement; others are forces, stresses, ...
 ALIKE = 1e-4  # of the coordinates: data set 15 writes six digits, 2411 sixteen
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-
-
-def arrays(path: Path) -> dict[str, np.ndarray]:
-    """The modes of the file, by the names that `modes_file` knows."""
-    return load_confined(__name__, path)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
     """Frequencies, damping, modal masses and shapes at nodes; to be called in a process of its own."""
-    sets = pyuff.UFF(str(path)).read_sets()
-    sets = sets if isinstance(sets, list) else [sets]
+    sets = data_sets(path)
     modes = [_of_55(s) if s["type"] == 55 else _of_2414(s) for s in sets if _is_mode(path, s)]
     if not modes:
         raise RecordFileError(

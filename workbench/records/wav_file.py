@@ -1,22 +1,20 @@
 """WAV: one channel a signal, as a share of full scale where the samples are whole numbers."""
 
 import warnings
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.io import wavfile
 
 from workbench.records.confined import load_confined
-from workbench.records.limits import DEFAULT, Limits, RecordFileError, check_counts
+from workbench.records.limits import Limits, RecordFileError, check_counts
 
-
-def arrays(path: Path, limits: Limits = DEFAULT) -> dict[str, np.ndarray]:
-    """Sample instants `t` and the channels, by name."""
-    return load_confined(__name__, path, limits)
+arrays = partial(load_confined, __name__)  # (path, limits) -> what `load` finds, by name
 
 
 def load(path: Path, limits: Limits) -> dict[str, np.ndarray]:
-    """The same; to be called in a process of its own."""
+    """Sample instants `t` and the channels, by name; to be called in a process of its own."""
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="Reached EOF prematurely")  # a file cut short is no shorter record
         rate, samples = wavfile.read(path)

@@ -69,12 +69,7 @@ class Actuator:
 
 
 def piezo_patch(
-    name: str,
-    at: Place,
-    *,
-    length: float | tuple[float, float],
-    gain: float = 1.0,
-    direction: str | None = None,
+    name: str, at: Place, *, length: float | tuple[float, float], gain: float = 1.0, direction: str | None = None
 ) -> Actuator:
     """A piezo patch on a beam or a plate: moments along its ends or edges, opposite ones of opposite sign.
 

@@ -169,8 +169,7 @@ class BetweenSamples:
         Of an acceleration without the forces themselves.
         """
         motion = _propagators(self.omega, self.damping, self.sample_time, time)
-        rows: Floats = motion[order] if order < 2 else -(self.omega**2) * motion[0] - self.damping * motion[1]
-        return rows
+        return np.asarray(motion[order] if order < 2 else -(self.omega**2) * motion[0] - self.damping * motion[1])
 
 
 def _held(n_modes: int) -> Floats:

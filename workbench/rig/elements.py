@@ -5,109 +5,103 @@ or `Between` two: w is then the displacement of the first less that of the secon
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
-from workbench.structure.domain import Where
 from workbench.structure.supports import AtPlace
 
 
 @dataclass(frozen=True)
-class LinearSpring(AtPlace):
+class PointElement(AtPlace):
+    """What acts by a law of the displacement and the velocity where it stands."""
+
+    @property
+    def parameters(self) -> tuple[float, ...]:
+        """The numbers of its law, in the order of its fields."""
+        return tuple(getattr(self, field.name) for field in fields(self)[1:])
+
+
+@dataclass(frozen=True)
+class LinearSpring(PointElement):
     """-k w at x, k in N/m; in the rig rather than in the structure, so the modes stay what they are."""
 
-    at: Where
     stiffness: float
 
 
 @dataclass(frozen=True)
-class LinearDamper(AtPlace):
+class LinearDamper(PointElement):
     """-c v at x, c in N s/m."""
 
-    at: Where
     coefficient: float
 
 
 @dataclass(frozen=True)
-class CubicSpring(AtPlace):
+class CubicSpring(PointElement):
     """-k w³ at x, k in N/m³; negative softens."""
 
-    at: Where
     stiffness: float
 
 
 @dataclass(frozen=True)
-class PowerSpring(AtPlace):
+class _PowerLaw(PointElement):
+    force: float
+    reference: float
+    exponent: float
+
+
+@dataclass(frozen=True)
+class PowerSpring(_PowerLaw):
     """-F |w / w_r|^p in the direction of w, at x: F (N), negative to soften, at the displacement w_r (m); p ≥ 1."""
 
-    at: Where
-    force: float
-    reference: float
-    exponent: float
-
 
 @dataclass(frozen=True)
-class EvenSpring(AtPlace):
+class EvenSpring(_PowerLaw):
     """-F |w / w_r|^p to one side, whichever way w points, at x: F (N) at the displacement w_r (m), p at least 1."""
 
-    at: Where
-    force: float
-    reference: float
-    exponent: float
-
 
 @dataclass(frozen=True)
-class PowerDamper(AtPlace):
+class PowerDamper(_PowerLaw):
     """-F |v / v_r|^p in the direction of v, at x: F (N) at the velocity v_r (m/s), p at least 1."""
 
-    at: Where
-    force: float
-    reference: float
-    exponent: float
-
 
 @dataclass(frozen=True)
-class Clearance(AtPlace):
+class Clearance(PointElement):
     """Springs k (N/m) that touch at w > gap and at w < -gap (m)."""
 
-    at: Where
     stiffness: float
     gap: float
 
 
 @dataclass(frozen=True)
-class OneSidedStop(AtPlace):
+class OneSidedStop(PointElement):
     """A spring k (N/m) that touches at w > gap (m)."""
 
-    at: Where
     stiffness: float
     gap: float
 
 
 @dataclass(frozen=True)
-class CoulombFriction(AtPlace):
+class CoulombFriction(PointElement):
     """-F tanh(v / v_s) - F_0 at x: force F and offset F_0 in N, smoothing speed v_s in m/s.
 
     Friction of two directions, F_+ forward and F_- backward, has F = (F_+ + F_-) / 2 and F_0 = (F_+ - F_-) / 2.
     """
 
-    at: Where
     force: float
     smoothing_speed: float
     offset: float = 0.0
 
 
 @dataclass(frozen=True)
-class BoucWen(AtPlace):
+class BoucWen(PointElement):
     """A hysteretic spring -k z at x, z' = v - (|v| z + v |z|) / (2 z_y): k in N/m, yield displacement z_y in m."""
 
-    at: Where
     stiffness: float
     yield_displacement: float
 
 
 @dataclass(frozen=True)
-class UserLaw(AtPlace):
+class UserLaw(PointElement):
     """A force law of the user's own at x.
 
     Attributes:
@@ -116,7 +110,6 @@ class UserLaw(AtPlace):
         parameters: up to three numbers handed to it.
     """
 
-    at: Where
     law: Callable[[float, float, Any], float]
     parameters: tuple[float, ...] = ()
 
@@ -139,7 +132,6 @@ class MidplaneStretching:
 class PeriodicForce(AtPlace):
     """amplitude sin(2π f t + phase) at x, t from the start of the record: N, Hz, rad."""
 
-    at: Where
     frequency_hz: float
     amplitude: float
     phase: float
@@ -149,21 +141,7 @@ class PeriodicForce(AtPlace):
 class RandomForce(AtPlace):
     """An unmeasured random force at x: rms in N. No prediction can hold it, only its statistics."""
 
-    at: Where
     rms: float
 
 
-PointElement = (
-    LinearSpring
-    | LinearDamper
-    | CubicSpring
-    | PowerSpring
-    | EvenSpring
-    | PowerDamper
-    | Clearance
-    | OneSidedStop
-    | CoulombFriction
-    | BoucWen
-    | UserLaw
-)
 Element = PointElement | AirDrag | MidplaneStretching | PeriodicForce | RandomForce

@@ -183,8 +183,7 @@ class _StraightPieces:
         if span == 0:
             return np.zeros((poles.size, ends.shape[2]))
         level, rise = _growth(poles, span), _ramp_growth(poles, span)
-        added: np.ndarray = level[:, None] * (weights @ ends[0]) + rise[:, None] * (weights @ (ends[1] - ends[0]))
-        return added
+        return np.asarray(level[:, None] * (weights @ ends[0]) + rise[:, None] * (weights @ (ends[1] - ends[0])))
 
 
 def sinusoid_response(

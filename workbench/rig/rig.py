@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.arrays import Floats
+from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.elements import Element
 from workbench.rig.sensors import MEASURED, Sensor
@@ -98,6 +99,20 @@ class Rig(Printed):
                     check_place(domain, where)
                 except PlaceError as error:
                     raise PlaceError(f"element {type(element).__name__}: {error}") from None
+
+    def record(
+        self, inputs: Floats, outputs: Floats, *, sample_time: float, name: str, input_hold: str = "zero"
+    ) -> Record:
+        """The record of commands (n_actuators, n_samples) and readings (n_sensors, n_samples) of the rig."""
+        return Record(
+            sample_time=sample_time,
+            outputs=outputs,
+            output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in self.sensors),
+            inputs=inputs,
+            input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in self.actuators),
+            input_hold=input_hold,
+            name=name,
+        )
 
     def in_record(self, name: str) -> "Rig":
         """The rig as it is in a record of that name: itself, but for what differs from record to record."""

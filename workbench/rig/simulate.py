@@ -3,69 +3,32 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
 
 from workbench.arrays import Floats, Integers
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
+from workbench.rig import elements, stepping
 from workbench.rig.actuators import Actuator
 from workbench.rig.between_samples import BetweenSamples, Step
-from workbench.rig.elements import (
-    AirDrag,
-    BoucWen,
-    Clearance,
-    CoulombFriction,
-    CubicSpring,
-    EvenSpring,
-    LinearDamper,
-    LinearSpring,
-    MidplaneStretching,
-    OneSidedStop,
-    PeriodicForce,
-    PointElement,
-    PowerDamper,
-    PowerSpring,
-    RandomForce,
-    UserLaw,
-)
 from workbench.rig.linear import held_response, modal_motion, modal_poles, sinusoid_response, straight_response
 from workbench.rig.rig import Rig, shape_error_of, shape_of
 from workbench.rig.sensors import MEASURED, Sensor
-from workbench.rig.stepping import (
-    BOUC_WEN,
-    CLEARANCE,
-    CUBIC,
-    EVEN_SPRING,
-    FRICTION,
-    LINEAR_DAMPER,
-    LINEAR_SPRING,
-    N_PARAMETERS,
-    ONE_SIDED,
-    POWER_DAMPER,
-    POWER_SPRING,
-    USER,
-    address_of,
-    hysteresis,
-    ramped,
-    step_record,
-    stepper_with_laws,
-)
 from workbench.structure.domain import Between, Patch, PlaceError
 
-LAWS: dict[type, tuple[int, Callable[[Any], tuple[float, ...]]]] = {
-    LinearSpring: (LINEAR_SPRING, lambda e: (e.stiffness,)),
-    LinearDamper: (LINEAR_DAMPER, lambda e: (e.coefficient,)),
-    CubicSpring: (CUBIC, lambda e: (e.stiffness,)),
-    PowerSpring: (POWER_SPRING, lambda e: (e.force, e.reference, e.exponent)),
-    EvenSpring: (EVEN_SPRING, lambda e: (e.force, e.reference, e.exponent)),
-    PowerDamper: (POWER_DAMPER, lambda e: (e.force, e.reference, e.exponent)),
-    Clearance: (CLEARANCE, lambda e: (e.stiffness, e.gap)),
-    OneSidedStop: (ONE_SIDED, lambda e: (e.stiffness, e.gap)),
-    CoulombFriction: (FRICTION, lambda e: (e.force, e.smoothing_speed, e.offset)),
-    BoucWen: (BOUC_WEN, lambda e: (e.stiffness, e.yield_displacement)),
-    UserLaw: (USER, lambda e: e.parameters),
+LAWS: dict[type[elements.PointElement], int] = {
+    elements.LinearSpring: stepping.LINEAR_SPRING,
+    elements.LinearDamper: stepping.LINEAR_DAMPER,
+    elements.CubicSpring: stepping.CUBIC,
+    elements.PowerSpring: stepping.POWER_SPRING,
+    elements.EvenSpring: stepping.EVEN_SPRING,
+    elements.PowerDamper: stepping.POWER_DAMPER,
+    elements.Clearance: stepping.CLEARANCE,
+    elements.OneSidedStop: stepping.ONE_SIDED,
+    elements.CoulombFriction: stepping.FRICTION,
+    elements.BoucWen: stepping.BOUC_WEN,
+    elements.UserLaw: stepping.USER,
 }
 QUANTITIES = ("displacement", "velocity", "acceleration")  # by derivative in time
 NOTHING, NO_GAIN, NO_ORDERS = np.zeros((0, 0)), np.zeros((2, 0, 0)), np.zeros(0, np.int64)
@@ -151,15 +114,8 @@ def simulate(
             f"inputs must have shape ({len(rig.actuators)} actuators, n_samples); got {inputs.shape}. Is time last?"
         )
     motion = move(rig, inputs, sample_time=sample_time, substeps=substeps, input_hold=input_hold)
-    return Record(
-        sample_time=sample_time,
-        outputs=read(rig, motion, sample_time=sample_time),
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=inputs,
-        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in rig.actuators),
-        input_hold=input_hold,
-        name=name,
-    )
+    outputs = read(rig, motion, sample_time=sample_time)
+    return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=input_hold)
 
 
 def predict(rig: Rig, record: Record, *, substeps: int = 8) -> np.ndarray:
@@ -182,7 +138,7 @@ def is_stepped(rig: Rig) -> bool:
     """Whether the motion has no closed form and is stepped through time."""
     if rig.stiffness_rate != 0 or any(np.isfinite(actuator.rate_limit) for actuator in rig.actuators):
         return True
-    return any(not isinstance(e, PeriodicForce | RandomForce) for e in rig.elements)
+    return any(not isinstance(e, elements.PeriodicForce | elements.RandomForce) for e in rig.elements)
 
 
 def steps_exactly(rig: Rig) -> bool:
@@ -244,7 +200,9 @@ def actuator_force(actuator: Actuator, command: np.ndarray) -> np.ndarray:
     """The force that an actuator heads for: hysteresis, gain, dead zone, saturation, before what takes its time."""
     if actuator.hysteresis_share:
         share = actuator.hysteresis_share
-        command = (1.0 - share) * command + share * hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[1:]
+        command = (1.0 - share) * command + share * stepping.hysteresis(np.r_[0.0, command], actuator.hysteresis_width)[
+            1:
+        ]
     force = command if actuator.gain == 1 else actuator.gain * command
     if actuator.dead_zone > 0:
         force = np.sign(force) * np.maximum(np.abs(force) - actuator.dead_zone, 0.0)
@@ -300,7 +258,7 @@ def _move_exactly(rig: Rig, inputs: np.ndarray, sample_time: float, input_hold: 
     held = on_modes if input_hold == "zero" else 0.0
     time = sample_time * np.arange(n_samples)
     for element in rig.elements:
-        if not isinstance(element, PeriodicForce):
+        if not isinstance(element, elements.PeriodicForce):
             continue
         shape = modes.phi_at(element.at)
         omega, phasor = 2 * np.pi * element.frequency_hz, element.amplitude * np.exp(1j * element.phase)
@@ -434,18 +392,19 @@ def _step(
     starts, ends, at_samples = on_substeps(rig, inputs, sample_time, substeps)
     participation = participation_of(rig)
     for element in rig.elements:
-        if isinstance(element, PeriodicForce):
+        if isinstance(element, elements.PeriodicForce):
             mean, now = _sinusoid_on_substeps(element, n_samples, sample_time, substeps)
             starts, ends = np.vstack([starts, mean]), np.vstack([ends, mean])
             at_samples = np.vstack([at_samples, now])
             participation = np.column_stack([participation, modes.phi_at(element.at)])
     driven = starts.any(axis=1) | ends.any(axis=1)
-    points = [e for e in rig.elements if isinstance(e, PointElement)]
+    points = [e for e in rig.elements if isinstance(e, elements.PointElement)]
     known, reading, orders = outputs, NOTHING, NO_ORDERS
     if outputs.size:
         reading, orders = reading_of(rig)
         known = _left_to_motion(rig, outputs, reading, orders, participation, at_samples)
-    step: Callable[..., None] = stepper_with_laws() if any(isinstance(e, UserLaw) for e in points) else step_record
+    of_the_users_own = any(isinstance(e, elements.UserLaw) for e in points)
+    step: Callable[..., None] = stepping.stepper_with_laws() if of_the_users_own else stepping.step_record
     damping, coupling, spread = structure_arrays(rig)
     step(
         modes.omega,
@@ -494,25 +453,24 @@ def structure_arrays(rig: Rig) -> tuple[Floats, Floats, tuple[float, Floats, Flo
     """
     damping = np.diag(rig.modes.damping).copy()
     coupling = rig.modes.damping - np.diag(damping)
-    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, MidplaneStretching)))
-    drag = float(sum(e.coefficient for e in rig.elements if isinstance(e, AirDrag)))
+    stretch = float(sum(e.coefficient for e in rig.elements if isinstance(e, elements.MidplaneStretching)))
+    drag = float(sum(e.coefficient for e in rig.elements if isinstance(e, elements.AirDrag)))
     shapes, weights = along(rig, 0) if drag else (np.zeros((0, rig.modes.n_modes)), np.zeros(0))
     stretching = np.ascontiguousarray(stretching_of(rig)) if stretch else np.zeros((0, 0))
     coupling = np.ascontiguousarray(coupling) if coupling.any() else np.zeros((0, 0))
     return damping, coupling, (stretch, stretching, np.ascontiguousarray(shapes.T), drag * weights)
 
 
-def law_arrays(rig: Rig, points: Sequence[PointElement]) -> tuple[Integers, Floats, Floats]:
+def law_arrays(rig: Rig, points: Sequence[elements.PointElement]) -> tuple[Integers, Floats, Floats]:
     """Kinds (n_elements,), shapes (n_elements, n_modes) and parameters of elements at points, a row each."""
-    of_the_users_own = any(isinstance(e, UserLaw) for e in points)
-    parameters = np.zeros((len(points), N_PARAMETERS + of_the_users_own))
+    of_the_users_own = any(isinstance(e, elements.UserLaw) for e in points)
+    parameters = np.zeros((len(points), stepping.N_PARAMETERS + of_the_users_own))
     for row, element in zip(parameters, points, strict=True):
-        values = LAWS[type(element)][1](element)
-        row[: len(values)] = values
-        if isinstance(element, UserLaw):
-            row[-1] = address_of(element.law)
+        row[: len(element.parameters)] = element.parameters
+        if isinstance(element, elements.UserLaw):
+            row[-1] = stepping.address_of(element.law)
     shapes = np.array([rig.modes.phi_at(e.at) for e in points]).reshape(len(points), rig.modes.n_modes)
-    return np.array([LAWS[type(e)][0] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
+    return np.array([LAWS[type(e)] for e in points], np.int64), np.ascontiguousarray(shapes), parameters
 
 
 def along(rig: Rig, derivative: int) -> tuple[Floats, Floats]:
@@ -543,7 +501,7 @@ def _forces_on_substeps(
         held = np.repeat(actuator_force(actuator, inputs[j]), substeps)
         start = held
         if np.isfinite(actuator.rate_limit):
-            held, start = ramped(held, actuator.rate_limit * h)
+            held, start = stepping.ramped(held, actuator.rate_limit * h)
             if actuator.delay == 0 and actuator.time_constant == 0:
                 change = np.diff(np.r_[start, 2.0 * held[-1] - start[-1]])
                 share = np.minimum(
@@ -566,7 +524,7 @@ def _straight_forces_on_substeps(
     for j, actuator in enumerate(rig.actuators):
         force = np.interp(time, sample_time * np.arange(n), actuator_force(actuator, inputs[j]))
         if np.isfinite(actuator.rate_limit):
-            _, start = ramped(np.r_[force[1:], force[-1]], actuator.rate_limit * h)
+            _, start = stepping.ramped(np.r_[force[1:], force[-1]], actuator.rate_limit * h)
             force = start
         if actuator.delay:
             force = np.interp(time - actuator.delay, time, force, left=0.0)
@@ -602,7 +560,7 @@ def _shifted(values: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _sinusoid_on_substeps(
-    element: PeriodicForce, n_samples: int, sample_time: float, substeps: int
+    element: elements.PeriodicForce, n_samples: int, sample_time: float, substeps: int
 ) -> tuple[np.ndarray, np.ndarray]:
     omega, h = 2 * np.pi * element.frequency_hz, sample_time / substeps
     edges = omega * h * np.arange(n_samples * substeps + 1) + element.phase
@@ -617,8 +575,7 @@ def _lagged(truth: np.ndarray, time_constant: float, sample_time: float, *, sett
     new = 1.0 - (1.0 - fade) / ratio
     old = (1.0 - fade) / ratio - fade
     first = truth[0] if settled else 0.0
-    filtered: np.ndarray = lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0]
-    return filtered
+    return np.asarray(lfilter([new, old], [1.0, -fade], truth, zi=[first - new * truth[0]])[0])
 
 
 def _mean_rounded(y: np.ndarray, step: float, noise_std: float) -> np.ndarray:

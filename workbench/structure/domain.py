@@ -98,8 +98,7 @@ class Interval:
                 f"x = {x[outside][0]:g} lies outside the structure, which runs from 0 to {self.length:g}; give a place"
                 " on it"
             )
-        inside: Floats = np.clip(x, 0.0, self.length)
-        return inside
+        return np.asarray(np.clip(x, 0.0, self.length))
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Places, derivative along x and sign of a displacement (derivative 0), slope (1) and so on."""
@@ -113,13 +112,7 @@ class Interval:
 
     def quadrature(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Gauss-Legendre points (n,), m, and weights (n,), m: ∫ f dx = Σ w f."""
-        points, weights = _gauss(n)
-        return 0.5 * self.length * (points + 1.0), 0.5 * self.length * weights
-
-    def distance(self, one: Place, other: Place) -> float:
-        """Between two places, m."""
-        x, y = self.locate([one, other])
-        return float(abs(x - y))
+        return gauss_between(np.array([0.0, self.length]), n)
 
     def separation(self, one: Where, other: Where) -> float:
         """Distance between two places over the length."""
@@ -181,8 +174,7 @@ class Rectangle:
             raise PlaceError(
                 f"(x, y) = ({x:g}, {y:g}) lies outside the structure, 0 to {a:g} by 0 to {b:g}; give a place on it"
             )
-        inside: Floats = np.clip(xy, 0.0, extent)
-        return inside
+        return np.asarray(np.clip(xy, 0.0, extent))
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Places, derivatives along x and y and sign of a displacement, a slope about an axis, or (i, j) as it is."""
@@ -254,11 +246,6 @@ class Rectangle:
         a, b = self.length
         x, y = np.meshgrid(0.5 * a * (points + 1.0), 0.5 * b * (points + 1.0), indexing="ij")
         return np.column_stack([x.ravel(), y.ravel()]), 0.25 * a * b * np.outer(weights, weights).ravel()
-
-    def distance(self, one: Place, other: Place) -> float:
-        """Between two places, m."""
-        p, q = self.locate([one, other])
-        return float(np.hypot(*(p - q)))
 
     def separation(self, one: Where, other: Where) -> float:
         """Distance between two places over the diagonal."""
@@ -442,15 +429,6 @@ class NamedPoints:
         """
         raise PlaceError("named points have no shapes between them to integrate; describe the structure as a member")
 
-    def distance(self, one: Place, other: Place) -> float:
-        """Between two points, m.
-
-        Raises:
-            PlaceError: positions are not known.
-        """
-        i, j = self.locate([one, other])
-        return float(np.linalg.norm(self._positions[i] - self._positions[j]))
-
     def separation(self, one: Where, other: Where) -> float:
         """0 for the same place and 1 for another: there is no way from one to the other."""
         return float(_unordered(one) != _unordered(other))
@@ -574,6 +552,13 @@ def _as_list(names: Any) -> list[Any]:
 
 def _some(names: Sequence[str]) -> str:
     return ", ".join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+
+
+def gauss_between(nodes: np.ndarray, n: int) -> tuple[Floats, Floats]:
+    """Gauss-Legendre points and weights, n on each stretch between nodes that increase: Σ w f is exact to 2 n - 1."""
+    points, weights = _gauss(n)
+    halves = 0.5 * np.diff(nodes)[:, None]
+    return (nodes[:-1, None] + halves * (points + 1.0)).ravel(), (halves * weights).ravel()
 
 
 @cache

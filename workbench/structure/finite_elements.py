@@ -142,8 +142,7 @@ class FiniteElements(Printed):
                 f"{massive} motions of {len(values)} degrees of freedom have mass, so there are no {n_modes} modes; ask"
                 f" for at most {massive}, or give the others mass"
             )
-        lowest: Floats = shapes[:, ::-1][:, :n_modes]
-        return lowest
+        return np.asarray(shapes[:, ::-1][:, :n_modes])
 
     def attached(self, parts: Sequence[Attachment]) -> "FiniteElements":
         """The structure with masses, springs and dampers at its points, or between two of them, in its matrices.

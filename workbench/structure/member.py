@@ -158,8 +158,7 @@ class _Member(Printed):
                 break
 
         def shapes(x: np.ndarray, derivative: int) -> np.ndarray:
-            found: Floats = segments.evaluation(x, derivative) @ coefficients
-            return found
+            return np.asarray(segments.evaluation(x, derivative) @ coefficients)
 
         known = self.frequency_errors[:n_modes]
         omega[: len(known)] *= np.exp(known)

@@ -40,6 +40,14 @@ def frozen(array: ArrayLike, dtype: type = float) -> np.ndarray:
     return copy
 
 
+def freeze(owner: object, *names: str, dtype: type | None = float) -> None:
+    """Make fields of a frozen type read-only copies, for its `__post_init__`; no dtype for places, numbers or names."""
+    for name in names:
+        value = getattr(owner, name)
+        kind = dtype or (object if np.asarray(value).dtype.kind in "OU" else float)
+        object.__setattr__(owner, name, frozen(value, kind))
+
+
 def modal_state_matrix(stiffness: ArrayLike, damping: ArrayLike) -> np.ndarray:
     """A = [0 I; -S -C] of q'' + C q' + S q = f, states (q_1..q_n, q_1'..q_n'): (2 n_modes, 2 n_modes), rad/s.
 
@@ -175,16 +183,13 @@ class Modes(Printed):
         """Mode shapes (n_modes,) at a place, at the first of two less those at the second, or ∮ ∂φ/∂n ds of a patch."""
         if isinstance(where, Between):
             first, second = (self.phi(place, derivative, direction=direction)[0] for place in where)
-            difference: Floats = first - second
-            return difference
+            return np.asarray(first - second)
         if isinstance(where, Patch):
             if derivative != 1:
                 raise PlaceError("a patch turns a plate by moments along its edges and has no force or displacement")
-            turned: Floats = self.edge_slopes([where], direction=direction)[0]
-            return turned
+            return np.asarray(self.edge_slopes([where], direction=direction)[0])
         at = position(where) if isinstance(self.domain, Interval) else where
-        shape: Floats = self.phi(at, derivative, direction=direction)[0]
-        return shape
+        return np.asarray(self.phi(at, derivative, direction=direction)[0])
 
     def edge_slopes(self, patches: Any, *, direction: str | None = None) -> Floats:
         """Slopes across the edges of patches of a plate, integrated along them: (n_patches, n_modes).
@@ -229,8 +234,7 @@ class Modes(Printed):
 
     def _hardly_move(self, phi: Floats) -> Flags:
         """Whether all of some mode shapes' values (..., n_modes) are nothing beside the largest displacement, (...)."""
-        still: Flags = np.abs(phi).max(axis=-1) <= HELD * self._largest
-        return still
+        return np.asarray(np.abs(phi).max(axis=-1) <= HELD * self._largest)
 
     @cached_property
     def _largest(self) -> float:
@@ -305,10 +309,9 @@ class SampledModes(Printed):
     positions: np.ndarray
 
     def __post_init__(self) -> None:
-        named = np.asarray(self.positions).dtype.kind in "OU"
-        for name, dtype in (("omega", float), ("zeta", float), ("shapes", complex)):
-            object.__setattr__(self, name, frozen(getattr(self, name), dtype))
-        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+        freeze(self, "omega", "zeta")
+        freeze(self, "shapes", dtype=complex)
+        freeze(self, "positions", dtype=None)
         n, m = self.omega.size, len(self.positions)
         if self.zeta.shape != (n,) or self.shapes.shape != (m, n):
             raise ValueError(
@@ -341,8 +344,7 @@ class SampledModes(Printed):
         """Which sensors have no known place, (n_outputs,)."""
         if self.positions.dtype == object:
             return np.array([place is None for place in self.positions])
-        unknown: Flags = ~np.isfinite(self.positions.reshape(self.n_outputs, -1)).all(axis=1)
-        return unknown
+        return np.asarray(~np.isfinite(self.positions.reshape(self.n_outputs, -1)).all(axis=1))
 
     @property
     def is_along(self) -> bool:
@@ -393,8 +395,7 @@ def mac(first: ArrayLike, second: ArrayLike) -> Floats:
     if a.shape[0] != b.shape[0]:
         raise ValueError(f"MAC compares shapes at the same places; got {a.shape[0]} and {b.shape[0]} of them")
     norms = np.outer((np.abs(a) ** 2).sum(0), (np.abs(b) ** 2).sum(0))
-    values: Floats = np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300)
-    return values
+    return np.asarray(np.abs(a.conj().T @ b) ** 2 / np.maximum(norms, 1e-300))
 
 
 def _range_hz(frequencies: np.ndarray) -> str:

@@ -281,8 +281,7 @@ class Plate(_Surface):
         def shapes(places: np.ndarray, derivatives: tuple[int, int]) -> np.ndarray:
             along_x = kx ** derivatives[0] * np.sin(np.outer(places[:, 0], kx) + 0.5 * np.pi * derivatives[0])
             along_y = ky ** derivatives[1] * np.sin(np.outer(places[:, 1], ky) + 0.5 * np.pi * derivatives[1])
-            values: np.ndarray = size * along_x * along_y
-            return values
+            return np.asarray(size * along_x * along_y)
 
         omega = np.sqrt(values[order])
         return Modes(omega=omega, damping=self.damping.matrix(omega), shapes=shapes, domain=self.domain)  # type: ignore
@@ -316,11 +315,7 @@ def bending_squares(rigidity: Field, poisson_ratio: float) -> tuple[Square, ...]
     )
 
 
-ROTATIONAL = {
-    PointMass: "rotary_inertia",
-    PointSpring: "rotational_stiffness",
-    PointDamper: "rotational_coefficient",
-}
+ROTATIONAL = {PointMass: "rotary_inertia", PointSpring: "rotational_stiffness", PointDamper: "rotational_coefficient"}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -6,7 +6,7 @@ identity, and round-off stays near machine precision at any degree. Low-order el
 accuracy would lose it to the condition number, which grows with the fourth power of their count.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 
@@ -124,6 +124,23 @@ class Segments:
         points, weights, tables = tabulated_basis(degree, self.continuity, degree + 4)
         table = tables[derivative] * self.scales(segment) * (2.0 / h) ** derivative
         return self.nodes[segment] + 0.5 * h * (points + 1.0), 0.5 * h * weights, table
+
+    def tables(self, derivatives: Iterable[int]) -> tuple[Floats, Floats, list[Floats]]:
+        """Gauss points of all segments (n_points,), m, their weights, and derivatives of all functions there.
+
+        Returns:
+            (points, weights, tables, each (n_points, n_functions)).
+        """
+        x, weights, found = np.zeros(0), np.zeros(0), []
+        for derivative in derivatives:
+            parts = [self.tabulated(s, derivative) for s in range(self.n_segments)]
+            x, weights = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+            table, row = np.zeros((x.size, self.n_functions)), 0
+            for s, (points, _, values) in enumerate(parts):
+                table[row : row + points.size, self.indices(s)] = values
+                row += points.size
+            found.append(table)
+        return x, weights, found
 
     def assemble(self, weight: Callable[[Floats], Floats], derivative: int) -> Floats:
         """Integral of weight(x) times the products of the functions' derivatives: (n_functions, n_functions)."""

@@ -59,8 +59,7 @@ class Profile:
         def piecewise_linear(at: Floats) -> Floats:
             piece = np.asarray(pieces)[np.clip(np.searchsorted(starts, at, side="right") - 1, 0, None)]
             share = (at - x[piece]) / (x[piece + 1] - x[piece])
-            values: Floats = value[piece] + share * (value[piece + 1] - value[piece])
-            return values
+            return np.asarray(value[piece] + share * (value[piece + 1] - value[piece]))
 
         return cls(piecewise_linear, tuple(np.unique(x)))
 

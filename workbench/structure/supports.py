@@ -11,16 +11,20 @@ HELD = np.inf
 
 
 @dataclass(frozen=True)
-class End:
-    """An end of a structure: stiffness against translation (N/m) and rotation (N m/rad); 0 is free, inf is held."""
-
+class _Support:
     translation: float
     rotation: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("translation", "rotation"):
             if not getattr(self, name) >= 0:
-                raise ValueError(f"the {name} stiffness of an end must be 0 or more; got {getattr(self, name)}")
+                what = type(self).__name__.lower()
+                raise ValueError(f"the {name} stiffness of an {what} must be 0 or more; got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
+class End(_Support):
+    """An end of a structure: stiffness against translation (N/m) and rotation (N m/rad); 0 is free, inf is held."""
 
 
 NAMED_ENDS = {
@@ -42,19 +46,11 @@ def as_end(end: str | End, *, allowed: tuple[str, ...]) -> End:
 
 
 @dataclass(frozen=True)
-class Edge:
+class Edge(_Support):
     """An edge of a plate: stiffness against displacement (N/m per m) and rotation about it (N m/rad per m).
 
     0 is free, inf is held.
     """
-
-    translation: float
-    rotation: float = 0.0
-
-    def __post_init__(self) -> None:
-        for name in ("translation", "rotation"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"the {name} stiffness of an edge must be 0 or more; got {getattr(self, name)}")
 
 
 NAMED_EDGES = {
@@ -88,6 +84,7 @@ def as_edges(edges: str | Edge | Mapping[str, str | Edge], *, allowed: tuple[str
     return found
 
 
+@dataclass(frozen=True)
 class AtPlace:
     """What stands at a place, or between two: kept as a float, a pair or a name, whatever it was given as."""
 
@@ -115,7 +112,6 @@ class _Attached(AtPlace):
 class PointMass(_Attached):
     """A rigid body attached at a point: mass (kg) and rotary inertia (kg m²) about that point."""
 
-    at: Where
     mass: float
     rotary_inertia: float = 0.0
 
@@ -124,7 +120,6 @@ class PointMass(_Attached):
 class PointSpring(_Attached):
     """A linear spring from a point to ground: against translation (N/m) and rotation (N m/rad)."""
 
-    at: Where
     stiffness: float
     rotational_stiffness: float = 0.0
 
@@ -133,7 +128,6 @@ class PointSpring(_Attached):
 class PointDamper(_Attached):
     """A viscous damper from a point to ground: against translation (N s/m) and rotation (N m s/rad)."""
 
-    at: Where
     coefficient: float
     rotational_coefficient: float = 0.0
 

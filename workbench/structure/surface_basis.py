@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from workbench.structure.domain import gauss_between
 from workbench.structure.polynomials import Segments
 from workbench.structure.supports import HELD
 
@@ -109,18 +110,8 @@ class Axis:
         last = segments.nodes.size - 1
         dropped = [nodal * (0 if at <= segments.nodes[0] else last) + derivative for at, derivative in held]
         kept = np.setdiff1d(np.arange(segments.n_functions), dropped)
-        points, weights = [], []
-        tables: list[list[np.ndarray]] = [[] for _ in range(nodal + 1)]
-        for s in range(segments.n_segments):
-            for derivative, rows in enumerate(tables):
-                x, w, local = segments.tabulated(s, derivative)
-                table = np.zeros((x.size, segments.n_functions))
-                table[:, segments.indices(s)] = local
-                rows.append(table[:, kept])
-            points.append(x)
-            weights.append(w)
-        joined = tuple(np.vstack(rows) for rows in tables)
-        return cls(segments, kept, np.concatenate(points), np.concatenate(weights), joined)
+        points, weights, tables = segments.tables(range(nodal + 1))
+        return cls(segments, kept, points, weights, tuple(table.take(kept, axis=1) for table in tables))
 
     @property
     def n(self) -> int:
@@ -143,8 +134,7 @@ class Functions:
         """(n_places, n_functions) ∂_x^i ∂_y^j at places (n_places, 2), with (i, j) = derivatives."""
         x = self.x_axis.values(places[:, 0], derivatives[0])
         y = self.y_axis.values(places[:, 1], derivatives[1])
-        values: np.ndarray = np.einsum("pjr,pj->pr", np.tensordot(x, self.coefficients, axes=(1, 0)), y)
-        return values
+        return np.asarray(np.einsum("pjr,pj->pr", np.tensordot(x, self.coefficients, axes=(1, 0)), y))
 
     def on_grid(self, x_axis: Axis, y_axis: Axis, derivatives: tuple[int, int] = (0, 0)) -> np.ndarray:
         """(n_x, n_y, n_functions) at the Gauss points of two axes, its own or others."""
@@ -220,11 +210,8 @@ def common_grid(*grids: tuple[Axis, Axis]) -> tuple[Axis, Axis]:
         nodes = np.unique(np.concatenate([axis.segments.nodes for axis in axes]))
         nodes = nodes[np.r_[True, np.diff(nodes) > 1e-9 * nodes[-1]]]
         most = max(max(axis.segments.degrees) for axis in axes)
-        points, weights = np.polynomial.legendre.leggauss(most + 3)
-        halves = 0.5 * np.diff(nodes)[:, None]
-        segments = Segments(nodes, (most,) * halves.size, axes[0].segments.continuity)
-        places = nodes[:-1, None] + halves * (points + 1.0)
-        return Axis(segments, np.zeros(0, int), places.ravel(), (halves * weights).ravel(), ())
+        segments = Segments(nodes, (most,) * (nodes.size - 1), axes[0].segments.continuity)
+        return Axis(segments, np.zeros(0, int), *gauss_between(nodes, most + 3), ())
 
     return joined(tuple(x for x, _ in grids)), joined(tuple(y for _, y in grids))
 

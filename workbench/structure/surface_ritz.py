@@ -62,8 +62,7 @@ class SurfaceModes:
         for functions, shares in self.parts:
             values = values + functions.on_grid(x_axis, y_axis, derivatives) @ shares
         shares = weights_on(weight, x_axis, y_axis)
-        total: np.ndarray = np.einsum("qpr,qp,qps->rs", values, shares, values, optimize=True)
-        return total
+        return np.asarray(np.einsum("qpr,qp,qps->rs", values, shares, values, optimize=True))
 
 
 def solve(problem: SurfaceProblem, n_modes: int, *, tolerance: float, beyond: int = 0) -> SurfaceModes:

@@ -1,7 +1,8 @@
 """A report of what is at hand: a study that has run, a case folder, or a JSON file that the command wrote."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -10,11 +11,17 @@ import numpy as np
 from workbench.cases.case import read_case
 from workbench.draw.beam import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
+from workbench.draw.identification import stabilisation_diagram
 from workbench.draw.motion import mode_motion
+from workbench.draw.spectra import plot_frf, plot_spectra, plot_transfer
 from workbench.draw.tables import plot_deviations, plot_mac, plot_places, plot_poles
+from workbench.identification.free_decay.ibrahim import stabilise, stable_modes
+from workbench.records.record import Record
+from workbench.records.transfer_functions import TransferFunctions
 from workbench.structure.domain import place_array, same_place
 from workbench.structure.modes import SampledModes, mac
 from workbench.study.catalogue import find_study, output_root
+from workbench.study.pages.identification_report import IdentificationReport
 from workbench.study.pages.page import FORMAT, PageContent, Table, block, page_content_of, tables_of, to_its_error
 from workbench.study.pages.verdict_page import STANDING_OF, case_inputs, moving_modes, verdict_tables
 from workbench.study.runs.cases import StudyError
@@ -22,6 +29,9 @@ from workbench.study.runs.cases import StudyError
 TURN = 2.0 * np.pi
 MOST_BYTES = 200_000_000
 ON_AXIS = 1e-9  # rad/s from the imaginary axis within which a pole is undamped
+MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
+BEYOND = 8  # orders more than modes that it shows
+SAMPLES_AN_ORDER = 8  # at least
 
 
 def page_content_about(what: str) -> tuple[str, PageContent]:
@@ -295,3 +305,34 @@ KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "placements": _placed,
     "checks": _studied,
 }
+
+
+def identification_page(
+    report: IdentificationReport, measured: Sequence[Record | TransferFunctions], *, made_by: str
+) -> PageContent:
+    """The page of a report, and of the data that it is of."""
+    content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
+    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0])]
+    return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
+
+
+def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
+    decays = [replace(decay, outputs=decay.outputs[:, :MOST_SAMPLES]) for decay in report.decays]
+    if not decays:
+        return []
+    shortest = min(decay.n_samples for decay in decays)
+    highest = min(len(report.rows) + BEYOND, shortest // SAMPLES_AN_ORDER)
+    if highest < 2:
+        return []
+    diagram = stabilise(decays, orders=range(1, highest + 1))
+    nyquist = 0.5 * decays[0].sample_rate_hz
+    figure = stabilisation_diagram(diagram, stable_modes(diagram).modes, nyquist)
+    return [block(figure, "Stabilisation diagram: the poles of models of each order; bands where they stay the same.")]
+
+
+def _response(measured: Record | TransferFunctions) -> list[dict[str, Any]]:
+    if isinstance(measured, TransferFunctions):
+        return [block(plot_transfer(measured), "Magnitude of the transfer functions.")]
+    if measured.n_inputs == 1 and np.ptp(measured.inputs):
+        return [block(plot_frf(measured), "Frequency response functions and coherence.")]
+    return [block(plot_spectra(measured), "Power spectral density, by Welch's method.")]

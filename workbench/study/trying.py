@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import simpson
 
 from workbench.cases.case import read_rig
-from workbench.design.estimation.surface_filter import filter_on
+from workbench.design.estimation.modal_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr
 from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import DesignError, Law

@@ -319,11 +319,7 @@ def _bent_reading(scene: Scene, row: int, rng: np.random.Generator) -> Number:
 def _hum(scene: Scene, rng: np.random.Generator) -> OfStrength:
     row, frequency = int(rng.integers(len(scene.bench.rig.sensors))), float(rng.uniform(0.2, 2.0)) * scene.bench.band_hz
     rms = float(scene.outputs[row].std())
-    return lambda s: {
-        "output": scene.bench.rig.sensors[row].name,
-        "frequency": frequency,
-        "amplitude": 0.3 * s * rms,
-    }
+    return lambda s: {"output": scene.bench.rig.sensors[row].name, "frequency": frequency, "amplitude": 0.3 * s * rms}
 
 
 def _spikes(scene: Scene, rng: np.random.Generator) -> OfStrength:

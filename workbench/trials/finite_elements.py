@@ -14,10 +14,10 @@ from skfem import Basis, BilinearForm, ElementLineHermite, ElementLineP2, Functi
 from skfem.helpers import d, dd
 
 from workbench.arrays import Floats
-from workbench.structure.domain import Between, Domain, NamedPoints, Where, position
+from workbench.structure.domain import Between, NamedPoints, Where, position
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.supports import HELD
 
 ELEMENTS = 240
@@ -65,30 +65,23 @@ class ElementModes:
     gram: np.ndarray
 
     def __post_init__(self) -> None:
-        for name in ("omega", "shapes", "gram"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "omega", "shapes", "gram")
 
 
 def element_modes(
-    member: Structure,
-    places: np.ndarray,
-    n_modes: int,
-    *,
-    altered: Alterations = AS_NOMINAL,
-    elements: int = ELEMENTS,
+    member: Structure, places: np.ndarray, n_modes: int, *, altered: Alterations = AS_NOMINAL
 ) -> ElementModes:
     """The lowest modes of an altered member, K v = ω² M v, with a node at every place.
 
     Args:
         places: (n_places,) where shapes are wanted, m.
-        elements: evenly spaced ones, to which the special places add theirs.
     """
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
     special += [at + side * width / 2 for at, width, _ in altered.losses for side in (-1, 1)]
     profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
     special += [*member.mass_per_length.breaks, *profile.breaks, *(part.at for part in member.attachments)]
-    nodes = _nodes(np.array(special, float), member.length, elements)
+    nodes = _nodes(np.array(special, float), member.length)
     basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
     strain, mass, slopes, strain_energy = _matrices(basis, member, altered)
     beside = (member.tension + altered.tension if isinstance(member, Beam) else 0.0) * slopes.tolil()
@@ -135,8 +128,7 @@ def matrix_modes(
 
     def row(where: Where) -> Floats:
         first, *second = points.locate(list(where) if isinstance(where, Between) else where)
-        shape: Floats = rows[first] - rows[second].sum(axis=0)
-        return shape
+        return np.asarray(rows[first] - rows[second].sum(axis=0))
 
     _add(stiffness, [(row(at), value) for at, value in altered.springs])
     _add(mass, [(row(name), value) for at, value in altered.masses for name in points.translations(at)])
@@ -155,18 +147,14 @@ def modal_modes(nominal: Modes, places: Sequence[Where], *, altered: Alterations
     """
     _check_no_member(altered)
     points = nominal.domain
-    moving = [(name, value) for at, value in altered.masses for name in _moving(points, at)]
+    every = points.translations if isinstance(points, NamedPoints) else lambda at: (at,)  # all directions of a node
+    moving = [(name, value) for at, value in altered.masses for name in every(at)]
     stiffness, mass = np.diag(altered.stiffness_factor * nominal.omega**2), np.eye(nominal.n_modes)
     _add(stiffness, [(nominal.phi_at(at), value) for at, value in altered.springs])
     _add(mass, [(nominal.phi_at(at), value) for at, value in moving])
     values, vectors = eigh(stiffness, mass)
     shapes = np.array([nominal.phi_at(at) for at in places]).reshape(-1, nominal.n_modes) @ vectors
     return ElementModes(np.sqrt(np.maximum(values, 0.0)), shapes, np.zeros_like(mass))
-
-
-def _moving(domain: Domain, at: Any) -> tuple[Any, ...]:
-    """Where a mass at a place moves: at a named point in every direction of its node."""
-    return domain.translations(at) if isinstance(domain, NamedPoints) else (at,)
 
 
 def _check_no_member(altered: Alterations) -> None:
@@ -181,13 +169,13 @@ def _add(matrix: Floats, parts: list[tuple[Floats, float]]) -> None:
         matrix += value * np.outer(row, row)
 
 
-def _nodes(special: np.ndarray, length: float, elements: int) -> np.ndarray:
+def _nodes(special: np.ndarray, length: float) -> np.ndarray:
     """Even nodes and the special ones; an even node beside a special one gives way, so no element is a sliver."""
     special = np.unique(np.r_[0.0, special[(special > 0) & (special < length)], length])
     special = special[np.r_[True, np.diff(special) > 1e-9 * length]]
-    even = np.linspace(0.0, length, elements + 1)
+    even = np.linspace(0.0, length, ELEMENTS + 1)
     distance = np.abs(even[:, None] - special[None, :]).min(axis=1)
-    return np.sort(np.r_[special, even[distance > 0.3 * length / elements]])
+    return np.sort(np.r_[special, even[distance > 0.3 * length / ELEMENTS]])
 
 
 def _node(nodes: np.ndarray, at: float) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,11 +26,8 @@ def _altered(plant: Plant, **changes: Any) -> Plant:
     return replace(plant, altered=replace(plant.altered, **changes))
 
 
-def _law(law: PointLaw) -> Hide:
-    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
-        return replace(plant, laws=(*plant.laws, (law.code, stands(e), tuple(e[name] for name in law.parameters))))
-
-    return hide
+def _law(law: PointLaw, plant: Plant, e: dict[str, Any]) -> Plant:
+    return replace(plant, laws=(*plant.laws, (law.code, stands(e), tuple(e[name] for name in law.parameters))))
 
 
 def _actuator(**fields: str) -> Hide:
@@ -46,30 +44,22 @@ def _support(plant: Plant, e: dict[str, Any]) -> Plant:
     return _altered(plant, rotational_stiffness=ends)
 
 
-def _moved(side: str, key: str) -> Hide:
+def _moved(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     """One actuator or sensor elsewhere; a patch keeps its size."""
-
-    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
-        (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
-        return with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
-
-    return hide
+    (stood,) = (port.at for port in getattr(plant, side) if port.name == e[key])
+    return with_ports(plant, side, e[key], at=centred_at(stood, stands(e)))
 
 
-def _swapped(side: str, key: str) -> Hide:
+def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     """Two actuators or two sensors on each other's wires; a channel keeps its name, its noise and its rounding."""
-
-    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
-        by_name = {port.name: port for port in getattr(plant, side)}
-        pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
-        kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
-        ports: Any = tuple(
-            replace(pair[name], **{field: getattr(port, field) for field in kept}) if name in pair else port
-            for name, port in by_name.items()
-        )
-        return replace(plant, **{side: ports})
-
-    return hide
+    by_name = {port.name: port for port in getattr(plant, side)}
+    pair = {e[key]: by_name[e["with"]], e["with"]: by_name[e[key]]}
+    kept = ("name", "noise_std", "step") if side == "sensors" else ("name",)
+    ports: Any = tuple(
+        replace(pair[name], **{field: getattr(port, field) for field in kept}) if name in pair else port
+        for name, port in by_name.items()
+    )
+    return replace(plant, **{side: ports})
 
 
 def _crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
@@ -96,18 +86,15 @@ def _bent_command(plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, curvature=e["curvature"] * acting)
 
 
-def _reading(law: Callable[[np.ndarray, float, dict[str, Any], int], None]) -> Hide:
-    def hide(plant: Plant, e: dict[str, Any]) -> Plant:
-        row = [s.name for s in plant.sensors].index(e["output"])
+def _reading(law: Callable[[np.ndarray, float, dict[str, Any], int], None], plant: Plant, e: dict[str, Any]) -> Plant:
+    row = [s.name for s in plant.sensors].index(e["output"])
 
-        def read(y: np.ndarray, sample_time: float) -> np.ndarray:
-            y = y.copy()
-            law(y, sample_time, e, row)
-            return y
+    def read(y: np.ndarray, sample_time: float) -> np.ndarray:
+        y = y.copy()
+        law(y, sample_time, e, row)
+        return y
 
-        return replace(plant, reading_laws=(*plant.reading_laws, read))
-
-    return hide
+    return replace(plant, reading_laws=(*plant.reading_laws, read))
 
 
 def _bent_reading(y: np.ndarray, sample_time: float, e: dict[str, Any], row: int) -> None:
@@ -131,7 +118,7 @@ HIDE: dict[str, Hide] = {
     "ground_spring": lambda p, e: _altered(p, springs=(*p.altered.springs, (stands(e), e["stiffness"]))),
     "truncated_modes": lambda p, e: replace(p, n_modes=e["needed"]),
     "modal_damping": lambda p, e: replace(p, damping_factor=p.damping_factor * e["factor"]),
-    **{name: _law(law) for name, law in POINT_LAWS.items() if not law.outside},
+    **{name: partial(_law, law) for name, law in POINT_LAWS.items() if not law.outside},
     "air_drag": lambda p, e: replace(p, drag=e["coefficient"]),
     "midplane_stretching": lambda p, e: replace(p, stretching=e["coefficient"]),
     "actuator_gain": _actuator(gain="gain"),
@@ -139,19 +126,19 @@ HIDE: dict[str, Hide] = {
     "actuator_delay": _actuator(delay="delay"),
     "actuator_saturation": _actuator(limit="limit"),
     "actuator_dead_zone": _actuator(dead_zone="width"),
-    "actuator_misplacement": _moved("actuators", "input"),
+    "actuator_misplacement": partial(_moved, "actuators", "input"),
     "actuator_hysteresis": _actuator(hysteresis_share="share", hysteresis_width="width"),
     "actuator_bias": _actuator(bias="force"),
     "actuator_rate_limit": _actuator(rate_limit="rate"),
-    "swapped_inputs": _swapped("actuators", "input"),
+    "swapped_inputs": partial(_swapped, "actuators", "input"),
     "sensor_gain": _sensor(gain="gain"),
     "sensor_bias": _sensor(bias="bias"),
     "sensor_drift": _sensor(drift="drift_over_record"),
     "sensor_lag": _sensor(time_constant="time_constant"),
-    "sensor_misplacement": _moved("sensors", "output"),
+    "sensor_misplacement": partial(_moved, "sensors", "output"),
     "sensor_delay": _sensor(delay="delay"),
     "sensor_crosstalk": _crosstalk,
-    "swapped_outputs": _swapped("sensors", "output"),
+    "swapped_outputs": partial(_swapped, "sensors", "output"),
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),
     "periodic_disturbance": lambda p, e: replace(
@@ -163,12 +150,12 @@ HIDE: dict[str, Hide] = {
 
 # Kinds that no catalogue of the diagnosis holds: an honest verdict on them is "unknown".
 OUTSIDE: dict[str, Hide] = {
-    **{name: _law(law) for name, law in POINT_LAWS.items() if law.outside},
+    **{name: partial(_law, law) for name, law in POINT_LAWS.items() if law.outside},
     "cross_talk": _cross_talk,
     "bent_command": _bent_command,
-    "bent_reading": _reading(_bent_reading),
-    "hum": _reading(_hum),
-    "spikes": _reading(_spikes),
+    "bent_reading": partial(_reading, _bent_reading),
+    "hum": partial(_reading, _hum),
+    "spikes": partial(_reading, _spikes),
 }
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from joblib import Parallel, delayed
-
 from workbench.cases.case import read_case
 from workbench.gap.diagnose import SECONDS, diagnose
 from workbench.trials.make import write_trials
@@ -39,7 +37,6 @@ def hold_trials(
     seed: int,
     *,
     diagnose_case: Callable[[Path], dict[str, Any]] | None = None,
-    jobs: int = 1,
     report: Callable[[str, float], None] = lambda text, share: None,
     **hidden: Any,
 ) -> Trials:
@@ -50,7 +47,6 @@ def hold_trials(
 
     Args:
         diagnose_case: folder -> verdict as JSON; None for the diagnosis of this package.
-        jobs: cases diagnosed at a time, each in a process of its own.
         report: called with (what, share done).
         hidden: `like`, `structure`, `kinds`, `dirt` and `size` of `write_trials`: what the cases are, and hide.
     """
@@ -61,9 +57,8 @@ def hold_trials(
         sealed.unlink()
         verdicts, scores, dirty = {}, {}, {}
         folders = sorted(Path(cases).iterdir())
-        found = Parallel(n_jobs=jobs, return_as="generator")(delayed(diagnose_case or verdict_on)(f) for f in folders)
-        for i, (folder, verdict) in enumerate(zip(folders, found, strict=True)):
-            verdicts[folder.name] = verdict
+        for i, folder in enumerate(folders):
+            verdicts[folder.name] = (diagnose_case or verdict_on)(folder)
             report(f"diagnosed {folder.name}", 0.1 + 0.9 * (i + 1) / n)
         for folder in folders:
             domain = read_case(folder).rig.modes.domain

@@ -138,10 +138,7 @@ POINT_LAWS: dict[str, PointLaw] = {
     "coulomb_friction": PointLaw(FRICTION, ("force", "smoothing_speed"), _friction),
     "bouc_wen": PointLaw(BOUC_WEN, ("stiffness", "yield_displacement"), _bouc_wen),
     "two_way_friction": PointLaw(
-        SLIDING,
-        ("force_forward", "force_backward", "smoothing_speed"),
-        _two_way_friction,
-        limit=_same_both_ways,
+        SLIDING, ("force_forward", "force_backward", "smoothing_speed"), _two_way_friction, limit=_same_both_ways
     ),
     "quadratic_damper": PointLaw(QUADRATIC_DAMPER, ("coefficient",), _power("coefficient", 0.05, 0, 2)),
     "quadratic_spring": PointLaw(QUADRATIC, ("stiffness",), _power("stiffness", 0.1, 2), outside=True),

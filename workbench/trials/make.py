@@ -11,7 +11,7 @@ import numpy as np
 from workbench.arrays import Floats
 from workbench.cases.case import Case
 from workbench.cases.writing import write_case
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
 from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
 from workbench.trials.draws import DRAWS, draw_effect
@@ -169,7 +169,8 @@ def _case(
         measured = real.readings(moved, bench.sample_time, rng)
         if not np.isfinite(measured).all() or (np.ptp(measured, axis=1) == 0).any():
             raise Unsuitable("the altered structure runs away, or a sensor is dead")
-        record = _record(bench, test, _logged(sent, real.plant.logging_noise, rng), measured)
+        logged = _logged(sent, real.plant.logging_noise, rng)
+        record = bench.rig.record(logged, measured, sample_time=bench.sample_time, name=test)
         (validation if test == "validate" else fit).append(record)
         figures[test] = {
             "gap": _gap(measured, _predicted(nominal, record.inputs, bench)),
@@ -284,17 +285,6 @@ def _predicted(plant: SolvedPlant, sent: np.ndarray, bench: Bench) -> np.ndarray
 def _gap(measured: np.ndarray, predicted: np.ndarray | float, scaled_by: np.ndarray | None = None) -> float:
     scale = (measured if scaled_by is None else scaled_by).std(axis=1, keepdims=True)
     return float(np.sqrt(np.mean(((measured - predicted) / scale) ** 2)))
-
-
-def _record(bench: Bench, name: str, inputs: np.ndarray, outputs: np.ndarray) -> Record:
-    return Record(
-        sample_time=bench.sample_time,
-        outputs=outputs,
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in bench.rig.sensors),
-        inputs=inputs,
-        input_channels=tuple(Channel(a.name, a.kind, at=a.at) for a in bench.rig.actuators),
-        name=name,
-    )
 
 
 def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = MEMBERS) -> list[tuple[str, ...]]:

@@ -154,14 +154,7 @@ class SolvedPlant:
         acting = np.array([not a.direct for a in plant.actuators], float)
         sent = np.ascontiguousarray(commands, float).copy()
         pieces = motion.integrate(
-            system,
-            drive,
-            sent,
-            feedback * acting[:, None] * self.at_actuators,
-            held,
-            float(sample_time),
-            edges,
-            steps,
+            system, drive, sent, feedback * acting[:, None] * self.at_actuators, held, float(sample_time), edges, steps
         )
         return ModalMotion(pieces[0, 0], pieces[1, 0], pieces[2, 0], np.r_[0.0, edges[:-1]], pieces), sent
 
@@ -219,12 +212,7 @@ class SolvedPlant:
             rows.append(np.r_[np.zeros(shift), read][: read.size])
         return np.array(rows)
 
-    def readings(
-        self,
-        moved: ModalMotion,
-        sample_time: float,
-        rng: np.random.Generator | None = None,
-    ) -> np.ndarray:
+    def readings(self, moved: ModalMotion, sample_time: float, rng: np.random.Generator | None = None) -> np.ndarray:
         """What the sensors read, (n_outputs, n_samples); without `rng` the mean of what rounding makes of noise."""
         y = self.truth(moved, sample_time)
         for law in self.plant.reading_laws:

@@ -32,18 +32,12 @@ CUBICS = (  # of the place t in an element: value and slope at its left node, th
 
 
 def plate_modes(
-    plate: Plate,
-    places: Sequence[Any],
-    n_modes: int,
-    *,
-    altered: Alterations = AS_NOMINAL,
-    elements: int = ELEMENTS,
+    plate: Plate, places: Sequence[Any], n_modes: int, *, altered: Alterations = AS_NOMINAL
 ) -> ElementModes:
     """The lowest modes of an altered plate, K v = ω² M v.
 
     Args:
         places: pairs (x, y) or `Patch`es where shapes, or ∮ ∂φ/∂n ds, are wanted, m.
-        elements: along the longer side.
 
     Raises:
         ValueError: a plate that varies, is stretched or carries something; alterations that only a member can have.
@@ -54,7 +48,7 @@ def plate_modes(
     if altered.losses or altered.tension or altered.stiffness_waves or altered.mass_waves:
         raise ValueError("trials know no local loss, tension or smooth variation of a plate")
     rigidity, nu = altered.stiffness_factor * float(plate.bending_stiffness(0.0, 0.0)), plate.poisson_ratio
-    spacing = max(plate.length) / elements
+    spacing = max(plate.length) / ELEMENTS
     x, y = (_Cubics.over(side, max(round(side / spacing), 8)) for side in plate.length)
     twisted = 2.0 * (1.0 - nu) * kron(x.slopes, y.slopes)
     across = nu * (kron(x.mixed, y.mixed.T) + kron(x.mixed.T, y.mixed))
@@ -162,10 +156,8 @@ def _row(x: _Cubics, y: _Cubics, at: Any) -> Floats:
         left, right = at.x - 0.5 * at.width, at.x + 0.5 * at.width
         bottom, top = at.y - 0.5 * at.height, at.y + 0.5 * at.height
         across_x = np.kron(x.at(right, 1) - x.at(left, 1), y.integral(bottom, top))
-        row: Floats = across_x + np.kron(x.integral(left, right), y.at(top, 1) - y.at(bottom, 1))
-        return row
-    at_point: Floats = np.kron(x.at(at[0]), y.at(at[1])).astype(float)
-    return at_point
+        return np.asarray(across_x + np.kron(x.integral(left, right), y.at(top, 1) - y.at(bottom, 1)))
+    return np.asarray(np.kron(x.at(at[0]), y.at(at[1])).astype(float))
 
 
 def _square(row: Floats) -> csc_array:

@@ -5,8 +5,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from workbench.design.estimation.controller import filtered
-from workbench.design.estimation.modal_filter import point_filter
-from workbench.design.estimation.surface_filter import filter_on
+from workbench.design.estimation.modal_filter import filter_on, point_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, close_with
 from workbench.design.spillover.comparison import through_sensors

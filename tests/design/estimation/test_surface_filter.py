@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from workbench.design.estimation.controller import filtered
-from workbench.design.estimation.surface_filter import filter_on, surface_filter
+from workbench.design.estimation.modal_filter import filter_on, surface_filter
 from workbench.design.laws.imsc import imsc
 from workbench.design.loop.closed_loop import close_loop, close_with
 from workbench.rig.actuators import Actuator

@@ -251,9 +251,8 @@ def test_the_law_that_is_drawn_is_the_law_that_acts(kind):
     if not changed.elements:
         pytest.skip("a change of the structure, not an element of the rig")
     (one,) = changed.elements
-    code, numbers = LAWS[type(one)]
-    row = np.zeros((1, 3))
-    row[0, : len(numbers(one))] = numbers(one)
+    code, row = LAWS[type(one)], np.zeros((1, 3))
+    row[0, : len(one.parameters)] = one.parameters
 
     def acting(w, v):
         return one.law(w, v, one.parameters) if code == USER else element_force(code, row, 0, w, v, 0.0, 0.0)[0]

@@ -14,7 +14,7 @@ from workbench.gap.prediction.workers import ALONE
 from workbench.gap.report.record_to_record import RecordToRecord, with_held_out
 from workbench.gap.search.record_to_record import deviations
 from workbench.gap.search.search import Search
-from workbench.records.record import Channel, Record
+from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.trials.hidden import hide
 from workbench.trials.plant import Plant
@@ -35,14 +35,7 @@ def measured(rig: Rig, plant: Plant, name: str) -> Record:
     inputs = LEVELS[name] * np.repeat(rng.normal(size=300), 5)[None]
     real = plant.solved()
     outputs = real.readings(real.move(inputs, 0.01)[0], 0.01, rng)
-    return Record(
-        sample_time=0.01,
-        outputs=outputs,
-        output_channels=tuple(Channel(s.name, s.quantity, at=s.at, noise_std=s.noise_std) for s in rig.sensors),
-        inputs=inputs,
-        input_channels=tuple(Channel(a.name, "force", at=a.at) for a in rig.actuators),
-        name=name,
-    )
+    return rig.record(inputs, outputs, sample_time=0.01, name=name)
 
 
 def of_stiffness(rig: Rig, name: str, effects=()) -> Record:

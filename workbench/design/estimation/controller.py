@@ -16,7 +16,7 @@ from workbench.design.laws.law import Law
 from workbench.rig.sensors import MEASURED, Sensor
 from workbench.rig.statespace import output_matrix
 from workbench.structure.domain import Place
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted, place_text
 
 
@@ -48,10 +48,9 @@ class Controller(Printed):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "sensors", tuple(self.sensors))
-        for name in ("state", "reads", "commands", "direct"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "state", "reads", "commands", "direct")
         if self.estimator is not None:
-            object.__setattr__(self, "estimator", frozen(self.estimator))
+            freeze(self, "estimator")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{self.name}: {counted(len(self.sensors), 'channel')} to {counted(len(self.law.actuators), 'actuator')}"

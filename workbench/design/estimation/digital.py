@@ -18,7 +18,7 @@ from scipy.linalg import expm
 
 from workbench.design.estimation.controller import Controller
 from workbench.rig.statespace import signal_names
-from workbench.structure.modes import frozen
+from workbench.structure.modes import freeze, frozen
 
 ONSET = 0.01  # of a dead zone: the v over which its inverse sets in, so that it does not jump at zero
 
@@ -101,8 +101,7 @@ class DigitalController:
             size = n_sensors if name in ("offset", "scale") else n_actuators
             value = getattr(self, name)
             object.__setattr__(self, name, frozen(value if np.size(value) else np.full(size, neutral)))
-        for name in "abcde":
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, *"abcde")
         n = self.a.shape[0]
         n_outputs = n_actuators if self.relays is None else self.relays.force.size
         if len(self.states) not in (0, n):

@@ -49,11 +49,7 @@ def export(
 
 
 def write_controller(
-    controller: DigitalController,
-    path: str | Path,
-    *,
-    readings: tuple[str, ...] = (),
-    commands: tuple[str, ...] = (),
+    controller: DigitalController, path: str | Path, *, readings: tuple[str, ...] = (), commands: tuple[str, ...] = ()
 ) -> tuple[Path, ...]:
     """The files written: NAME.c and NAME.h, NAME.py or NAME.mat, as the path says.
 

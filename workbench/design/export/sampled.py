@@ -13,7 +13,7 @@ from workbench.design.export.source import command_words, reading_words
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import close_with
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
 ON_CIRCLE = 1e-9  # a pole no further outside the unit circle stands on it
@@ -43,7 +43,7 @@ class SampledDesign(Printed):
     delay_margin: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "poles", frozen(self.poles, complex))
+        freeze(self, "poles", dtype=complex)
 
     @property
     def sample_rate_hz(self) -> float:

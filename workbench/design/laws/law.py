@@ -8,7 +8,7 @@ import numpy as np
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle, reach
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, place_text
 
 SINGULAR = 1e8
@@ -40,7 +40,7 @@ class Law(Printed):
     designed_by: Callable[[Modes, Sequence[int], Sequence[Actuator]], "Law"] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gain", frozen(self.gain))
+        freeze(self, "gain")
         object.__setattr__(self, "controlled", tuple(int(r) for r in self.controlled))
         object.__setattr__(self, "actuators", tuple(self.actuators))
         expected = (len(self.actuators), 2 * len(self.controlled))

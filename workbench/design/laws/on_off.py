@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from workbench.design.laws.law import DesignError, controlled_indices, participation
 from workbench.rig.actuators import Actuator
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class OnOffLaw:
     designed_by: Callable[[Modes, Sequence[int], Sequence[Actuator]], "OnOffLaw"] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "spread", frozen(self.spread))
+        freeze(self, "spread")
 
 
 def on_off(

@@ -14,7 +14,7 @@ from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.laws.law import Law
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Place
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import place_text
 
 UNSEEN = 1e-9
@@ -72,8 +72,7 @@ class Response:
     modes: Modes
 
     def __post_init__(self) -> None:
-        for name in ("time", "modal", "forces"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "time", "modal", "forces")
 
     def displacement(self, x: ArrayLike) -> Floats:
         """w(x, t): (n_points, n_times)."""
@@ -143,9 +142,7 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     Raises:
         ValueError: times that do not increase from zero or later, a state of another size or not finite.
     """
-    time = np.asarray(time, float)
-    if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
-        raise ValueError("times must increase, from zero or later")
+    time = checked_times(time)
     sizes = (2 * loop.modes.n_modes, loop.matrix.shape[0])
     if np.shape(state) not in ((sizes[0],), (sizes[1],)) or not np.isfinite(state).all():
         more = f", or ({sizes[1]},) with the controller" if sizes[1] > sizes[0] else ""
@@ -158,6 +155,18 @@ def initial_response(loop: ClosedLoop, state: np.ndarray, time: Sequence[float] 
     motion = modal if modal.shape[0] == 2 * loop.modes.n_modes else modal[: 2 * loop.modes.n_modes]
     fed = np.flatnonzero(loop.feedback.any(axis=0))
     return Response(time, motion, loop.feedback[:, fed] @ modal[fed], loop.modes)
+
+
+def checked_times(time: ArrayLike) -> Floats:
+    """Instants (n_times,) as an array.
+
+    Raises:
+        ValueError: times that do not increase from zero or later.
+    """
+    found = np.asarray(time, float)
+    if found.ndim != 1 or found.size == 0 or (np.diff(found) <= 0).any() or found[0] < 0:
+        raise ValueError("times must increase, from zero or later")
+    return found
 
 
 def _stepped(matrix: np.ndarray, state: np.ndarray, time: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.design.laws.on_off import OnOffLaw
-from workbench.design.loop.closed_loop import Response
+from workbench.design.loop.closed_loop import Response, checked_times
 from workbench.design.loop.switching import Stretch, switch, travel
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
@@ -34,9 +34,7 @@ def respond_on_off(modes: Modes, law: OnOffLaw, state: np.ndarray, time: ArrayLi
     Raises:
         ValueError: times that do not increase from zero or later.
     """
-    time = np.asarray(time, float)
-    if time.ndim != 1 or time.size == 0 or (np.diff(time) <= 0).any() or time[0] < 0:
-        raise ValueError("times must increase, from zero or later")
+    time = checked_times(time)
     stretches = switchings(modes, law, state, time[-1])
     return Switched(motion(modes, law, state, time, stretches), stretches)
 

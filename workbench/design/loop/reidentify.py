@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from workbench.design.laws.law import DesignError, Law
 from workbench.rig.statespace import input_matrix
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 
 ILL_CONDITIONED = 1e10
 
@@ -33,8 +33,7 @@ class Reidentified:
     damping: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "stiffness", frozen(self.stiffness))
-        object.__setattr__(self, "damping", frozen(self.damping))
+        freeze(self, "stiffness", "damping")
 
     @property
     def omega(self) -> np.ndarray:

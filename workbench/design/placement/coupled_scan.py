@@ -7,7 +7,7 @@ import numpy as np
 
 from workbench.arrays import Floats, Integers
 from workbench.design.laws.law import DesignError
-from workbench.design.placement.coupled_spillover import coupled_batch, coupled_costs
+from workbench.design.placement.coupled_placement import coupled_batch, coupled_costs
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import Placement
 from workbench.structure.modes import Modes
@@ -94,5 +94,4 @@ def _least(index: Integers, values: Floats, n_places: int) -> Floats:
         before, after = edge.copy(), edge.copy()
         before[axis], after[axis] = (1, 0), (0, 1)
         fall += 0.5 * np.maximum(np.pad(change, before), np.pad(change, after))
-    least: Floats = values - fall[tuple(index.T)]
-    return least
+    return np.asarray(values - fall[tuple(index.T)])

@@ -16,7 +16,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.placement.placement import nodes_of_mode
 from workbench.design.spillover.spillover import effort, spillover
 from workbench.rig.actuators import Actuator
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +42,8 @@ class HowMany:
     least: int
 
     def __post_init__(self) -> None:
-        for name in ("energy", "untouched", "spilled", "effort"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
-        object.__setattr__(self, "counts", frozen(self.counts, int))
+        freeze(self, "energy", "untouched", "spilled", "effort")
+        freeze(self, "counts", dtype=int)
 
     @property
     def left(self) -> Floats:

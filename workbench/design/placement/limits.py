@@ -13,16 +13,7 @@ import numpy as np
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.places import Box, coordinates, free_boxes, least_distances
 from workbench.design.placement.task import Placement, PlacementTask, batch_costs
-from workbench.structure.domain import (
-    SLACK,
-    Interval,
-    NamedPoints,
-    Place,
-    Rectangle,
-    position,
-    reach,
-    same_place,
-)
+from workbench.structure.domain import SLACK, Interval, NamedPoints, Place, Rectangle, position, reach, same_place
 
 TOLERANCE = 2e-6
 APART = 1e-6  # of the length: actuators closer than this stand at one place

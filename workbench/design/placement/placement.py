@@ -244,12 +244,7 @@ def _solver(task: PlacementTask, limits: Limits) -> Solver:
     limited = ca.vertcat(*bounded) if bounded else ca.MX(0, 1)
     gaps, least_gap = _gaps(z, sides, limits.spacing)
     problem: dict[str, ca.MX] = {"x": z, "f": ca.log(work / scale + 1e-300), "g": ca.vertcat(limited, gaps)}
-    options: dict[str, Any] = {
-        "ipopt.print_level": 0,
-        "print_time": 0,
-        "ipopt.sb": "yes",
-        **IPOPT,
-    }
+    options: dict[str, Any] = {"ipopt.print_level": 0, "print_time": 0, "ipopt.sb": "yes", **IPOPT}
     solver = ca.nlpsol("placement", "ipopt", problem, options)
     count, n_gaps = limited.shape[0], gaps.shape[0]
     n_forces = sum(part.shape[0] for part in bounded[first_force:]) - bool(np.isfinite(limits.condition))

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 
-from workbench.design.estimation.surface_filter import filter_of_mass
+from workbench.design.estimation.modal_filter import filter_of_mass
 from workbench.design.laws.law import DesignError, controlled_indices
 from workbench.design.placement.places import as_places
 from workbench.structure.domain import Interval, Place, Rectangle, listed, same_place
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted, place_text
 from workbench.structure.profile import FieldLike, ProfileLike
 from workbench.threads import one_blas_thread
@@ -46,8 +46,7 @@ class SensorPlacement(Printed):
     exhaustive: bool
 
     def __post_init__(self) -> None:
-        named = np.asarray(self.positions).dtype.kind in "OU"
-        object.__setattr__(self, "positions", frozen(self.positions, object if named else float))
+        freeze(self, "positions", dtype=None)
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{counted(len(self.positions), 'sensor')} placed: error of the filter {self.error:.3g}"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import expm, solve_continuous_lyapunov
 
-from workbench.arrays import Floats
+from workbench.arrays import Floats, symmetric_root
 from workbench.design.laws.imsc import imsc, riccati_gains
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.placement.peak import largest
@@ -22,7 +22,7 @@ from workbench.design.placement.places import as_places, coordinates, least_dist
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, Interval, NamedPoints, Patch, Rectangle, centred_at, listed, reach
-from workbench.structure.modes import Modes, frozen, modal_state_matrix
+from workbench.structure.modes import Modes, freeze, frozen, modal_state_matrix
 from workbench.structure.printed import Printed, place_text
 
 SINGULAR_SHARE = 1e-14
@@ -63,9 +63,8 @@ class Placement(Printed):
     spacing: float = np.inf
 
     def __post_init__(self) -> None:
-        dtype = object if np.asarray(self.positions).dtype.kind in "OU" else float
-        object.__setattr__(self, "positions", frozen(self.positions, dtype))
-        object.__setattr__(self, "by_mode", frozen(self.by_mode))
+        freeze(self, "positions", dtype=None)
+        freeze(self, "by_mode")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         count = len(self.positions)
@@ -286,7 +285,7 @@ def placement_task(
     else:
         unit = unit[:, :, None] * np.eye(n)
     transforms = unit @ rates.T
-    roots = np.array([_root((t @ t.conj().T).real) for t in transforms])
+    roots = np.array([symmetric_root((t @ t.conj().T).real) for t in transforms])
     # one impulse has a root of two columns; columns without weight only cost time
     weights = np.abs(roots).max(axis=(0, 1))
     roots = roots[:, :, weights > NOTHING * weights.max()]
@@ -352,12 +351,6 @@ def participation_along(modes: Modes, actuator: Actuator, x: Floats, derivative:
     if half == 0:
         return actuator.gain * modes.phi(x, order)
     return actuator.gain * (modes.phi(x + half, order) - modes.phi(x - half, order))
-
-
-def _root(matrix: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(matrix)
-    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
 
 
 def _force_gramian(a: Floats, gains: Floats, rates: Floats, final_time: float) -> Floats:

@@ -19,7 +19,7 @@ from workbench.arrays import Floats
 from workbench.design.laws.law import DesignError
 from workbench.design.placement.task import extent, participation_along
 from workbench.rig.actuators import Actuator
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze, frozen
 from workbench.structure.printed import Printed
 
 GRID = 4_001  # places at which the largest curvature of the participation is looked for
@@ -47,8 +47,7 @@ class FeedbackTask:
     spacing: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "gain", frozen(self.gain))
-        object.__setattr__(self, "state", frozen(self.state))
+        freeze(self, "gain", "state")
         if self.gain.ndim != 2 or self.gain.shape[0] != self.gain.shape[1]:
             raise DesignError(f"the feedback gain must be square, one row a pair; got shape {self.gain.shape}")
         if self.state.shape != (2 * self.modes.n_modes,):
@@ -242,8 +241,7 @@ class _Expansion:
         size, strength = np.abs(b), np.abs(gain)
 
         def products(one: Floats, other: Floats) -> Floats:
-            product: Floats = np.einsum("ij,pir,pjs->prs", strength, one, other)
-            return product
+            return np.asarray(np.einsum("ij,pir,pjs->prs", strength, one, other))
 
         second = products(curved, size) + products(size, curved) + products(moved, moved)
         change = products(moved, size) + products(size, moved) + products(moved, moved)
@@ -268,5 +266,4 @@ def _curvature(task: FeedbackTask) -> Floats:
     """Largest second derivative of a pair's participation in each mode anywhere, (n_modes,)."""
     grid = np.linspace(*task.reach, GRID)
     bend = participation_along(task.modes, task.actuator, grid, 2)
-    most: Floats = np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0)
-    return most
+    return np.asarray(np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0))

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.design.estimation.controller import Controller, filtered
+from workbench.design.estimation.modal_filter import filter_on
 from workbench.design.estimation.observers import luenberger
-from workbench.design.estimation.surface_filter import filter_on
 from workbench.design.laws.coupled import coupled_lqr, coupled_poles
 from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
@@ -18,7 +18,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import NamedPoints, Place
 from workbench.structure.member import Structure
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.plate import Membrane, Plate
 from workbench.threads import one_blas_thread
 
@@ -48,7 +48,7 @@ class Compared:
     poles: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "poles", frozen(self.poles, complex))
+        freeze(self, "poles", dtype=complex)
 
     @property
     def most_excited(self) -> int | None:

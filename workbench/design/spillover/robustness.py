@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.arrays import Floats
+from workbench.arrays import symmetric_root
 from workbench.design.estimation.controller import Controller
 from workbench.design.laws.law import DesignError, Law
 from workbench.design.loop.closed_loop import close_with
 from workbench.design.spillover.spillover import finite_spillover
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.threads import one_blas_thread
 
 LEAST_OMEGA = 1e-3
@@ -34,8 +34,7 @@ class Robustness:
     work: np.ndarray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "margins", frozen(self.margins))
-        object.__setattr__(self, "work", frozen(self.work))
+        freeze(self, "margins", "work")
 
     @property
     def share(self) -> float:
@@ -85,22 +84,16 @@ def draw_modes(
     rng = np.random.default_rng(seed)
     n = modes.n_modes
     centre = np.r_[modes.omega, modes.zeta]
-    drawn = centre + scale * rng.standard_normal((count, 2 * n)) @ _root(modes.covariance).T
+    drawn = centre + scale * rng.standard_normal((count, 2 * n)) @ symmetric_root(modes.covariance).T
     mixing = np.zeros((count, n, n))
     if shape_covariance is not None and positions is not None:
         at = modes.phi(positions)
         known = np.linalg.pinv(at)
         for r, covariance in enumerate(np.asarray(shape_covariance, float)):
             largest = np.abs(at[:, r]).max()
-            error = largest * rng.standard_normal((count, len(at))) @ _root(covariance).T
+            error = largest * rng.standard_normal((count, len(at))) @ symmetric_root(covariance).T
             mixing[:, :, r] = scale * error @ known.T
     return [_possible(modes, row, mix) for row, mix in zip(drawn, mixing, strict=True)]
-
-
-def _root(covariance: Floats) -> Floats:
-    values, vectors = np.linalg.eigh(covariance)
-    root: Floats = vectors * np.sqrt(np.maximum(values, 0.0))
-    return root
 
 
 def _possible(modes: Modes, figures: np.ndarray, mixing: np.ndarray) -> Modes:

@@ -22,7 +22,8 @@ from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import motion, switchings
 from workbench.rig.statespace import input_matrix
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.domain import gauss_between
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed
 
 GAUSS_POINTS = 12
@@ -43,7 +44,7 @@ class Spillover(Printed):
     final_time: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "by_mode", frozen(self.by_mode))
+        freeze(self, "by_mode")
 
     @property
     def residual(self) -> tuple[int, ...]:
@@ -93,8 +94,7 @@ def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Comp
     values, vectors = np.linalg.eig(loop)
     if np.linalg.cond(vectors) < 1e6:
         weights = -(law.gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
-        transform: Complexes = weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None]))
-        return transform
+        return np.asarray(weights @ (1.0 / (np.asarray(s)[None, :] - values[:, None])))
     eye = np.eye(loop.shape[0])
     return np.array([-law.gain @ np.linalg.solve(si * eye - loop, start) for si in np.asarray(s)]).T
 
@@ -158,12 +158,10 @@ def on_off_work(modes: Modes, law: OnOffLaw, state: np.ndarray, final_time: floa
     edges = np.concatenate(
         [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(events[:-1], events[1:], pieces)] + [[final_time]]
     )
-    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
-    width = 0.5 * np.diff(edges)[:, None]
-    at = (edges[:-1, None] + width * (1 + points)).ravel()
+    at, weights = gauss_between(edges, GAUSS_POINTS)
     response = motion(modes, law, state, at, stretches)
     power = (input_matrix(modes, law.actuators) @ response.forces) * response.modal[modes.n_modes :]
-    return Spillover(power @ (width * weights).ravel(), law.controlled, final_time)
+    return Spillover(power @ weights, law.controlled, final_time)
 
 
 def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
@@ -183,8 +181,7 @@ def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
     for _ in range(halvings):
         moments = moments + transition @ moments @ transition.T
         transition = transition @ transition
-    balanced: Floats = scale[:, None] * moments * scale
-    return balanced
+    return np.asarray(scale[:, None] * moments * scale)
 
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:

@@ -254,7 +254,8 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
     if deviations:
         entry["parameters_std"] = deviations
     if kind.path in ("actuator", "sensor"):
-        entry |= _channels_json("input" if kind.path == "actuator" else "output", effect.target, kind.second_channel)
+        side, target = "input" if kind.path == "actuator" else "output", effect.target
+        entry |= {side: target[0], kind.second_channel: target[1]} if isinstance(target, tuple) else {side: target}
     if kind.stands is not None:
         entry["at"], entry["at_std"] = kind.stands(effect, nominal)[0], 0.0
     elif effect.at is not None:
@@ -262,11 +263,6 @@ def effect_json(effect: Effect, nominal: Rig) -> dict[str, Any]:
         spread = [_rounded(effect.deviations.get(name, 0.0)) for name in COORDINATES if name in effect.values]
         entry["at_std"] = spread if len(spread) > 1 else spread[0]
     return entry
-
-
-def _channels_json(side: str, target: Any, second: str) -> dict[str, Any]:
-    """The input or output that an effect acts on, and the other one of two."""
-    return {side: target[0], second: target[1]} if isinstance(target, tuple) else {side: target}
 
 
 def _place_json(where: Any) -> dict[str, Any]:

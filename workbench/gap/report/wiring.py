@@ -6,6 +6,7 @@ astray does not do that: no missing effect turns a sign, multiplies by 1000, or 
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from itertools import combinations
 
 import numpy as np
@@ -16,7 +17,8 @@ from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped, predict
 from workbench.structure.damping import ModalDamping
 
-Mend = Callable[[Rig, Sequence[Record]], tuple[Rig, tuple[Record, ...]]]
+Mended = tuple[Rig, tuple[Record, ...]]
+Mend = Callable[[Rig, Sequence[Record]], Mended]
 
 WIDE_GAP = 0.3  # root mean square per standard deviation of a channel from which it may be wired wrongly: a turned sign
 # leaves 2, an exchange about 1.4, a factor of 2π at least 0.84
@@ -139,7 +141,7 @@ def _repeated(records: Sequence[Record]) -> list[WiringFault]:
                     "repeated record",
                     f"The records {first} and {second} hold the same samples: leave {second} out of case.toml.",
                     np.nan,
-                    _without_record(second),
+                    partial(_without_record, second),
                 )
             )
     return faults
@@ -169,7 +171,7 @@ def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
                 f"The outputs {one.name} and {other.name} hold the same samples, and the model agrees better with"
                 f" {rig.sensors[kept].name}: measure {rig.sensors[copy].name} again, or leave it out.",
                 np.nan,
-                _without_output(rig.sensors[copy].name),
+                partial(_without_output, rig.sensors[copy].name),
             )
         )
     return faults
@@ -182,40 +184,56 @@ def _copied(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
 class _Gap:
     """Measured beside predicted, by output; power is in units of the noise where that is larger than a thousandth."""
 
+    rig: Rig
+    records: Sequence[Record]
+    predicted: Sequence[Floats]
     measured: list[np.ndarray]
     noise: np.ndarray
     scale: np.ndarray
 
     @staticmethod
-    def of(rig: Rig, records: Sequence[Record]) -> "_Gap":
+    def of(rig: Rig, records: Sequence[Record], predicted: Sequence[Floats] | None = None) -> "_Gap":
+        predicted = [_predict(rig, record) for record in records] if predicted is None else predicted
         measured = [record.outputs for record in records]
         power = sum((y**2).sum(axis=1) for y in measured) / sum(y.shape[1] for y in measured)
         scale = np.where(power > 0, power, 1.0)
-        return _Gap(measured, np.array([s.noise_std for s in rig.sensors]) ** 2 / scale, scale)
+        noise = np.array([s.noise_std for s in rig.sensors]) ** 2 / scale
+        return _Gap(rig, records, predicted, measured, noise, scale)
+
+    @cached_property
+    def before(self) -> Floats:
+        """(n_outputs,) power that the rig leaves as it is."""
+        return self.power(self.predicted)
+
+    @property
+    def wide(self) -> Flags:
+        """(n_outputs,) where that is too much for an effect."""
+        return np.asarray(self.before > np.maximum(WIDE_GAP**2, 4.0 * self.noise))
 
     def power(self, predicted: Sequence[Floats]) -> Floats:
         """(n_outputs,) mean square of what is left, as a share of the mean square measured."""
         count = sum(y.shape[1] for y in self.measured)
         with np.errstate(over="ignore", invalid="ignore"):
             left = sum(((y - p) ** 2).sum(axis=1) for y, p in zip(self.measured, predicted, strict=True))
-        power: Floats = np.nan_to_num(left / count / self.scale, nan=np.inf)
-        return power
+        return np.asarray(np.nan_to_num(left / count / self.scale, nan=np.inf))
 
-    def closed(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    def closed(self, after: np.ndarray) -> np.ndarray:
         """(n_outputs,) share of the power beyond the noise that is gone; 0 where much of the signal is still missed."""
         left = np.maximum(after - self.noise, 0.0)
-        return np.where(left > LEFT, 0.0, 1.0 - left / np.maximum(before - self.noise, 1e-300))
+        return np.where(left > LEFT, 0.0, 1.0 - left / np.maximum(self.before - self.noise, 1e-300))
+
+    def closes(self, rig: Rig, records: Sequence[Record]) -> float:
+        """The share that another rig and other records close, in the median of the channels with a wide gap."""
+        after = self.power([_predict(rig, record) for record in records])
+        return float(np.median(self.closed(after)[self.wide]))
 
 
 def _best(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
     """The faults of the kind that closes most, doubtful ones where none is certain; none where no mend closes most."""
     gap = _Gap.of(rig, records)
-    predicted = [_predict(rig, record) for record in records]
-    before = gap.power(predicted)
-    wide = before > np.maximum(WIDE_GAP**2, 4.0 * gap.noise)
     ways = (_scaled_outputs, _exchanged_outputs, _exchanged_inputs, _scaled_inputs, _quantities, _rates, _structure)
     # a record at a low level may be sampled wrongly and yet leave no wide gap over all records
-    found = [way(rig, records, gap, predicted, before, wide) for way in (ways if wide.any() else (_rates,))]
+    found = [way(gap) for way in (ways if gap.wide.any() else (_rates,))]
     doubtful = [fault for faults in found for fault in faults if not fault.certain]
     found = [faults for faults in ([f for f in faults if f.certain] for faults in found) if faults]
     if not found:
@@ -226,25 +244,23 @@ def _best(rig: Rig, records: Sequence[Record]) -> list[WiringFault]:
 def _overall(faults: Sequence[WiringFault], rig: Rig, records: Sequence[Record]) -> float:
     """Minus the share of the measured power that remains with the mends."""
     rig, kept = mended(faults, rig, records)
-    gap = _Gap.of(rig, kept)
-    return -float(np.minimum(gap.power([_predict(rig, record) for record in kept]), 1.0).mean())
+    return -float(np.minimum(_Gap.of(rig, kept).before, 1.0).mean())
 
 
-def _scaled_outputs(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
+def _scaled_outputs(gap: _Gap) -> list[WiringFault]:
     """Outputs that read a known factor times what is predicted."""
-    over = sum((p**2).sum(axis=1) for p in predicted)
-    along = sum((y * p).sum(axis=1) for y, p in zip(gap.measured, predicted, strict=True))
+    rig = gap.rig
+    over = sum((p**2).sum(axis=1) for p in gap.predicted)
+    along = sum((y * p).sum(axis=1) for y, p in zip(gap.measured, gap.predicted, strict=True))
     gains = np.divide(along, over, out=np.ones_like(over), where=over > 0)
-    freely = gap.power([gains[:, None] * p for p in predicted])
+    freely = gap.power([gains[:, None] * p for p in gap.predicted])
     n_samples = sum(y.shape[1] for y in gap.measured)
     factors: dict[tuple[float, bool], list[int]] = {}
-    for j in np.flatnonzero(wide):
+    for j in np.flatnonzero(gap.wide):
         factor = _factor(float(gains[j]))
         if factor is not None:
-            left = gap.power([factor * p for p in predicted])
-            if gap.closed(before, left)[j] >= CLOSED:
+            left = gap.power([factor * p for p in gap.predicted])
+            if gap.closed(left)[j] >= CLOSED:
                 certain = not _is_gain(
                     float(gains[j]),
                     factor,
@@ -257,7 +273,7 @@ def _scaled_outputs(
     faults = []
     for (factor, certain), outputs in factors.items():
         names = [rig.sensors[j].name for j in outputs]
-        closes = float(gap.closed(before, gap.power([factor * p for p in predicted]))[outputs].min())
+        closes = float(gap.closed(gap.power([factor * p for p in gap.predicted]))[outputs].min())
         every = len(outputs) == len(rig.sensors)
         what, of_inputs = FACTORS[factor]
         if factor == 1.0 / G and {rig.sensors[j].quantity for j in outputs} == {"acceleration"}:
@@ -269,7 +285,7 @@ def _scaled_outputs(
         sentence = f"{_one(f'{who} {what}', names)}{rest}: {cure}{' (the outputs)' if rest else ''}."
         if not certain:
             sentence = _doubtful(f"{who} {what}{rest}", gains[outputs] / factor - 1.0)
-        mend = _outputs_times(dict.fromkeys(names, 1.0 / factor))
+        mend = partial(_outputs_times, dict.fromkeys(names, 1.0 / factor))
         faults.append(WiringFault(kind, sentence, closes, mend, certain))
     return faults
 
@@ -299,42 +315,39 @@ def _factor(gain: float) -> float | None:
     return min(near, key=lambda factor: abs(gain / factor - 1.0), default=None)
 
 
-def _exchanged_outputs(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
-    for i, j in combinations(np.flatnonzero(wide), 2):
+def _exchanged_outputs(gap: _Gap) -> list[WiringFault]:
+    rig = gap.rig
+    for i, j in combinations(np.flatnonzero(gap.wide), 2):
         order = np.arange(len(rig.sensors))
         order[[i, j]] = j, i
-        after = gap.power([p[order] for p in predicted])
-        closes = float(gap.closed(before, after)[[i, j]].min())
+        after = gap.power([p[order] for p in gap.predicted])
+        closes = float(gap.closed(after)[[i, j]].min())
         if closes >= CLOSED:
             one, other = rig.sensors[i].name, rig.sensors[j].name
             sentence = f"The outputs {one} and {other} are exchanged: swap them in case.toml."
-            return [WiringFault("exchanged outputs", sentence, closes, _outputs_swapped(one, other))]
+            return [WiringFault("exchanged outputs", sentence, closes, partial(_exchanged, "outputs", one, other))]
     return []
 
 
-def _exchanged_inputs(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
+def _exchanged_inputs(gap: _Gap) -> list[WiringFault]:
+    rig, records = gap.rig, gap.records
     found: list[WiringFault] = []
     n = len(rig.actuators)
     for i, j in combinations(range(n), 2):
         if n > MOST_CHANNELS and j != i + 1:
             continue
         one, other = rig.actuators[i].name, rig.actuators[j].name
-        mend = _inputs_swapped(one, other)
-        closes = _closes(gap, before, wide, *mend(rig, records))
+        mend = partial(_exchanged, "inputs", one, other)
+        closes = gap.closes(*mend(rig, records))
         if closes >= CLOSED:
             sentence = f"The inputs {one} and {other} are exchanged: swap them in case.toml."
             found.append(WiringFault("exchanged inputs", sentence, closes, mend))
     return sorted(found, key=lambda fault: -fault.closes)[:1]
 
 
-def _scaled_inputs(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
+def _scaled_inputs(gap: _Gap) -> list[WiringFault]:
     """Inputs that a linear rig would need a known factor larger or smaller, by least squares on their responses."""
+    rig, records = gap.rig, gap.records
     n = len(rig.actuators)
     if n < 2 or n > MOST_CHANNELS or is_stepped(rig):
         return []
@@ -358,8 +371,8 @@ def _scaled_inputs(
     wrong = {p: factor for p, factor in known.items() if factor is not None}
     if not wrong or (len(wrong) == acting.size and len(set(wrong.values())) == 1):
         return []
-    mend = _inputs_times({rig.actuators[p].name: factor for p, factor in wrong.items()})
-    closes = _closes(gap, before, wide, *mend(rig, records))
+    mend = partial(_inputs_times, {rig.actuators[p].name: factor for p, factor in wrong.items()})
+    closes = gap.closes(*mend(rig, records))
     if closes < CLOSED:
         return []
     freely, noise = _squares(target - matrix @ gains), float(gap.noise.sum()) * target.size / gap.noise.size
@@ -376,7 +389,8 @@ def _scaled_inputs(
         if not certain:
             sentence = _doubtful(what, gains[inputs] / factor - 1.0)
         kind = "sign" if factor == -1.0 else "unit"
-        faults.append(WiringFault(kind, sentence, closes, _inputs_times(dict.fromkeys(names, factor)), certain))
+        own = partial(_inputs_times, dict.fromkeys(names, factor))
+        faults.append(WiringFault(kind, sentence, closes, own, certain))
     return faults
 
 
@@ -384,45 +398,40 @@ def _squares(values: Floats) -> float:
     return float(values @ values)
 
 
-def _quantities(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
+def _quantities(gap: _Gap) -> list[WiringFault]:
     """Outputs that are another time derivative of the motion than their label says."""
+    rig, records = gap.rig, gap.records
     meant: dict[tuple[str, str], list[int]] = {}
     for quantity in QUANTITIES:
-        here = [j for j in np.flatnonzero(wide) if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
+        here = [j for j in np.flatnonzero(gap.wide) if rig.sensors[j].quantity in set(QUANTITIES) - {quantity}]
         if not here:
             continue
         every = {rig.sensors[j].name for j in here}
-        closed = gap.closed(before, gap.power([_predict(_relabelled(rig, every, quantity), r) for r in records]))
+        closed = gap.closed(gap.power([_predict(_relabelled(rig, every, quantity), r) for r in records]))
         for j in here:
             if closed[j] >= CLOSED:
                 meant.setdefault((rig.sensors[j].quantity, quantity), []).append(int(j))
     faults = []
     for (said, quantity), outputs in meant.items():
         names = [rig.sensors[j].name for j in outputs]
-        closed = gap.closed(before, gap.power([_predict(_relabelled(rig, set(names), quantity), r) for r in records]))
+        closed = gap.closed(gap.power([_predict(_relabelled(rig, set(names), quantity), r) for r in records]))
         what = _one(f"{_named('output', names)} are {quantity}, not {said}", names)
         sentence = f'{what}: write quantity = "{quantity}" in case.toml.'
-        mend = _quantity_set(frozenset(names), quantity)
+        mend = partial(_quantity_set, frozenset(names), quantity)
         faults.append(WiringFault("quantity", sentence, float(closed[outputs].min()), mend))
     return faults
 
 
-def _rates(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
+def _rates(gap: _Gap) -> list[WiringFault]:
     """Records sampled at another rate than they are said to be."""
+    rig, records = gap.rig, gap.records
     wrong: dict[float, list[int]] = {}
     for i, record in enumerate(records):
-        own = _Gap.of(rig, [record])
-        left = own.power([predicted[i]])
-        here = left > np.maximum(WIDE_GAP**2, 4.0 * own.noise)
-        if not here.any():
+        own = _Gap.of(rig, [record], [gap.predicted[i]])
+        if not own.wide.any():
             continue
         shares = {
-            factor: _closes(own, left, here, rig, [replace(record, sample_time=record.sample_time / factor)])
-            for factor in RATES
+            factor: own.closes(rig, [replace(record, sample_time=record.sample_time / factor)]) for factor in RATES
         }
         best = max(shares, key=lambda factor: shares[factor])
         if shares[best] >= CLOSED:
@@ -435,16 +444,15 @@ def _rates(
         times = ", ".join(dict.fromkeys(f"{records[i].sample_time / factor:.6g}" for i in at))
         what = _one(f"{who} are sampled at {RATES[factor]} the stated rate", names)
         sentence = f"{what}: write sample_time = {times} s."
-        mend = _rate_times(None if every else frozenset(names), factor)
-        whole = _closes(gap, before, wide, *mend(rig, records)) if every else np.nan
+        mend = partial(_rate_times, None if every else frozenset(names), factor)
+        whole = gap.closes(*mend(rig, records)) if every else np.nan
         faults.append(WiringFault("sample rate", sentence, whole, mend))
     return faults
 
 
-def _structure(
-    rig: Rig, records: Sequence[Record], gap: _Gap, predicted: Sequence[Floats], before: Floats, wide: Flags
-) -> list[WiringFault]:
+def _structure(gap: _Gap) -> list[WiringFault]:
     """Damping in per cent, frequencies in rad/s for Hz and the other way about."""
+    rig, records = gap.rig, gap.records
     tries: list[tuple[str, str, Mend]] = []
     zeta = float(rig.modes.zeta.max(initial=0.0))
     if zeta > PER_CENT_FROM and (rig.structure is None or isinstance(rig.structure.damping, ModalDamping)):
@@ -452,23 +460,14 @@ def _structure(
             f"The damping looks like per cent where a ratio is meant: divide it by 100 (the largest would be"
             f" {zeta / 100:.4g}, not {zeta:.4g})."
         )
-        tries.append(("damping", sentence, _modes_times(1.0, 0.01)))
+        tries.append(("damping", sentence, partial(_modes_times, 1.0, 0.01)))
     if rig.structure is None:
         for factor, words in ((TURN, "Hz where rad/s is"), (1.0 / TURN, "rad/s where Hz is")):
             sentence = f"The natural frequencies look like {words} meant: multiply them by {factor:.6g}."
-            tries.append(("frequency", sentence, _modes_times(factor, 1.0)))
-    found = [
-        WiringFault(kind, sentence, _closes(gap, before, wide, *mend(rig, records)), mend)
-        for kind, sentence, mend in tries
-    ]
+            tries.append(("frequency", sentence, partial(_modes_times, factor, 1.0)))
+    found = [WiringFault(kind, sentence, gap.closes(*mend(rig, records)), mend) for kind, sentence, mend in tries]
     found = [fault for fault in found if fault.closes >= CLOSED]
     return sorted(found, key=lambda fault: -fault.closes)[:1]
-
-
-def _closes(gap: _Gap, before: np.ndarray, wide: np.ndarray, rig: Rig, records: Sequence[Record]) -> float:
-    """The share that another rig and other records close, in the median of the channels with a wide gap."""
-    after = gap.power([_predict(rig, record) for record in records])
-    return float(np.median(gap.closed(before, after)[wide]))
 
 
 def _predict(rig: Rig, record: Record) -> np.ndarray:
@@ -493,62 +492,36 @@ def _one(sentence: str, names: Sequence[str]) -> str:
     return sentence
 
 
-# --- mends
+# --- mends: of (rig, records), once all before these is given
 
 
-def _without_record(name: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        return rig, tuple(record for record in records if record.name != name)
-
-    return mend
+def _without_record(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    return rig, tuple(record for record in records if record.name != name)
 
 
-def _without_output(name: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
-        return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
-
-    return mend
+def _without_output(name: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    sensors = tuple(sensor for sensor in rig.sensors if sensor.name != name)
+    return replace(rig, sensors=sensors), tuple(r.only([s.name for s in sensors]) for r in records)
 
 
-def _outputs_times(factors: dict[str, float]) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        by = np.array([factors.get(sensor.name, 1.0) for sensor in rig.sensors])
-        sensors = tuple(replace(s, noise_std=abs(f) * s.noise_std) for s, f in zip(rig.sensors, by, strict=True))
-        return replace(rig, sensors=sensors), tuple(replace(r, outputs=by[:, None] * r.outputs) for r in records)
-
-    return mend
+def _outputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Mended:
+    by = np.array([factors.get(sensor.name, 1.0) for sensor in rig.sensors])
+    sensors = tuple(replace(s, noise_std=abs(f) * s.noise_std) for s, f in zip(rig.sensors, by, strict=True))
+    return replace(rig, sensors=sensors), tuple(replace(r, outputs=by[:, None] * r.outputs) for r in records)
 
 
-def _inputs_times(factors: dict[str, float]) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
-        return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
-
-    return mend
+def _inputs_times(factors: dict[str, float], rig: Rig, records: Sequence[Record]) -> Mended:
+    by = np.array([factors.get(actuator.name, 1.0) for actuator in rig.actuators])
+    return rig, tuple(replace(record, inputs=by[:, None] * record.inputs) for record in records)
 
 
-def _swapped(names: Sequence[str], one: str, other: str) -> list[int]:
+def _exchanged(side: str, one: str, other: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    """Two "inputs" or two "outputs"."""
+    names = [port.name for port in (rig.actuators if side == "inputs" else rig.sensors)]
     order = list(range(len(names)))
     i, j = names.index(one), names.index(other)
     order[i], order[j] = j, i
-    return order
-
-
-def _outputs_swapped(one: str, other: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        order = _swapped([sensor.name for sensor in rig.sensors], one, other)
-        return rig, tuple(replace(record, outputs=record.outputs[order]) for record in records)
-
-    return mend
-
-
-def _inputs_swapped(one: str, other: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        order = _swapped([actuator.name for actuator in rig.actuators], one, other)
-        return rig, tuple(replace(record, inputs=record.inputs[order]) for record in records)
-
-    return mend
+    return rig, tuple(replace(record, **{side: getattr(record, side)[order]}) for record in records)
 
 
 def _relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
@@ -556,30 +529,20 @@ def _relabelled(rig: Rig, names: Iterable[str], quantity: str) -> Rig:
     return replace(rig, sensors=tuple(replace(s, quantity=quantity) if s.name in named else s for s in rig.sensors))
 
 
-def _quantity_set(names: frozenset[str], quantity: str) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        return _relabelled(rig, names, quantity), tuple(records)
-
-    return mend
+def _quantity_set(names: frozenset[str], quantity: str, rig: Rig, records: Sequence[Record]) -> Mended:
+    return _relabelled(rig, names, quantity), tuple(records)
 
 
-def _rate_times(names: frozenset[str] | None, factor: float) -> Mend:
+def _rate_times(names: frozenset[str] | None, factor: float, rig: Rig, records: Sequence[Record]) -> Mended:
     """Of the named records, or of all."""
-
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        return rig, tuple(
-            replace(r, sample_time=r.sample_time / factor) if names is None or r.name in names else r for r in records
-        )
-
-    return mend
+    return rig, tuple(
+        replace(r, sample_time=r.sample_time / factor) if names is None or r.name in names else r for r in records
+    )
 
 
-def _modes_times(omega: float, zeta: float) -> Mend:
-    def mend(rig: Rig, records: Sequence[Record]) -> tuple[Rig, tuple[Record, ...]]:
-        modes = replace(rig.modes, omega=omega * rig.modes.omega, damping=omega * zeta * rig.modes.damping)
-        structure = rig.structure
-        if structure is not None and isinstance(structure.damping, ModalDamping):
-            structure = replace(structure, damping=ModalDamping(zeta * np.asarray(structure.damping.zeta, float)))
-        return replace(rig, modes=modes, structure=structure), tuple(records)
-
-    return mend
+def _modes_times(omega: float, zeta: float, rig: Rig, records: Sequence[Record]) -> Mended:
+    modes = replace(rig.modes, omega=omega * rig.modes.omega, damping=omega * zeta * rig.modes.damping)
+    structure = rig.structure
+    if structure is not None and isinstance(structure.damping, ModalDamping):
+        structure = replace(structure, damping=ModalDamping(zeta * np.asarray(structure.damping.zeta, float)))
+    return replace(rig, modes=modes, structure=structure), tuple(records)

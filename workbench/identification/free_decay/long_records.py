@@ -118,13 +118,7 @@ class _Search:
         self.converged, self.steps = True, 0
         if poles.size:
             poles, fits, self.converged, self.steps = search(
-                self.records,
-                poles,
-                self.weights,
-                True,
-                most_steps,
-                hold=True,
-                budget=self.budget,
+                self.records, poles, self.weights, True, most_steps, hold=True, budget=self.budget
             )
         else:
             fits = [_nothing(record) for record in self.records]

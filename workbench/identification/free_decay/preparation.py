@@ -208,17 +208,14 @@ def without_drift(record: Record, poles: np.ndarray, *, most: int = HIGHEST_DEGR
     for part in _parts(n):
         drift = (_polynomials(np.arange(part.start, part.stop), n, degree)[:, 1:] @ weights).T
         outputs[:, part] -= drift
-        lowest, topmost = (
-            np.minimum(lowest, drift.min(axis=1)),
-            np.maximum(topmost, drift.max(axis=1)),
-        )
+        lowest, topmost = (np.minimum(lowest, drift.min(axis=1)), np.maximum(topmost, drift.max(axis=1)))
     return Drift(replace(record, outputs=outputs), frozen(topmost - lowest))
 
 
-def without_polynomial(outputs: np.ndarray, degree: int = HIGHEST_DEGREE) -> np.ndarray:
-    """(n_outputs, n_samples) less the polynomial of that degree in time that fits each best."""
+def without_polynomial(outputs: np.ndarray) -> np.ndarray:
+    """(n_outputs, n_samples) less the polynomial of `HIGHEST_DEGREE` in time that fits each best."""
     n = outputs.shape[1]
-    degree = min(degree, n - 1)
+    degree = min(HIGHEST_DEGREE, n - 1)
     r, along = _factored(lambda at: _polynomials(at, n, degree), outputs)
     weights, about = np.linalg.solve(r, along), outputs.copy()
     for part in _parts(n):

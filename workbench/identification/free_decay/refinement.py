@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from workbench.arrays import symmetric_root
 from workbench.identification.signal.data_quality import check_same_sensors
 from workbench.identification.signal.modal_estimates import Refined, normalised_shapes, time_derivatives
 from workbench.identification.signal.projection import Projection, noise_near, project, variances
@@ -170,7 +171,7 @@ def _mean_shapes(
     spread = np.array([np.diag(fit.spread)[:n] + np.diag(fit.spread)[n : 2 * n] for fit in fits])
     own = variance * np.abs(to_displacement) ** 2 * spread[:, None]
     strongest = (np.abs(shapes) ** 2 / own).sum(axis=1).argmax(axis=0)
-    root = _root(pole_covariance)
+    root = symmetric_root(pole_covariance)
     mean, covariance = np.empty(shapes.shape[1:], complex), np.zeros((n, len(derivative), len(derivative)))
     for r in range(n):
         best = shapes[strongest[r], :, r]
@@ -202,16 +203,10 @@ def _by_poles(fit: Projection, r: int) -> np.ndarray:
 
 def _by_noise(fit: Projection, r: int, k: int, unit: np.ndarray, ratio: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Covariance of the real parts by each output's own noise, (Φ^T Φ)^-1, and by that of the reference, poles held."""
-    pair = np.array([1.0, -1j]) @ _root(fit.spread[np.ix_([r, fit.poles.size + r], [r, fit.poles.size + r])])
+    pair = np.array([1.0, -1j]) @ symmetric_root(fit.spread[np.ix_([r, fit.poles.size + r], [r, fit.poles.size + r])])
     each = np.sqrt(variance)[:, None] * pair * unit[:, None]
     common = (ratio[:, None] * each[k]).real
     return np.asarray(common @ common.T + np.diag((each.real**2).sum(axis=1)))
-
-
-def _root(matrix: np.ndarray) -> np.ndarray:
-    """R with R R^T = matrix, for a matrix that may be singular."""
-    values, vectors = np.linalg.eigh(matrix)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 @one_blas_thread

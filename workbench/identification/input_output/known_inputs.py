@@ -231,7 +231,7 @@ class KnownInputs:
 
     def _rows(self, samples: np.ndarray) -> np.ndarray:
         """Columns of samples as the fit sees them."""
-        return np.vstack([lines_of(samples[rows]) for rows in self.rows]) if self.by_line else samples
+        return self.rows_of([samples[rows] for rows in self.rows]) if self.by_line else samples
 
     def _samples(self, rows: np.ndarray) -> np.ndarray:
         """Rows of one record as samples."""
@@ -239,11 +239,7 @@ class KnownInputs:
 
     def modulated(self, rows: Floats, factor: Floats) -> Floats:
         """Columns (n_rows, k) times a factor at each sample, (n_samples,) of all records."""
-        found = []
-        for part in self.rows:
-            samples = self._samples(rows[part]) * factor[part, None]
-            found.append(lines_of(samples) if self.by_line else samples)
-        return np.vstack(found)
+        return self.rows_of([self._samples(rows[part]) * factor[part, None] for part in self.rows])
 
     @property
     def time(self) -> Floats:

@@ -25,11 +25,7 @@ def samples_of(lines: np.ndarray) -> np.ndarray:
 
 
 def noise_spectrum(
-    left: Sequence[np.ndarray],
-    whole: Sequence[np.ndarray],
-    taken: Sequence[np.ndarray],
-    n_modes: int,
-    free: np.ndarray,
+    left: Sequence[np.ndarray], whole: Sequence[np.ndarray], taken: Sequence[np.ndarray], n_modes: int, free: np.ndarray
 ) -> list[np.ndarray] | None:
     """Standard deviation of the noise at each line of each record, (n_samples, n_outputs) each, over their rms.
 

@@ -34,6 +34,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.special import ndtri
 from scipy.stats import chi2
 
+from workbench.arrays import symmetric_root
 from workbench.identification.shapes.eigenfunctions import (
     KnownEnds,
     Spline,
@@ -315,8 +316,7 @@ def eigenfunction_bands(
             q = v @ mass @ v
             phi[:, r] = along @ v / np.sqrt(q)
             jacobian = along / np.sqrt(q) - np.outer(phi[:, r], mass @ v / q)
-            strengths, directions = np.linalg.eigh(found.shape_covariance[r])
-            root = jacobian @ (directions * np.sqrt(np.maximum(strengths, 0.0)))
+            root = jacobian @ symmetric_root(found.shape_covariance[r])
             roughness = leave_one_out.roughness(v, found.shape_covariance[r])
             if roughness > 0.0:
                 error = peano_kernel(spline, x, modes.positions, length) / np.sqrt(q)

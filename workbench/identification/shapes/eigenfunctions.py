@@ -13,7 +13,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from workbench.identification.signal.modal_estimates import check_placed, normalised_shapes
-from workbench.structure.domain import Interval
+from workbench.structure.domain import Interval, gauss_between
 from workbench.structure.modes import Modes, SampledModes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.structure.supports import PointMass
@@ -287,11 +287,7 @@ def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
 
 def quadrature(knots: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
     """Gauss points and weights between the knots, exact for products of two splines with a cubic weight."""
-    points, weights = np.polynomial.legendre.leggauss(degree + 3)
-    nodes = np.unique(knots)
-    h = np.diff(nodes)
-    x = nodes[:-1, None] + 0.5 * h[:, None] * (points + 1.0)
-    return x.ravel(), (0.5 * h[:, None] * weights).ravel()
+    return gauss_between(np.unique(knots), degree + 3)
 
 
 def check_along(sampled: SampledModes) -> None:

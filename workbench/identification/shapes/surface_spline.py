@@ -17,6 +17,7 @@ from scipy.linalg import null_space
 from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
+from workbench.arrays import symmetric_root
 from workbench.identification.shapes.bands import BANDS, Bands
 from workbench.identification.signal.modal_estimates import ShapeEstimates, check_placed, normalised_shapes
 from workbench.structure.domain import Rectangle
@@ -312,5 +313,4 @@ def _weighted(domain: Rectangle, mass_per_area: FieldLike | None) -> tuple[np.nd
 
 def _root(covariance: np.ndarray) -> np.ndarray:
     """R with R Rᵀ the covariance, which rounding may have made slightly negative."""
-    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return symmetric_root(0.5 * (covariance + covariance.T))

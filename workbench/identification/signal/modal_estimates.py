@@ -69,6 +69,30 @@ class ModalEstimates(Printed):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class ParticipatingModes(ModalEstimates):
+    """Modes between inputs and outputs, each mode's shape and participation factors with one covariance."""
+
+    modes: SampledModes
+    covariance: np.ndarray
+    vector_covariance: np.ndarray
+    participation: np.ndarray
+
+    @property
+    def shape_covariance(self) -> np.ndarray:
+        """(n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of each."""
+        return self.vector_covariance[:, : self.modes.n_outputs, : self.modes.n_outputs]
+
+    @property
+    def shape_std(self) -> np.ndarray:
+        """Standard error of the real part of each shape (n_outputs, n_modes)."""
+        return self._vector_std[:, : self.modes.n_outputs].T
+
+    @property
+    def _vector_std(self) -> np.ndarray:
+        return np.asarray(np.sqrt(np.diagonal(self.vector_covariance, axis1=1, axis2=2)))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Refined(ModalEstimates):
     """Maximum likelihood modes of free decays, with their standard errors.
 

@@ -203,15 +203,14 @@ class _Exponentials:
             yield part, rows, _columns(exponentials), self.record.outputs[:, part].T
 
 
-def whitened(records: Sequence[Record], poles: np.ndarray, *, offset: bool = True) -> list[Record] | None:
+def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | None:
     """The records behind filters, one an output, that whiten the residual of `poles`; None where it may be white.
 
     Args:
         records: free decays, of the same outputs.
         poles: (n_modes,) of their modes, rad/s.
-        offset: whether each output may also hold a constant.
     """
-    left = [project(record, poles, offset).residual.T for record in records]
+    left = [project(record, poles, True).residual.T for record in records]
     powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in left]
     order = min(PROJECTION.order, sum(each.shape[1] for each in left) // PROJECTION.samples_each)
     squares = sum((each**2).sum(axis=1) for each in left)

@@ -173,12 +173,7 @@ class Minimum(Generic[State]):
 
 
 def minimise(
-    problem: LeastSquares[State],
-    start: State,
-    *,
-    most_steps: int,
-    round_off: float = 0.0,
-    budget: Budget | None = None,
+    problem: LeastSquares[State], start: State, *, most_steps: int, round_off: float = 0.0, budget: Budget | None = None
 ) -> Minimum[State]:
     """The local minimum of a problem next to `start`.
 

@@ -19,6 +19,7 @@ from numpy.polynomial.legendre import legvander
 from scipy.interpolate import BSpline
 from scipy.linalg import null_space
 
+from workbench.structure.domain import gauss_between
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.profile import Profile, ProfileLike, as_profile
 from workbench.threads import one_blas_thread
@@ -236,12 +237,10 @@ def _unit_mean_square(modes: Modes) -> tuple[Modes, np.ndarray]:
 
 def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Shapes (n_points, n_modes), weights and places of a Gauss rule that no break interrupts."""
-    points, weights = np.polynomial.legendre.leggauss(12)
     n_pieces = 16 * (1 + modes.n_modes // 4)
     nodes = np.unique(np.r_[np.linspace(0.0, modes.length, n_pieces + 1), [b for b in breaks if 0 < b < modes.length]])
-    h = np.diff(nodes)[:, None]
-    x = (nodes[:-1, None] + 0.5 * h * (points + 1.0)).ravel()
-    return modes.phi(x, derivative), (0.5 * h * weights).ravel(), x
+    x, weights = gauss_between(nodes, 12)
+    return modes.phi(x, derivative), weights, x
 
 
 def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:

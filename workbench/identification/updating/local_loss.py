@@ -145,11 +145,7 @@ def _price(task: Task) -> float:
 
 
 def _smooth(
-    task: Task,
-    basis: Callable[[int], Basis],
-    terms: tuple[list[int], list[int]],
-    lossy: FittedStructure,
-    limit: float,
+    task: Task, basis: Callable[[int], Basis], terms: tuple[list[int], list[int]], lossy: FittedStructure, limit: float
 ) -> FittedStructure:
     """The best explanation without a loss; where one fit settles that it wins or cannot win, that one."""
 

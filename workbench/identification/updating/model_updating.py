@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 
 from workbench.identification.shapes.mode_pairing import assigned, repeated_modes
 from workbench.identification.signal.modal_estimates import rounded
-from workbench.structure.modes import Modes, frozen
+from workbench.structure.modes import Modes, freeze
 from workbench.structure.printed import Printed, counted
 
 
@@ -58,8 +58,7 @@ class UpdatedModel(Printed):
     reason: str
 
     def __post_init__(self) -> None:
-        for name in ("parameters", "covariance", "mac", "residuals"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+        freeze(self, "parameters", "covariance", "mac", "residuals")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         rows = [(str(i + 1), *rounded(p, e)) for i, (p, e) in enumerate(zip(self.parameters, self.std))]
@@ -74,8 +73,7 @@ class UpdatedModel(Printed):
     @property
     def std(self) -> np.ndarray:
         """(n_parameters,) standard errors."""
-        deviations: np.ndarray = np.sqrt(np.diag(self.covariance))
-        return deviations
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
 
 
 def update_model(
@@ -142,8 +140,7 @@ def update_model(
         return columns, agreement[rows, columns], quotients
 
     def residuals(logarithms: np.ndarray) -> np.ndarray:
-        difference: np.ndarray = (paired(build(first * np.exp(logarithms)))[2] - target) / deviation
-        return difference
+        return np.asarray((paired(build(first * np.exp(logarithms)))[2] - target) / deviation)
 
     def jacobian(logarithms: np.ndarray) -> np.ndarray:
         steps = UPDATING.step * np.eye(first.size)

@@ -221,7 +221,7 @@ class _Mesh:
         nodes = _nodes([*places, *edges, *(cast(float, part.at) for part in nominal.attachments)], nominal.length)
         degree = int(np.ceil(1.7 * n_modes * np.diff(nodes).max() / nominal.length)) + 12 + EXTRA_DEGREES
         segments = Segments(nodes, (degree,) * (nodes.size - 1), order - 1)
-        x, weights, (values, slopes, strains) = _tables(segments, order)
+        x, weights, (values, slopes, strains) = segments.tables((0, 1, order))
         fixed_mass, fixed_stiffness, free = _fixed(nominal, segments, order)
         if isinstance(nominal, Beam) and nominal.tension:
             fixed_stiffness += nominal.tension * (slopes.T * weights) @ slopes
@@ -236,20 +236,6 @@ def _nodes(places: Sequence[float], length: float) -> np.ndarray:
         if nodes[-1] + 1e-6 * length < at < length * (1 - 1e-6):
             nodes.append(float(at))
     return np.array([*nodes, length])
-
-
-def _tables(segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Points, weights, and the functions with their first and highest derivatives there, (n_points, n_functions)."""
-    each = [[segments.tabulated(s, derivative) for s in range(segments.n_segments)] for derivative in (0, 1, order)]
-    x, weights = (np.concatenate([segment[i] for segment in each[0]]) for i in range(2))
-    tables = []
-    for tabulated in each:
-        table, row = np.zeros((x.size, segments.n_functions)), 0
-        for s, (points, _, values) in enumerate(tabulated):
-            table[row : row + points.size, segments.indices(s)] = values
-            row += points.size
-        tables.append(table)
-    return x, weights, tables
 
 
 def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

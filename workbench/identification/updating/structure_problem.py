@@ -19,7 +19,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.arrays import Floats
+from workbench.arrays import Floats, symmetric_root
 from workbench.identification.updating.distributions import KNOWN_TOLERANCE, Basis
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
@@ -187,8 +187,7 @@ class Problem:
         if freedom > 0 and chi2 > chi2_distribution.isf(TASK.unlikely, freedom):
             covariance = covariance * chi2 / freedom
         size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-        values, vectors = np.linalg.eigh(covariance / np.outer(size, size))
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        root = symmetric_root(covariance / np.outer(size, size))
         normal = np.random.default_rng(0).standard_normal((PROBLEM.draws, parameters.size))
         draws = parameters + size * (normal @ root.T)
         n, m = d.size, d.size + e.size

@@ -48,7 +48,7 @@ def redesign_page(
             "Both controllers after the impulse of the test, on the same samples of the uncertain model; every dead"
             " zone, delay, friction and noise is in. The lower curve is the better controller; a wide band says"
             " that the records leave much uncertain.",
-        ),
+        )
     ]
     if max(s.loss for s in found.steps) > NOTHING:
         blocks.append(

@@ -97,7 +97,8 @@ class Results(Sequence[Result]):
         names = dict.fromkeys(name for part in (0, 1) for pair in parts for name in pair[part])
         rows = []
         for result, (parameters, values) in zip(self.every, parts):
-            twice = [n for n in parameters.keys() & values.keys() if not _same(parameters[n], values[n])]
+            both = parameters.keys() & values.keys()
+            twice = [n for n in both if json.dumps(_plain(parameters[n])) != json.dumps(_plain(values[n]))]
             if twice:
                 raise StudyError(f"{min(twice)!r} is a parameter and a result of another value; rename the result")
             row = {name: values.get(name, parameters.get(name)) for name in names}
@@ -148,10 +149,6 @@ def _flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
             raise StudyError(f"two values would stand in one column, {min(twice)!r}; rename one")
         flat.update(part)
     return flat
-
-
-def _same(a: object, b: object) -> bool:
-    return json.dumps(_plain(a)) == json.dumps(_plain(b))
 
 
 def _plain(value: object) -> object:

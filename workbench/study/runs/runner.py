@@ -60,7 +60,9 @@ def run(
     folder = None if cache is None else Path(cache).resolve() / f"{_name(function)}-{print_[:12]}"
     records = {} if folder is None else _kept(folder, keys)
     jobs = {
-        key: Job(key, _arguments(case, s), None if folder is None or scheduler else _file(folder, key))
+        key: Job(
+            key, case if s is None else {**case, "seed": s}, None if folder is None or scheduler else _file(folder, key)
+        )
         for key, case, s in zip(keys, checked_cases, seeds)
         if key not in records
     }
@@ -83,12 +85,7 @@ def run(
             f" {unkept[0]}",
             stacklevel=2,
         )
-    return Results(
-        tuple(
-            Result(case, _seed_shown(case, s), _values(records[key]), *_ending(records[key]))
-            for case, s, key in zip(checked_cases, seeds, keys)
-        )
-    )
+    return Results(tuple(_result(case, s, records[key]) for case, s, key in zip(checked_cases, seeds, keys)))
 
 
 def _computed(
@@ -116,21 +113,9 @@ def _seeds(cases: Sequence[Mapping[str, Any]], function: Callable[..., Any], roo
     return [seed_of(case, root) if wants and "seed" not in case else None for case in cases]
 
 
-def _arguments(case: dict[str, Any], seed: int | None) -> dict[str, Any]:
-    return case if seed is None else {**case, "seed": seed}
-
-
-def _seed_shown(case: dict[str, Any], seed: int | None) -> int | None:
-    return case.get("seed") if seed is None else seed
-
-
-def _values(record: dict[str, Any]) -> dict[str, Any]:
-    values: dict[str, Any] = decoded(record["result"] or {})
-    return values
-
-
-def _ending(record: dict[str, Any]) -> tuple[str | None, str | None, float]:
-    return record["error"], record["trace"], record["seconds"]
+def _result(case: dict[str, Any], seed: int | None, record: dict[str, Any]) -> Result:
+    shown = case.get("seed") if seed is None else seed
+    return Result(case, shown, decoded(record["result"] or {}), record["error"], record["trace"], record["seconds"])
 
 
 def _kept(folder: Path, keys: list[str]) -> dict[str, dict[str, Any]]:

@@ -5,20 +5,6 @@ import tempfile
 from pathlib import Path
 
 
-def check_target(path: Path | None) -> None:
-    """Refuse a place where nothing can be written, before the work that is to be written there.
-
-    Raises:
-        ValueError: the folder is missing, or the place is a folder itself.
-    """
-    if path is None:
-        return
-    if path.is_dir():
-        raise ValueError(f"{path} is a folder; name a file in it")
-    if not path.parent.is_dir():
-        raise ValueError(f"{path}: there is no folder {path.parent}; make it first")
-
-
 def write_whole(path: Path, text: str) -> Path:
     """Write a text beside its place and then move it there: an interruption leaves no half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)

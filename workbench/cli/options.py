@@ -1,0 +1,50 @@
+"""Arguments and options that several commands have."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+DAMPING = 0.1  # ratio, unless given
+ESTIMATORS = ("luenberger", "kalman", "modal-filter")
+
+JsonPath = Annotated[Path | None, typer.Option("--json", help="Write the results to this file as JSON.")]
+Memory = Annotated[float, typer.Option(help="Memory that reading a file may take, GiB.")]
+SampleRate = Annotated[float | None, typer.Option(help="Sampling rate, where the file has no time axis.")]
+PagePath = Annotated[Path | None, typer.Option("--page", help="HTML file to write; default out/NAME.html.")]
+CasePath = Annotated[Path, typer.Argument(help="Case folder: case.toml and its records.")]
+VerdictPath = Annotated[
+    Path | None, typer.Option(help="Verdict that `workbench diagnose --json` wrote; diagnosed now unless given.")
+]
+Workers = Annotated[int | None, typer.Option(help="Processes that share the diagnosis; one a core.")]
+# a bracket that opens a word would be taken for markup of the help text
+RigPath = Annotated[
+    Path, typer.Argument(help=r"Case folder, or TOML file with \[structure], \[\[input]] and \[\[output]] as in one.")
+]
+ImpulseAt = Annotated[
+    str | None,
+    typer.Option(
+        metavar="PLACE",
+        help="Place of the impulse: m (X,Y on a plate), a point or an input by name; the hammer's unless given.",
+    ),
+]
+Weight = Annotated[float, typer.Option(help="Control weight R: force against motion.")]
+LawName = Annotated[str, typer.Option(help="Control law: imsc, coupled, poles or on-off.")]
+Control = Annotated[
+    int | None, typer.Option(help="Number of controlled modes, lowest first; as many as actuators unless given.")
+]
+LawWeight = Annotated[
+    float | None, typer.Option("--weight", help="Control weight R: force against motion; in place of --damping.")
+]
+Damping = Annotated[
+    float | None, typer.Option(help=f"Damping ratio of the controlled modes; {DAMPING:g} unless given.")
+]
+Disturbance = Annotated[
+    float,
+    typer.Option(help="For the Kalman filter: intensity of white modal forces; noise is as the outputs state it."),
+]
+RecordName = Annotated[
+    str, typer.Argument(metavar="RECORD", help="File with a column for each input, or a record of the case by name.")
+]
+Draws = Annotated[int, typer.Option(min=1, help="Samples of the uncertain model from which the bands are computed.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of the samples and of the noise.")]
