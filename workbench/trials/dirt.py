@@ -8,7 +8,7 @@ from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
 
 CLEAN, TRIPLE = "clean", "triple"
-DIRT_CLASSES = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "mixed", TRIPLE)
+DIRT_CLASSES = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "gain", "mixed", TRIPLE)
 SIZES = (0.5, 1.0, 2.0)
 MIXED = ("shape", "offset", "noise", "input", "late")  # each at half the size
 
@@ -21,6 +21,7 @@ NOISE_RATIO = 1.0 / 0.6  # the true noise over the stated one, to the power of t
 NOISE_MEMORY = 0.9  # correlation of coloured noise over one sample, to the power of 1 / size
 LOGGING_NOISE = 0.01  # of an input's rms
 LATE = 0.3  # of a sample: the latest sensor, at most
+CALIBRATION = 0.01  # standard deviation of the gain of each actuator and each sensor
 
 # What a class of dirt does itself, and no verdict could tell from it.
 MIMICS: dict[str, frozenset[str]] = {
@@ -31,6 +32,7 @@ MIMICS: dict[str, frozenset[str]] = {
     "coloured": frozenset({"random_disturbance", "sensor_quantisation"}),
     "input": frozenset({"random_disturbance"}),
     "late": frozenset({"actuator_delay", "actuator_lag", "sensor_lag", "sensor_delay"}),
+    "gain": frozenset({"actuator_gain", "sensor_gain"}),
     TRIPLE: frozenset(),
 }
 MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
@@ -48,6 +50,7 @@ class Dirt:
         noise_memory: correlation of that noise over one sample.
         logging_noise: of each logged input, as a share of its rms.
         delays: of each sensor, in samples.
+        gains: of each actuator, then of each sensor, over those stated.
     """
 
     stiffness_waves: tuple[float, ...] = ()
@@ -59,13 +62,19 @@ class Dirt:
     noise_memory: float = 0.0
     logging_noise: float = 0.0
     delays: tuple[float, ...] = ()
+    gains: tuple[float, ...] = ()
 
     def on(self, plant: Plant, sample_time: float) -> Plant:
         """The plant with this dirt, before any effect is hidden in it."""
+        n = len(plant.actuators)
         delays = self.delays or (0.0,) * len(plant.sensors)
+        gains = self.gains or (1.0,) * (n + len(plant.sensors))
+        actuators = tuple(replace(a, gain=a.gain * gain) for a, gain in zip(plant.actuators, gains[:n], strict=True))
         sensors = tuple(
-            replace(s, noise_std=s.noise_std * self.noise_ratio, delay=s.delay + delay * sample_time)
-            for s, delay in zip(plant.sensors, delays, strict=True)
+            replace(
+                s, noise_std=s.noise_std * self.noise_ratio, delay=s.delay + delay * sample_time, gain=s.gain * gain
+            )
+            for s, delay, gain in zip(plant.sensors, delays, gains[n:], strict=True)
         )
         altered = replace(
             plant.altered,
@@ -75,6 +84,7 @@ class Dirt:
         )
         return replace(
             plant,
+            actuators=actuators,
             sensors=sensors,
             altered=altered,
             damping_factor=plant.damping_factor * self.damping_factor,
@@ -122,6 +132,9 @@ def _with_part(dirt: Dirt, name: str, size: float, bench: Bench, rng: np.random.
         return replace(dirt, logging_noise=LOGGING_NOISE * size)
     if name == "late":
         return replace(dirt, delays=tuple(map(float, rng.uniform(0.0, LATE * size, len(bench.rig.sensors)))))
+    if name == "gain":
+        ports = len(bench.rig.actuators) + len(bench.rig.sensors)
+        return replace(dirt, gains=tuple(map(float, np.exp(CALIBRATION * size * rng.standard_normal(ports)))))
     return dirt
 
 
