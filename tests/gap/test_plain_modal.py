@@ -5,6 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from workbench.cases.case import read_case
+from workbench.cases.writing import write_case
 from workbench.draw.gap import plot_unmodelled_force, plot_where
 from workbench.gap.diagnose import diagnose
 
@@ -52,6 +53,19 @@ def case(tmp_path_factory):
         text += RECORD.format(name, DT, "validate" if name == "validate" else "fit")
     (folder / "case.toml").write_text(text)
     return read_case(folder)
+
+
+def test_noise_that_is_not_stated_is_taken_from_the_records(case, tmp_path):
+    folder = tmp_path / "silent"
+    write_case(case, folder)
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text("\n".join(line for line in text.splitlines() if "noise_std" not in line))
+    silent = read_case(folder)
+    assert silent.rig.sensors[0].noise_std == 0.0
+    verdict = diagnose(silent.rig, silent.fit, validation=silent.validation)
+    assert [effect.label for effect in verdict.effects] == ["cubic_spring"]
+    assert verdict.budget.noise_found[0] == pytest.approx(NOISE, rel=0.2)
+    assert any("noise_std of w is not stated" in note for note in verdict.notes)
 
 
 def test_a_hardening_spring_is_named_at_the_input_where_it_stands(case):

@@ -9,12 +9,13 @@ from workbench.gap.diagnose import _fails_unseen
 from workbench.gap.effects.catalogue import kind_named
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.limiting_cases import fewer, merged_sets, simpler_forms
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
 from workbench.gap.prediction.innovations import LOOSE
 from workbench.gap.prediction.random_force import tonal
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import force_filter, sampled_model, whiten
 from workbench.gap.report.budget import Shrinkage
-from workbench.gap.search.fit import cost_of, fit, slopes
+from workbench.gap.search.fit import _Problem, cost_of, fit, slopes
 from workbench.rig.elements import CubicSpring, PeriodicForce
 from workbench.rig.simulate import simulate
 
@@ -160,3 +161,33 @@ def test_a_set_must_hold_on_records_it_has_not_seen():
     assert not _fails_unseen(Found("random_disturbance"), unseen(0.3, 0.1)), "no prediction can hold it"
     assert not _fails_unseen(Found("cubic_spring"), None)
     assert not _fails_unseen(Found("cubic_spring"), unseen(0.12, 0.77), beyond=0.12**2), "noise of the inputs is"
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_own_readings(rig, measured, swapped):
+    """Slopes are those of one number at a time, to the last digit."""
+    data = measured(rig)
+    prior = NominalPrior(frequency=0.005, delay=0.1, gain=0.01, shape=0.01, sample_time=DT)
+    exchange = Effect(kind_named("swapped_outputs"), ("d1", "d3"), {})
+    effects = (*([exchange] if swapped else []), nominal_errors(rig, prior))
+    together = _Problem(rig, effects, data)
+    alone = _Problem(rig, effects, data)
+    alone._of_sensors_alone = lambda numbers: []
+    assert bool(together._of_sensors_alone(range(20))) != swapped
+    start = together.residual(together.start)
+    one, other = (each.jacobian(each.start, start, False) for each in (together, alone))
+    np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(other).max())
+
+
+def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measured):
+    data = measured(rig)
+    effects = (Effect(CUBIC, None, {"at": 0.8, "stiffness": 400.0}), nominal_errors(rig, NominalPrior(gain=0.01)))
+    chord = _Problem(rig, effects, data, chord=True)
+    residual = chord.residual(chord.start)
+    first = chord.jacobian(chord.start, residual, False).copy()
+    np.testing.assert_allclose(chord.normal(first), first.T @ first)
+    moved = chord.start + 0.01 * (np.arange(chord.start.size) < 2)
+    second = chord.jacobian(moved, chord.residual(moved), False)
+    np.testing.assert_array_equal(second[:, chord.believed], first[:, chord.believed])
+    assert np.abs(second[:, :2] - first[:, :2]).max() > 1e-6 * np.abs(first[:, :2]).max()
+    np.testing.assert_allclose(chord.normal(second), second.T @ second, rtol=1e-9, atol=1e-6)

@@ -8,6 +8,7 @@ import pytest
 from workbench.gap.diagnose import diagnose
 from workbench.gap.effects.catalogue import CATALOGUE
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.effects.record_to_record import TENSION
 from workbench.gap.effects.structural import buckling_load
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
@@ -76,6 +77,13 @@ def test_each_record_tells_its_own_axial_load(rig):
     found = deviations(search, (), "axial load")
     np.testing.assert_allclose(found.values, about_their_mean(share.values()), atol=8e-4)
     assert found.left < 0.1 * deviations(search, (), "stiffness").left
+
+
+def test_a_beam_free_at_both_ends_bears_no_compression(rig):
+    free = replace(rig.structure, left="free", right="free")
+    loose = replace(rig, structure=free, modes=free.modes(4))
+    search = search_of(loose, [measured(loose, Plant.of(loose), name) for name in FITTED])
+    assert deviations(search, (), TENSION) is None
 
 
 def test_records_alike_do_not_ask_for_a_stiffness_each(rig):

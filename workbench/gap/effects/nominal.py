@@ -46,6 +46,7 @@ class NominalPrior:
             jumps at each sample, and no small step leads from one side to the other.
         waves: cosines of a smooth variation along the structure, the constant among them.
         records, figure: names of the records between which a figure differs, and which.
+        by_mode: whether modes are off one by one.
     """
 
     stiffness: float = 0.0
@@ -62,6 +63,7 @@ class NominalPrior:
     waves: int = 9
     records: tuple[str, ...] = ()
     figure: str = STIFFNESS
+    by_mode: bool = False
 
     @property
     def groups(self) -> tuple[str, ...]:

@@ -23,6 +23,10 @@ class NoiseSettings:
     alike: float = 1.3  # times the power of the quietest record: noise as strong in two records
     same: float = 1.1  # likewise: what differs from it by chance alone
     loud: float = 0.5  # of the mean square: peaks that hold less are not worth leaving out
+    # quantile of all bands: what is left of a gap is least between and beyond the modes; and the share of white noise's
+    # power that it is, by the chi-square distribution of so many lines
+    least: float = 0.05
+    of_least: float = 0.66
     flat: float = 0.6  # likewise, of a spectrum that has none: 0.8 and more of white noise in 1400 samples
 
 
@@ -57,24 +61,31 @@ def is_flat(residuals: Sequence[np.ndarray]) -> Flags:
 
 
 def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:
-    """Standard deviation of each sensor's noise (n_outputs,) before anything is known of the gap, at most.
+    """Standard deviation of each sensor's white noise (n_outputs,) before anything is known of the gap.
 
-    It lies under the peaks of what was measured, and of what the rig leaves of that.
+    By the quietest bands of what was measured, and of what the rig leaves of that.
     """
-    measured = noise_found([record.outputs for record in records])
-    left = noise_found([record.outputs - predict(rig, record) for record in records])
-    guess: Floats = np.minimum(measured, left)
+    left = [record.outputs - predict(rig, record) for record in records]
+    bands = [_band_means(series) for series in (*left, *(record.outputs for record in records))]
+    least = np.min([np.quantile(means, NOISE.least, axis=1) for means in bands], axis=0)
+    guess: Floats = np.sqrt(least / NOISE.of_least)
     return guess
 
 
-def _under_peaks(residual: Floats) -> Floats:
-    """Mean square (n_outputs,) under the peaks of the spectrum."""
+def _band_means(residual: Floats) -> Floats:
+    """Means of the periodogram over bands of so many lines: (n_outputs, n_bands)."""
     n_outputs, n_samples = residual.shape
     window = np.hanning(n_samples)
     spectrum = np.abs(np.fft.rfft(residual * window, axis=1)[:, 1:]) ** 2 / (n_samples * np.mean(window**2))
     bands = max(spectrum.shape[1] // NOISE.lines, 1)
-    means = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
-    reach = min(NOISE.reach, (bands - 1) // 2)
+    means: Floats = spectrum[:, : bands * (spectrum.shape[1] // bands)].reshape(n_outputs, bands, -1).mean(axis=2)
+    return means
+
+
+def _under_peaks(residual: Floats) -> Floats:
+    """Mean square (n_outputs,) under the peaks of the spectrum."""
+    means = _band_means(residual)
+    reach = min(NOISE.reach, (means.shape[1] - 1) // 2)
     around = sliding_window_view(np.pad(means, ((0, 0), (reach, reach)), mode="reflect"), 2 * reach + 1, axis=1)
     floor = np.quantile(around, NOISE.quiet, axis=2) * (1.0 + NOISE.lower / np.sqrt(NOISE.lines))
     under: Floats = np.minimum(means, floor).mean(axis=1)

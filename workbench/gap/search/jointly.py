@@ -17,8 +17,13 @@ from workbench.gap.search.settings import JOINT, SELECTION
 
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
     """Whether a careful laboratory could have a nominal model with these errors; those of damping where they count."""
-    widest = ((group, size) for group, size in JOINT.widest if damping or group != "damping")
+    widest = ((group, size) for group, size in _widest(errors.target) if damping or group != "damping")
     return all(getattr(errors.target, group) < JOINT.plausible * size for group, size in widest)
+
+
+def _widest(prior: NominalPrior) -> list[tuple[str, float]]:
+    """Largest standard deviation believed of each group; of modes that are off one by one, damping is a guess."""
+    return [(g, JOINT.guessed if g == "damping" and prior.by_mode else size) for g, size in JOINT.widest]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +160,7 @@ def _resized(errors: Effect) -> Effect:
     prior = errors.target
     assert isinstance(prior, NominalPrior)
     sizes: dict[str, Any] = {}
-    for group, widest in JOINT.widest:
+    for group, widest in _widest(prior):
         if group not in prior.groups:
             continue
         names = [name for name in errors.values if group_of(name) == group]
@@ -170,7 +175,7 @@ def _resized(errors: Effect) -> Effect:
 
 def _closed(errors: Effect) -> Effect:
     """The errors without the groups that were learnt to be none: what is not there costs no time."""
-    none = [g for g, widest in JOINT.widest if getattr(errors.target, g) <= 1.01 * JOINT.narrowest * widest]
+    none = [g for g, widest in _widest(errors.target) if getattr(errors.target, g) <= 1.01 * JOINT.narrowest * widest]
     none = [group for group in none if group != "delay" or not errors.target.late]
     kept = {name: value for name, value in errors.values.items() if group_of(name) not in none}
     deviations = {name: errors.deviations[name] for name in kept if name in errors.deviations}

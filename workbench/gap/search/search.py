@@ -174,6 +174,7 @@ class Search:
             sample_time=self.data.records[0].sample_time,
             records=tuple(record.name for record in self.data.records) if self.differs else (),
             figure=self.differs or STIFFNESS,
+            by_mode=by_mode,
         )
 
     @cached_property

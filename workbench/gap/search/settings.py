@@ -162,6 +162,7 @@ class JointSettings:
         ("shape", 0.05),
         ("record", 0.02),
     )
+    guessed: float = 0.6  # likewise of damping, where each mode is off by itself: a guess is off by a factor of two
     # share of the widest that errors of a careful laboratory keep within; where they are larger, an effect that makes
     # them smaller is named although they leave little
     plausible: float = 0.95

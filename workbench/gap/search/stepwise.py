@@ -344,9 +344,9 @@ class Stepwise:
     def _on_the_other_side(self, step: Step, tried: Sequence[Step]) -> Step | None:
         """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
         best = min(tried, key=lambda s: s.fit.cost)
-        if not self._is_timing(best, TIMING):
-            return None
         prior, late = step.errors.target, best.effects[-1]
+        if late.kind.name not in TIMING or not self._is_timing(best, TIMING):
+            return None
         jumping = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
         if late.target not in jumping.difference(prior.late):
             return None

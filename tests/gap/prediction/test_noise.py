@@ -1,0 +1,43 @@
+"""What is noise, however loud: a spectrum without peaks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from workbench.gap.prediction.noise import is_flat, noise_guessed
+from workbench.rig.actuators import Actuator
+from workbench.rig.rig import Rig
+from workbench.rig.sensors import Sensor
+from workbench.rig.simulate import simulate
+from workbench.structure.domain import NamedPoints
+from workbench.structure.modes import Modes, PointShapes
+
+
+def resonance(noise):
+    pole = 0.99 * np.exp(0.4j)
+    return lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], noise)
+
+
+@pytest.mark.parametrize("n", [1000, 8000])
+def test_white_noise_is_flat_and_what_a_mode_does_is_not(n):
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        white, moved = rng.normal(size=(2, n)), resonance(rng.normal(size=n))
+        assert is_flat([white, 3.0 * white[:, ::-1]]).all()
+        assert not is_flat([np.array([moved, white[0] + moved / moved.std()])]).any()
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-3])
+def test_noise_is_guessed_under_the_peaks(noise):
+    """Of a rig whose frequency is 2 % off: its gap is as large as its readings, 0.06 m."""
+    rng = np.random.default_rng(1)
+
+    def rig(omega):
+        modes = Modes(omega=[omega], damping=[0.01], shapes=PointShapes([[1.0], [1.0]]), domain=NamedPoints(("F", "d")))
+        return Rig(modes, (Actuator("F", "F"),), (Sensor("d", "d"),))
+
+    record = simulate(rig(50.0), 50.0 * rng.normal(size=(1, 4000)), sample_time=0.01)
+    record = replace(record, outputs=record.outputs + noise * rng.normal(size=(1, 4000)))
+    assert noise_guessed(rig(51.0), [record])[0] == pytest.approx(noise, rel=0.3)

@@ -1,0 +1,68 @@
+"""A nominal model whose modes are off one by one, and whose sensors stand and read a little otherwise than stated."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.rig.elements import CubicSpring
+from workbench.rig.rig import Rig
+from workbench.structure.modes import Modes
+
+STIFFNESS, AT = 4000.0, 0.62
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(n_modes=3)
+
+
+def off(rig: Rig, elements=()) -> Rig:
+    """Frequencies off by half a per cent to either side, damping by a third, sensors by 5 mm and 1 %."""
+    modes = rig.modes
+    real = Modes(
+        omega=modes.omega * [1.005, 0.994, 1.004],
+        damping=modes.zeta * [0.7, 1.3, 1.2],
+        shapes=modes.shapes,
+        domain=modes.domain,
+    )
+    errors = zip(rig.sensors, (0.006, -0.005, 0.004, -0.006), (1.01, 0.993, 1.006, 0.99), strict=True)
+    sensors = tuple(replace(s, at=s.at + shift, gain=gain) for s, shift, gain in errors)
+    return Rig(real, rig.actuators, sensors, elements=elements)
+
+
+@pytest.fixture(scope="module")
+def measured(rig, record_of):
+    def make(*elements):
+        rng, real = np.random.default_rng(6), off(rig, elements)
+        levels = {"low": 0.3, "high": 1.0, "validate": 0.7}
+        inputs = {name: level * np.repeat(rng.normal(size=300), 5)[None] for name, level in levels.items()}
+        return [record_of(real, u, rng, name=name, substeps=8) for name, u in inputs.items()]
+
+    return make
+
+
+def test_nothing_is_named_where_nothing_hides(rig, measured):
+    *fitted, kept = measured()
+    verdict = diagnose(rig, fitted, validation=[kept])
+    assert verdict.outcome == "none" and verdict.sentence.startswith("There is no gap beyond small errors")
+
+
+def test_a_law_is_named_beside_them_and_its_interval_holds(rig, measured):
+    *fitted, kept = measured(CubicSpring(AT, STIFFNESS))
+    verdict = diagnose(rig, fitted, validation=[kept])
+    (effect,) = (e for e in verdict.effects if not e.kind.first)
+    assert effect.kind.name == "cubic_spring" and effect.at == pytest.approx(AT, abs=0.03 * rig.modes.length)
+    assert abs(effect.values["stiffness"] - STIFFNESS) < 2.5 * effect.deviations["stiffness"]
+
+
+def test_errors_of_a_frequency_stay_where_an_effect_solves_the_structure_anew(rig):
+    prior = NominalPrior(frequency=0.005, damping=0.2)
+    errors = nominal_errors(rig, prior, {"frequency_2": 0.01, "damping_1": 0.3})
+    made = errors.apply(rig)
+    again = made.structure.modes(3)
+    np.testing.assert_allclose(again.omega / rig.modes.omega, [1.0, np.exp(0.01), 1.0], rtol=1e-9)
+    np.testing.assert_allclose(made.modes.omega, again.omega, rtol=1e-9)
+    np.testing.assert_allclose(again.zeta / rig.modes.zeta, [np.exp(0.3), 1.0, 1.0], rtol=1e-9)
