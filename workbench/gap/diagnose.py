@@ -24,6 +24,7 @@ from workbench.gap.report.budget import (
     power_in,
     power_of_inputs,
 )
+from workbench.gap.report.data_faults import data_faults
 from workbench.gap.report.experiment import Experiment, next_experiment
 from workbench.gap.report.readiness import check_modes, check_records, readiness
 from workbench.gap.report.record_to_record import with_held_out
@@ -157,6 +158,7 @@ def diagnose(
                     if silent
                     else []
                 ),
+                *(() if outcome in ("none", "explained") else data_faults(rig, records, settle=settle)),
                 *_notes(attribution, outcome, budget, seconds),
             ),
         )

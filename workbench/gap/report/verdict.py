@@ -19,6 +19,7 @@ from workbench.gap.search.attribute import Attribution
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Between, NamedPoints
 
+NEAR = 0.05  # of the gap: a set that closes less is not near
 SHOWN = 0.005  # of the gap: what is less is not worth a word
 BESIDE = 0.02  # of the extent: as near as a place is asked for
 
@@ -131,7 +132,8 @@ class Verdict:
         else:
             text = "No effect of the catalogue, alone or with another, explains the gap"
             if not any_beyond(self.effects):
-                text += f"; the nearest, {words}, would close {closed or 'part of '}it." if words else "."
+                near = words and (self.shrinkage is None or self.shrinkage.overall >= NEAR)
+                text += f"; the nearest, {words}, would close {closed or 'part of '}it." if near else "."
             elif self.alternatives:
                 text += f" as likely as {words}, which explains {closed}it{self._not_excluded}"
             else:

@@ -1,0 +1,56 @@
+"""Records that begin in motion, and a channel that is stuck for a while; and records that are sound."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from workbench.gap.report.data_faults import data_faults
+from workbench.rig.elements import CoulombFriction, OneSidedStop
+
+
+@pytest.fixture(scope="module")
+def rig(hinged_rig):
+    return hinged_rig(n_modes=4)
+
+
+@pytest.fixture(scope="module")
+def measured(record_of):
+    def make(real):
+        rng = np.random.default_rng(2)
+        return record_of(real, np.repeat(rng.normal(size=200), 5)[None], rng, name="high", substeps=8)
+
+    return make
+
+
+def altered(record, change):
+    outputs = record.outputs.copy()
+    change(outputs)
+    return replace(record, outputs=outputs)
+
+
+def test_sound_records_have_none(rig, measured):
+    for elements in ((), (CoulombFriction(0.6, 0.2, 0.01),), (OneSidedStop(0.9, 2e4, 1e-3),)):
+        assert data_faults(rig, [measured(replace(rig, elements=elements))]) == ()
+
+
+def test_a_record_that_begins_in_motion(rig, measured):
+    record = measured(rig)
+    (said,) = data_faults(rig, [record.between(2.3)])
+    assert "'high' does not begin at rest" in said and "settle" in said
+    assert data_faults(rig, [record.between(2.3)], settle=5.0) == ()
+    biased = altered(record, lambda y: np.add(y[1], 1.0, out=y[1]))
+    assert data_faults(rig, [biased]) == (), "a constant offset is a bias"
+
+
+def test_a_channel_that_is_stuck(rig, measured):
+    def hold(y):
+        y[2, 300:700] = y[2, 300]
+
+    said, *_ = data_faults(rig, [altered(measured(rig), hold)])
+    assert "d3 reads" in said and "from 3 s to 7 s" in said
+
+    def clip(y):
+        y[2] = np.clip(y[2], -1e-4, 1e-4)
+
+    assert not any("without change" in said for said in data_faults(rig, [altered(measured(rig), clip)]))
