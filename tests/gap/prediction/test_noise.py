@@ -1,4 +1,4 @@
-"""What is noise, however loud: a spectrum without peaks."""
+"""What is noise, however loud, and how much of it there is at least."""
 
 from dataclasses import replace
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from workbench.gap.prediction.noise import is_flat, noise_guessed
+from workbench.gap.prediction.noise import is_noise_alone, noise_guessed
+from workbench.records.record import Channel, Record
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
@@ -21,12 +22,19 @@ def resonance(noise):
 
 
 @pytest.mark.parametrize("n", [1000, 8000])
-def test_white_noise_is_flat_and_what_a_mode_does_is_not(n):
+def test_noise_has_no_peaks_and_does_not_go_with_the_level(n):
     rng = np.random.default_rng(n)
+
+    def measured(level):
+        return Record(0.01, level * rng.normal(size=(1, n)), (Channel("d", "displacement"),))
+
+    records = [measured(1.0), measured(3.0)]
     for _ in range(20):
-        white, moved = rng.normal(size=(2, n)), resonance(rng.normal(size=n))
-        assert is_flat([white, 3.0 * white[:, ::-1]]).all()
-        assert not is_flat([np.array([moved, white[0] + moved / moved.std()])]).any()
+        white, moved = rng.normal(size=(2, 1, n)), resonance(rng.normal(size=n))
+        assert is_noise_alone(white, records)
+        assert not is_noise_alone(white, [records[0], records[0]]), "of one level it may be anything"
+        assert not is_noise_alone([white[0], 3.0 * white[1]], records)
+        assert not is_noise_alone(white + moved / moved.std(), records)
 
 
 @pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-3])

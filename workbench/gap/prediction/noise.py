@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from workbench.arrays import Flags, Floats
+from workbench.arrays import Floats
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import predict
@@ -27,6 +27,7 @@ class NoiseSettings:
     # power that it is, by the chi-square distribution of so many lines
     least: float = 0.05
     of_least: float = 0.66
+    louder: float = 2.0  # times the power of the quietest record: another level
     flat: float = 0.6  # likewise, of a spectrum that has none: 0.8 and more of white noise in 1400 samples
 
 
@@ -53,11 +54,18 @@ def noise_found(residuals: Sequence[np.ndarray]) -> np.ndarray:
     return np.sqrt(power)
 
 
-def is_flat(residuals: Sequence[np.ndarray]) -> Flags:
-    """Whether the spectrum of each sensor (n_outputs,) has no peaks in any record: then it is noise, however loud."""
+def is_noise_alone(residuals: Sequence[np.ndarray], records: Sequence[Record]) -> bool:
+    """Whether what is left is noise, however loud: without peaks, and as strong in records of other levels.
+
+    Args:
+        residuals: (n_outputs, n_samples) measured less predicted, one a record.
+        records: what was measured.
+    """
     shares = np.array([_under_peaks(residual) / (residual**2).mean(axis=1) for residual in residuals])
-    flat: Flags = shares.min(axis=0) > NOISE.flat
-    return flat
+    power = np.array([(residual**2).mean(axis=1) for residual in residuals])
+    levels = np.array([(record.outputs**2).mean() for record in records])
+    louder = levels.max() > NOISE.louder * levels.min()
+    return bool(louder and shares.min() > NOISE.flat and (power.max(axis=0) < NOISE.alike * power.min(axis=0)).all())
 
 
 def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:

@@ -15,7 +15,7 @@ from workbench.gap.effects.ports import clipped_level, exchanged_last, rounding_
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.localisation.where import of_one_sensor
 from workbench.gap.prediction.logged_inputs import logging_noise
-from workbench.gap.prediction.noise import is_flat, noise_found
+from workbench.gap.prediction.noise import is_noise_alone, noise_found
 from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE, Workers
@@ -201,7 +201,7 @@ def attribute(
     ahead: list[Fit] = []
     if not seen and _is_small(found.nominal, tolerance):
         decision = Decision("none", start)
-    elif not search.explains(start) and is_flat(evidence.residuals).all():
+    elif not search.explains(start) and is_noise_alone(evidence.residuals, data.counted):
         decision = Decision("none", start, noise=noise_found(evidence.residuals))
     elif free_nominal and not search.explains(start):
         decision = _beside_nominal_errors(search, tolerance)

@@ -17,7 +17,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, fit_jointly
 from workbench.gap.search.search import Decision, Search, spread_over_kinds
 from workbench.gap.search.selection import on_whole_records, one_more
-from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
+from workbench.gap.search.settings import INTERVALS, JOINT, RANDOM, SEARCH, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, NamedPoints
@@ -131,7 +131,15 @@ def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
     places = [f.effects[0].at for f in found if f.effects[0].at is not None]
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
-    return [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RANDOM.rival]
+    likely = [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RANDOM.rival]
+    return [f for f in likely if not _is_calibration(f)]
+
+
+def _is_calibration(single: Fit) -> bool:
+    """Whether a single effect is a gain that is off by no more than gains are."""
+    (effect,) = single.effects
+    gain = effect.values.get("gain", 0.0)
+    return gain > 0 and bool(abs(np.log(gain)) < dict(JOINT.widest)["gain"])
 
 
 def _nothing(search: Search) -> Fit:

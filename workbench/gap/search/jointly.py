@@ -9,7 +9,7 @@ import numpy as np
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.prediction.logged_inputs import logging_noise
-from workbench.gap.prediction.noise import is_flat, noise_found
+from workbench.gap.prediction.noise import is_noise_alone, noise_found
 from workbench.gap.search.fit import Fit, fit
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT, SELECTION
@@ -147,7 +147,7 @@ def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
     residuals = whole.differences(rig)
     with np.errstate(over="ignore", invalid="ignore"):  # of a motion that runs away
         by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
-        credible = np.where(is_flat(residuals), np.inf, JOINT.credible)
+        credible = np.inf if is_noise_alone(residuals, whole.counted) else JOINT.credible
     sensor_noise = np.minimum(noise_found(residuals) / whole.noise, credible) ** 2
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     per_unit = search.logging_noise

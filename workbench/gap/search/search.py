@@ -168,7 +168,7 @@ class Search:
             frequency=0.0 if structured and not by_mode else 0.005,
             damping=0.2,
             delay=0.1,
-            gain=0.01,
+            gain=0.01 if len(self.rig.actuators) + len(self.rig.sensors) > 2 else 0.0,  # of one each: the mass says it
             shape=0.01 if by_mode else 0.0,
             record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,

@@ -144,6 +144,9 @@ class PlainSettings:
     needless: float = 6.0  # twice the log-likelihood that one number more may gain by chance
     several: int = 3  # sensors, of which one alone is hardly late by chance
     likeliest: int = 4  # kinds of the one more that are tried
+    # logarithm of a gain: more is an effect of its own; and how many at once: of more, all are off by one error
+    most_gain: float = 0.05
+    wrong_gains: int = 2
 
 
 @dataclass(frozen=True)

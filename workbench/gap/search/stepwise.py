@@ -16,6 +16,7 @@ from workbench.gap.effects.limiting_cases import (
     with_one_simpler,
 )
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, group_of, nominal_errors
+from workbench.gap.effects.ports import ACTUATOR_GAIN, SENSOR_GAIN
 from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
@@ -118,6 +119,23 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
+        self._add(most)
+        calibrated = self._with_wrong_gains(self.last)
+        if calibrated is not self.last:
+            self.steps.append(calibrated)
+            self._add(most)
+        limit = self._in_limit(self.last)
+        if limit is not self.last:
+            self.steps.append(replace(limit, others=self.last.others))
+        self.plain = self._without_errors(self.last)
+        if self.plain is not None:
+            return
+        self.steps.append(self._promoted(self.last))
+        if self.last.effects:
+            self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
+
+    def _add(self, most: int) -> None:
+        """Add effects one after the other, at most so many in all."""
         while len(self.last.effects) < most and not (self.is_enough and self._is_spotless):
             if self.search.is_over:
                 break
@@ -133,15 +151,6 @@ class Stepwise:
             self.steps.append(self._finely(self._without_needless(self.last)))
             if len(self.last.effects) <= len(before.effects) and not self._is_worth(self.last, before):
                 break
-        limit = self._in_limit(self.last)
-        if limit is not self.last:
-            self.steps.append(replace(limit, others=self.last.others))
-        self.plain = self._without_errors(self.last)
-        if self.plain is not None:
-            return
-        self.steps.append(self._promoted(self.last))
-        if self.last.effects:
-            self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
 
     @property
     def is_enough(self) -> bool:
@@ -567,7 +576,8 @@ class Stepwise:
         fewer = self._fitted(list(each_left_out(step.effects)), step, self._slopes(step))
         best = min(fewer, key=lambda s: s.fit.cost)
         enough = (1.0 + STEPWISE.needless) * max(step.excess(step.sensor_noise), STEPWISE.simpler)
-        return self._without_needless(best) if best.excess(step.sensor_noise) < enough else step
+        needless = best.excess(step.sensor_noise) < enough and (best.is_plausible or not step.is_plausible)
+        return self._without_needless(best) if needless else step
 
     def _without_errors(self, step: Step) -> Fit | None:
         """Few effects that explain the records without errors of the nominal model as well as a step beside them."""
@@ -588,6 +598,20 @@ class Stepwise:
             return None
         self.search = search
         return found
+
+    def _with_wrong_gains(self, step: Step) -> Step:
+        """The set with gains that are off by more than any calibration as effects."""
+        kinds = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}
+        wrong = {n: v for n, v in step.errors.values.items() if group_of(n) == "gain" and abs(v) > PLAIN.most_gain}
+        if not wrong or len(wrong) > PLAIN.wrong_gains:
+            return step
+        added = []
+        for name, value in wrong.items():
+            _, side, port = name.split("_", 2)
+            added.append(Effect(kinds[side], port, {"gain": float(np.exp(value))}))
+        errors = replace(step.errors, values={**step.errors.values, **dict.fromkeys(wrong, 0.0)})
+        found = fit_jointly(self.search, (*step.effects, *added), errors, rounds=2)
+        return found if self._matter(found.effects, found.fit.effects) else step
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small and common to all, and one sensor late alone, as effects."""
