@@ -22,7 +22,10 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
     beside = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
     if beside.is_quiet and beside.is_believed:
         before.run(most=1)
-        return before if before.last.effects and before.is_quiet and before.is_believed else beside
+        if before.is_believed and (before.plain or (before.last.effects and before.is_quiet)):
+            return before
+        beside.run(most=0)
+        return beside
     again = beside.afresh(nearest.effects)
     if again.excess(again.noise_power) > STEPWISE.halved * nearest.excess(nearest.noise_power):
         return None

@@ -17,7 +17,7 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, fit_jointly
 from workbench.gap.search.search import Decision, Search, spread_over_kinds
 from workbench.gap.search.selection import on_whole_records, one_more
-from workbench.gap.search.settings import INTERVALS, JOINT, RANDOM, SEARCH, STEPWISE
+from workbench.gap.search.settings import INTERVALS, RANDOM, SEARCH, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import is_stepped
 from workbench.structure.domain import Between, NamedPoints
@@ -61,7 +61,7 @@ def decide_on_random(search: Search, evidence: Evidence) -> tuple[Decision | Non
         return None, []
     beside = search.through(model_filter(evidence.model, search.rig, alone[1]), _follower(search, search.rig, alone[1]))
     search.report("beside a random disturbance", 0.2)
-    gaining = beside.side_by_side(simplest, _gaining(beside, evidence)[: RANDOM.tried])
+    gaining = beside.side_by_side(simplest, _gaining(search, beside, evidence)[: RANDOM.tried])
     if any(search.explains(finished(search, single)) for single in gaining):
         return None, []
     tried = [alone, *(with_random(search, single) for single in gaining)]
@@ -116,10 +116,13 @@ def _beside(search: Search, given: Fit) -> Evidence:
     return _by_laws_on_measured_motion(search, search.evidence_of(apply_all(search.rig, given.effects)))
 
 
-def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
+def _gaining(search: Search, beside: Search, evidence: Evidence) -> list[Fit]:
     """The fits of single effects that the filter of a random force leaves something to explain, best first.
 
     The unmodelled force stands where the random one does; where the best of them stands, all laws are tried again.
+
+    Args:
+        search: without that filter.
     """
     cost = cost_of(beside.rig, (), beside.data)
 
@@ -132,14 +135,13 @@ def _gaining(beside: Search, evidence: Evidence) -> list[Fit]:
     if places:
         found = sorted((*found, *fitted(evidence.of_force_at(places[0]))), key=lambda f: f.cost)
     likely = [f for f in spread_over_kinds(found, 1) if f.cost < found[0].cost + RANDOM.rival]
-    return [f for f in likely if not _is_calibration(f)]
+    return [f for f in likely if _matters(search, f)]
 
 
-def _is_calibration(single: Fit) -> bool:
-    """Whether a single effect is a gain that is off by no more than gains are."""
-    (effect,) = single.effects
-    gain = effect.values.get("gain", 0.0)
-    return gain > 0 and bool(abs(np.log(gain)) < dict(JOINT.widest)["gain"])
+def _matters(search: Search, single: Fit) -> bool:
+    """Whether a single effect takes away more of the gap than gains and places do that are hardly off."""
+    before, after = (cost_of(search.rig, effects, search.data) for effects in ((), single.effects))
+    return before - after > STEPWISE.least * before
 
 
 def _nothing(search: Search) -> Fit:
