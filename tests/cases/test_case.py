@@ -65,7 +65,9 @@ def test_what_is_written_is_read_back(case, folder):
 def test_what_the_format_cannot_say_is_refused(case, tmp_path):
     smooth = replace(case.rig.structure, mass_per_length=lambda x: 1.0 + x**2)
     loaded = replace(case.rig.structure, attachments=(PointMass(1.0, 0.1),))
-    for structure, word in ((smooth, "linear between"), (loaded, "attachments"), (None, "without its structure")):
+    off = replace(case.rig.structure, frequency_errors=(0.01,))
+    faulty = ((smooth, "linear between"), (loaded, "attachments"), (off, "frequency_errors"), (None, "without its"))
+    for structure, word in faulty:
         with pytest.raises(ValueError, match=word):
             write_case(replace(case, rig=replace(case.rig, structure=structure)), tmp_path / "out")
 

@@ -79,6 +79,8 @@ def _rig(rig: Rig, folder: Path) -> list[str]:
 
 
 def _member(member: Structure, n_modes: int) -> str:
+    if any(member.frequency_errors):
+        raise ValueError("the case format solves natural frequencies; it knows no frequency_errors of a structure")
     beam = isinstance(member, Beam)
     stiffness = "bending_stiffness" if beam else "axial_stiffness"
     profiles = {"mass_per_length": member.mass_per_length, stiffness: getattr(member, stiffness)}

@@ -68,7 +68,7 @@ def diagnose(
     The search sees `records` alone; `validation` is opened once, after the last fit, to measure the shrinkage.
 
     Args:
-        rig: nominal; for a sensor without noise_std, what lies under the peaks of its spectrum is taken.
+        rig: nominal; for a sensor without noise_std, what the quietest bands of its spectrum hold is taken.
         records: with the rig's inputs and outputs, in its order.
         validation: kept out of every fit.
         catalogue: kinds of effects to try.
