@@ -10,7 +10,7 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
     """What holds beside errors of each mode, in frequency and in shape: nothing, or effects; None where none does.
 
     Errors of a structure that is a little off everywhere are fewer and come first; those of its modes take linear
-    effects for their own, so where they alone would do, one effect beside the few is asked for once more.
+    effects for their own, so one effect more beside the few is asked for first.
 
     Args:
         before: what holds without, its likeliest single effects tried.
@@ -21,15 +21,22 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
     before.search.report("errors of each mode", 0.5)
     beside = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
     if beside.is_quiet and beside.is_believed:
-        before.run(most=1)
-        if before.is_believed and (before.plain or (before.last.effects and before.is_quiet)):
+        if _with_one_more(before, beside):
             return before
         beside.run(most=0)
         return beside
     again = beside.afresh(nearest.effects)
-    if again.excess(again.noise_power) > STEPWISE.halved * nearest.excess(nearest.noise_power):
+    if before.is_believed and again.excess(again.noise_power) > STEPWISE.halved * nearest.excess(nearest.noise_power):
         return None
     if not beside.by_singles():
         return None
     beside.run()
-    return beside if beside.is_closed and beside.is_believed else None
+    if not (beside.is_closed and beside.is_believed):
+        return None
+    return before if _with_one_more(before, beside) else beside
+
+
+def _with_one_more(before: Stepwise, beside: Stepwise) -> bool:
+    """Whether one effect more beside the few errors of the structure does what errors of each mode do."""
+    before.run(most=len(beside.last.effects) + 1)
+    return bool(before.is_believed and (before.plain or (before.last.effects and before.is_quiet)))
