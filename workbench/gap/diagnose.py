@@ -153,13 +153,8 @@ def diagnose(
             tolerance=tolerance,
             notes=(
                 *(fault.sentence for fault in faults),
-                *(
-                    [f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."]
-                    if silent
-                    else []
-                ),
                 *(() if outcome in ("none", "explained") else data_faults(rig, records, settle=settle)),
-                *_notes(attribution, outcome, budget, seconds),
+                *_notes(attribution, outcome, budget, seconds, silent),
             ),
         )
 
@@ -272,10 +267,15 @@ def _next(rig: Rig, found: Attribution, workers: Workers) -> Experiment | None:
     return None
 
 
-def _notes(found: Attribution, outcome: str, budget: Budget, seconds: float | None) -> tuple[str, ...]:
+def _notes(
+    found: Attribution, outcome: str, budget: Budget, seconds: float | None, silent: Sequence[str]
+) -> tuple[str, ...]:
+    """What is said beside the sentence; `silent` are the sensors whose noise was not stated."""
+    taken = f"noise_std of {', '.join(silent)} is not stated; it was taken from the records."
     seen = "The nearest set explains the records it was fitted to, but not those it has not seen."
     cut = f"The search ended after {seconds} s of processor time with the best that it had; more by `seconds`."
     notes = (
+        *([taken] if silent else []),
         *([cut] if found.is_cut else []),
         *([seen] if outcome != found.outcome else []),
         budget.noise_remark,

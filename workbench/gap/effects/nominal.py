@@ -240,9 +240,11 @@ def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, floa
         return replace(rig, modes=made.modes, structure=made.structure, actuators=made.actuators)
     rig = _solved(rig, prior, {name: value for name, value in values.items() if group_of(name) not in OUTSIDE})
     rig = differing(rig, prior.figure, deviations_of(values))
-    ports = (*rig.actuators, *rig.sensors)
+    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig) if prior.shape else np.zeros((len(ports), 0))
     off = [_off_port(port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
+    if all(one is other for one, other in zip(ports, off, strict=True)):
+        return rig
     n = len(rig.actuators)
     return replace(rig, actuators=tuple(off[:n]), sensors=tuple(off[n:]))
 

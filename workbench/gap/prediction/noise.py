@@ -61,11 +61,11 @@ def is_noise_alone(residuals: Sequence[np.ndarray], records: Sequence[Record]) -
         residuals: (n_outputs, n_samples) measured less predicted, one a record.
         records: what was measured.
     """
-    shares = np.array([_under_peaks(residual) / (residual**2).mean(axis=1) for residual in residuals])
+    levels = [(record.outputs**2).mean() for record in records]
     power = np.array([(residual**2).mean(axis=1) for residual in residuals])
-    levels = np.array([(record.outputs**2).mean() for record in records])
-    louder = levels.max() > NOISE.louder * levels.min()
-    return bool(louder and shares.min() > NOISE.flat and (power.max(axis=0) < NOISE.alike * power.min(axis=0)).all())
+    if max(levels) <= NOISE.louder * min(levels) or (power.max(axis=0) >= NOISE.alike * power.min(axis=0)).any():
+        return False
+    return all((_under_peaks(left) > NOISE.flat * own).all() for left, own in zip(residuals, power, strict=True))
 
 
 def noise_guessed(rig: Rig, records: Sequence[Record]) -> np.ndarray:

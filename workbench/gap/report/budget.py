@@ -17,12 +17,12 @@ from workbench.rig.simulate import predict
 from workbench.structure.domain import Domain
 
 REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
-IN_PERCENT = ("stiffness", "mass", "frequency", "damping", "gain", "shape")
 # per cent, root mean square: a quarter to a half more than the worst models of trials have; in false valleys it is more
 MOST = (("stiffness", 5.0), ("mass", 5.0), ("frequency", 2.5), ("damping", 90.0), ("gain", 5.0), ("shape", 10.0))
 RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: the mean from which on they are told as one delay of all
 DRAWS = 400  # of blocks, for the interval of what is closed
+# errors that are told in per cent, by group, as they are called
 PLURAL = {
     "stiffness": "stiffness",
     "mass": "mass",
@@ -277,10 +277,10 @@ def sizes_of(errors: Effect | None) -> dict[str, float]:
     """
     if errors is None:
         return {}
-    values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*IN_PERCENT, "delay")}
+    values = {group: [v for n, v in errors.values.items() if group_of(n) == group] for group in (*PLURAL, "delay")}
     sizes = {
-        f"{PLURAL[group]}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
-        for group in IN_PERCENT
+        f"{words}_percent": 100.0 * float(np.sqrt(np.mean(np.square(values[group]))))
+        for group, words in PLURAL.items()
         if values[group]
     }
     if values["delay"]:
