@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from workbench.gap.diagnose import diagnose
+from workbench.gap.effects.catalogue import CATALOGUE
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NominalPrior, nominal_errors
+from workbench.gap.effects.structural import LOCAL_STIFFNESS_LOSS, POINT_MASS
+from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE
+from workbench.gap.search.search import Search, most_informative
+from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.elements import CubicSpring
 from workbench.rig.rig import Rig
 from workbench.structure.modes import Modes
@@ -19,8 +26,8 @@ def rig(hinged_rig):
     return hinged_rig(n_modes=3)
 
 
-def off(rig: Rig, elements=()) -> Rig:
-    """Frequencies off by half a per cent to either side, damping by a third, sensors by 5 mm and 1 %."""
+def off(rig: Rig, elements=(), gain=1.0) -> Rig:
+    """Frequencies off by half a per cent to either side, damping by a third, sensors by 5 mm and 1 %; one by a gain."""
     modes = rig.modes
     real = Modes(
         omega=modes.omega * [1.005, 0.994, 1.004],
@@ -28,15 +35,15 @@ def off(rig: Rig, elements=()) -> Rig:
         shapes=modes.shapes,
         domain=modes.domain,
     )
-    errors = zip(rig.sensors, (0.006, -0.005, 0.004, -0.006), (1.01, 0.993, 1.006, 0.99), strict=True)
+    errors = zip(rig.sensors, (0.006, -0.005, 0.004, -0.006), (1.01, 0.993 * gain, 1.006, 0.99), strict=True)
     sensors = tuple(replace(s, at=s.at + shift, gain=gain) for s, shift, gain in errors)
     return Rig(real, rig.actuators, sensors, elements=elements)
 
 
 @pytest.fixture(scope="module")
 def measured(rig, record_of):
-    def make(*elements):
-        rng, real = np.random.default_rng(6), off(rig, elements)
+    def make(*elements, nominal=rig, gain=1.0):
+        rng, real = np.random.default_rng(6), off(nominal, elements, gain)
         levels = {"low": 0.3, "high": 1.0, "validate": 0.7}
         inputs = {name: level * np.repeat(rng.normal(size=300), 5)[None] for name, level in levels.items()}
         return [record_of(real, u, rng, name=name, substeps=8) for name, u in inputs.items()]
@@ -56,6 +63,43 @@ def test_a_law_is_named_beside_them_and_its_interval_holds(rig, measured):
     (effect,) = (e for e in verdict.effects if not e.kind.first)
     assert effect.kind.name == "cubic_spring" and effect.at == pytest.approx(AT, abs=0.03 * rig.modes.length)
     assert abs(effect.values["stiffness"] - STIFFNESS) < 2.5 * effect.deviations["stiffness"]
+
+
+def beside_modes_of(rig, records) -> Stepwise:
+    data = FitData(tuple(records), np.array([s.noise_std for s in rig.sensors]))
+    nominal = data.by_channel(data.residual(rig))
+    quick, first = most_informative(data, nominal)
+    return Stepwise(Search(rig, data, quick, first, CATALOGUE, lambda *_: None, ALONE, nominal, by_mode=True))
+
+
+def test_a_gain_far_from_the_others_is_an_effect(rig, measured):
+    *fitted, _ = measured(gain=0.8)
+    beside = beside_modes_of(rig, fitted)
+    assert beside.is_quiet and not beside.is_believed
+    assert beside.calibrate()
+    (effect,) = beside.last.effects
+    assert (effect.kind.name, effect.target) == ("sensor_gain", rig.sensors[1].name)
+    assert effect.values["gain"] < 0.9
+
+
+@pytest.mark.slow
+def test_a_gain_off_by_more_than_any_calibration_is_named(rig, measured):
+    *fitted, kept = measured(gain=0.8)
+    verdict = diagnose(rig, fitted, validation=[kept])
+    (effect,) = (e for e in verdict.effects if not e.kind.first)
+    assert (effect.kind.name, effect.target) == ("sensor_gain", rig.sensors[1].name)
+    assert effect.values["gain"] == pytest.approx(0.993 * 0.8, rel=0.02)
+
+
+def test_of_effects_that_errors_of_modes_close_the_one_with_the_smallest_errors_is_likeliest(rig, measured):
+    mass = Effect(POINT_MASS, None, {"at": AT, "mass": 0.1})
+    loss = Effect(LOCAL_STIFFNESS_LOSS, None, {"at": AT, "width": 0.2, "loss": 0.3})
+    *fitted, _ = measured(nominal=apply_all(rig, [mass]))
+    beside = beside_modes_of(rig, fitted)
+    assert beside.is_quiet and not beside.is_believed
+    beside.singles = [(loss,), (mass,)]
+    likeliest, _ = beside.alone
+    assert likeliest.effects[0].kind is POINT_MASS and likeliest.is_plausible
 
 
 def test_errors_of_a_frequency_stay_where_an_effect_solves_the_structure_anew(rig):

@@ -20,23 +20,34 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
         return None
     before.search.report("errors of each mode", 0.5)
     beside = Stepwise(replace(before.at_first, by_mode=True), before.tolerance, before.ahead)
-    if beside.is_quiet and beside.is_believed:
-        if _with_one_more(before, beside):
-            return before
-        beside.run(most=0)
-        return beside
-    again = beside.afresh(nearest.effects)
-    if before.is_believed and again.excess(again.noise_power) > STEPWISE.halved * nearest.excess(nearest.noise_power):
-        return None
+    if beside.is_quiet:
+        found = len(beside.last.effects)
+        if not beside.is_believed:
+            beside.calibrate()
+        if beside.is_believed and beside.is_quiet:
+            if _with_one_more(before, beside, found):
+                return before
+            beside.run(most=0)
+            return beside
+        beside.singles = [step.effects for step in before.alone]
+    else:
+        again = beside.afresh(nearest.effects)
+        left = nearest.excess(nearest.noise_power)
+        if before.is_believed and again.excess(again.noise_power) > STEPWISE.halved * left:
+            return None
     if not beside.by_singles():
         return None
     beside.run()
     if not (beside.is_closed and beside.is_believed):
         return None
-    return before if _with_one_more(before, beside) else beside
+    return before if _with_one_more(before, beside, len(beside.last.effects)) else beside
 
 
-def _with_one_more(before: Stepwise, beside: Stepwise) -> bool:
-    """Whether one effect more beside the few errors of the structure does what errors of each mode do."""
-    before.run(most=len(beside.last.effects) + 1)
+def _with_one_more(before: Stepwise, beside: Stepwise, found: int) -> bool:
+    """Whether one effect more beside the few errors of the structure does what errors of each mode do.
+
+    Args:
+        found: effects beside errors of each mode, gains that are off apart.
+    """
+    before.run(most=found + 1)
     return bool(before.is_believed and (before.plain or (before.last.effects and before.is_quiet)))

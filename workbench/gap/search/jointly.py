@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arrays import Floats
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.prediction.logged_inputs import logging_noise
@@ -65,10 +66,14 @@ class Step:
         if not of_errors_alone:
             left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
         for group, small in JOINT.small:
-            size = getattr(self.errors.target, group)
             count = sum(group_of(name) == group for name in self.errors.values)
-            left += count * np.log(max(size, small) / small)
+            left += count * np.log(max(self.size(group), small) / small)
         return float(left)
+
+    def size(self, group: str) -> float:
+        """Rms of a group of errors, as large as they are, not as is believed of a careful model."""
+        values, spread = _drawn(self.errors, group)
+        return float(np.sqrt(np.mean(values**2 + spread**2))) if values.size else 0.0
 
     def excess(self, noise_power: np.ndarray) -> float:
         """Mean square left above that noise, in units of the stated one."""
@@ -163,14 +168,20 @@ def _resized(errors: Effect) -> Effect:
     for group, widest in _widest(prior):
         if group not in prior.groups:
             continue
-        names = [name for name in errors.values if group_of(name) == group]
-        weights = np.array([weight_of(name, prior) for name in names])
-        values = np.array([errors.values[name] for name in names]) / weights
-        spread = np.array([errors.deviations[name] for name in names]) / weights
+        values, spread = _drawn(errors, group)
         known = np.clip(1.0 - (spread / getattr(prior, group)) ** 2, 0.0, 1.0).sum()
         size = np.sqrt((values**2).sum() / max(known, 1e-3))
         sizes[group] = float(np.clip(size, JOINT.narrowest * widest, widest))
     return replace(errors, target=replace(prior, **sizes))
+
+
+def _drawn(errors: Effect, group: str) -> Floats:
+    """The errors (2, n_errors) of a group and their standard deviations, each over its weight."""
+    names = [name for name in errors.values if group_of(name) == group]
+    weights = [weight_of(name, errors.target) for name in names]
+    each = [[found.get(name, 0.0) for name in names] for found in (errors.values, errors.deviations)]
+    drawn: Floats = np.array(each).reshape(2, len(names)) / np.array(weights)
+    return drawn
 
 
 def _closed(errors: Effect) -> Effect:

@@ -144,8 +144,12 @@ class PlainSettings:
     needless: float = 6.0  # twice the log-likelihood that one number more may gain by chance
     several: int = 3  # sensors, of which one alone is hardly late by chance
     likeliest: int = 4  # kinds of the one more that are tried
-    # logarithm of a gain: more is an effect of its own; and how many at once: of more, all are off by one error
+    # logarithm of a gain: more is an effect of its own, where it is so many times the rms of the others besides: of ten
+    # normal numbers, one is four times the rms of the rest once in a thousand draws
     most_gain: float = 0.05
+    outlying: float = 4.0
+    # share of that from which on a gain, which gives some of its own to others, is asked; and how many are
+    suspect: float = 0.4
     wrong_gains: int = 2
 
 

@@ -47,10 +47,12 @@ class Stepwise:
         is_tried: whether an effect has been tried beside noise of the logged inputs, which may stand for it.
         is_finer: whether it goes on by finer substeps than it began with.
         is_run: whether effects have been added as long as that pays.
+        singles: effects alone that are tried as the first; None for the likeliest one sample ahead.
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, ahead: Sequence[Fit] = ()) -> None:
         self.ahead = ahead
+        self.singles: Sequence[tuple[Effect, ...]] | None = None
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
@@ -71,13 +73,18 @@ class Stepwise:
     @property
     def nearest(self) -> Step:
         """The last set, or the likeliest single effect beside errors, whichever leaves less."""
-        return min((self.last, *self._alone), key=lambda s: s.fit.cost)
+        return min((self.last, *self.alone), key=lambda s: s.fit.cost)
 
     @cached_property
-    def _alone(self) -> list[Step]:
+    def alone(self) -> list[Step]:
         """The likeliest single effects beside errors that start from none, best first."""
-        found = self.search.workers.map(self.afresh, [f.effects for f in self._likeliest_alone()])
-        return sorted((s for s in found if not self._is_timing(s)), key=lambda s: s.fit.cost)
+        sets = [f.effects for f in self._likeliest_alone()] if self.singles is None else self.singles
+        found = [s for s in self.search.workers.map(self.afresh, list(sets)) if not self._is_timing(s)]
+        best = sorted(found, key=lambda s: s.fit.cost)
+        if not (self.search.by_mode and best and self.explains(best[0])):
+            return best
+        # errors of each mode close what any linear effect leaves: the one that they are the least beside is it
+        return sorted(found, key=lambda s: s.description(best[0].noise_power))
 
     def _likeliest_alone(self) -> list[Fit]:
         """The likeliest single effects one sample ahead, beside errors that give way; none that a simpler equals."""
@@ -94,15 +101,15 @@ class Stepwise:
 
     def by_singles(self) -> bool:
         """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
-        if not self._alone:
+        if not self.alone:
             return False
-        best = self._alone[0]
+        best = self.alone[0]
         if not self.explains(best):
             best = self._with_input_noise(best) or best
         left = best.excess(best.noise_power)
         if not self.explains(best) and left > STEPWISE.further * float(self.search.nominal.mean()):
             return False
-        best = replace(self._simplest(best, self._alone[1:]), others=tuple(self._alone))
+        best = replace(self._simplest(best, self.alone[1:]), others=tuple(self.alone))
         if not (best.is_plausible and self._is_worth(best, self.last)):
             return False
         fewer = self._without_needless(best)
@@ -120,9 +127,7 @@ class Stepwise:
             return
         self.is_run = True
         self._add(most)
-        calibrated = self._with_wrong_gains(self.last)
-        if calibrated is not self.last:
-            self.steps.append(calibrated)
+        if self.calibrate():
             self._add(most)
         limit = self._in_limit(self.last)
         if limit is not self.last:
@@ -370,7 +375,7 @@ class Stepwise:
     def _best_of(self, tried: Sequence[Step], step: Step) -> Step:
         """The best on whole records of sets fitted to the most telling ones."""
         # and of what was found before errors could bend to it
-        alone = [] if step.effects else self._alone
+        alone = [] if step.effects else self.alone
         tried = sorted((s for s in tried if not self._is_timing(s)), key=self._loss)
         near = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
         whole = sorted((*(self._without_idle(self._whole(s)) for s in near), *alone), key=self._loss)
@@ -599,19 +604,30 @@ class Stepwise:
         self.search = search
         return found
 
-    def _with_wrong_gains(self, step: Step) -> Step:
-        """The set with gains that are off by more than any calibration as effects."""
-        kinds = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}
-        wrong = {n: v for n, v in step.errors.values.items() if group_of(n) == "gain" and abs(v) > PLAIN.most_gain}
-        if not wrong or len(wrong) > PLAIN.wrong_gains:
+    def calibrate(self) -> bool:
+        """Take gains that are off by more than any calibration for effects; whether there are any."""
+        found = self._with_wrong_gains(self.last)
+        if found is self.last:
+            return False
+        self.steps.append(found)
+        return True
+
+    def _with_wrong_gains(self, step: Step, most: int = PLAIN.wrong_gains) -> Step:
+        """The set with gains that are off by more than any calibration, each far from the others, as effects."""
+        gains = {n: v for n, v in step.errors.values.items() if group_of(n) == "gain"}
+        name = max(gains, key=lambda n: abs(gains[n]), default="")
+        if not most or abs(gains.get(name, 0.0)) < PLAIN.suspect * PLAIN.most_gain:
             return step
-        added = []
-        for name, value in wrong.items():
-            _, side, port = name.split("_", 2)
-            added.append(Effect(kinds[side], port, {"gain": float(np.exp(value))}))
-        errors = replace(step.errors, values={**step.errors.values, **dict.fromkeys(wrong, 0.0)})
-        found = fit_jointly(self.search, (*step.effects, *added), errors, rounds=2)
-        return found if self._matter(found.effects, found.fit.effects) else step
+        _, side, port = name.split("_", 2)
+        kind = {"of": ACTUATOR_GAIN, "at": SENSOR_GAIN}[side]
+        effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
+        found = self.afresh((*step.effects, effect))  # others have bent to it
+        off = abs(float(np.log(found.effects[-1].values["gain"])))
+        if off < max(PLAIN.most_gain, PLAIN.outlying * found.size("gain")) or not self._matter(
+            found.effects, found.fit.effects
+        ):
+            return step
+        return self._with_wrong_gains(found, most - 1)
 
     def _promoted(self, step: Step) -> Step:
         """The set with errors too large to be small and common to all, and one sensor late alone, as effects."""
