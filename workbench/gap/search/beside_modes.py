@@ -10,7 +10,8 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
     """What holds beside errors of each mode, in frequency and in shape: nothing, or effects; None where none does.
 
     Errors of a structure that is a little off everywhere are fewer and come first; those of its modes take linear
-    effects for their own, so one effect more beside the few is asked for first.
+    effects for their own, so one effect more beside the few is asked for first. Where only errors larger than a careful
+    model's leave nothing, an effect beside which they are such may be what is missing.
 
     Args:
         before: what holds without, its likeliest single effects tried.
@@ -25,7 +26,7 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
         if not beside.is_believed:
             beside.calibrate()
         if beside.is_believed and beside.is_quiet:
-            if _with_one_more(before, beside, found):
+            if _with_one_more(before, found):
                 return before
             beside.run(most=0)
             return beside
@@ -40,10 +41,10 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
     beside.run()
     if not (beside.is_closed and beside.is_believed):
         return None
-    return before if _with_one_more(before, beside, len(beside.last.effects)) else beside
+    return before if _with_one_more(before, len(beside.last.effects)) else beside
 
 
-def _with_one_more(before: Stepwise, beside: Stepwise, found: int) -> bool:
+def _with_one_more(before: Stepwise, found: int) -> bool:
     """Whether one effect more beside the few errors of the structure does what errors of each mode do.
 
     Args:
