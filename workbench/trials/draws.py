@@ -1,18 +1,20 @@
 """Hidden effects at random: a kind, a place, and a strength at which the gap can be seen.
 
-A draw, one a kind, gives the numbers of an effect, or a function of a strength near 1 that gives them.
+A draw, one a kind, gives the numbers of an effect, or a function of a strength near 1 that gives them. Truncated modes
+are drawn with the bench, whose nominal model gives them up.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import combinations
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import Between, Interval, NamedPoints, Rectangle, Where, middle
-from workbench.structure.member import Bar, Beam, Structure
+from workbench.structure.member import Beam, Structure
 from workbench.structure.supports import HELD
 from workbench.trials.hidden import hide
 from workbench.trials.laws import POINT_LAWS, PointSizes, Strengths
@@ -58,7 +60,7 @@ def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> D
 
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         where = scene.place(rng, between=True)
-        w, v = (float(np.sqrt(np.mean(motion**2))) for motion in scene.motion_at(where))
+        w, v = map(_rms, scene.motion_at(where))
         law = make(PointSizes(_stiff(scene), w, v, scene.bench.level), rng)
         return lambda s: {**_told(where), **law(s)}
 
@@ -67,16 +69,27 @@ def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> D
 
 def _member(scene: Scene) -> Structure:
     member = scene.bench.rig.structure
-    if not isinstance(member, Bar | Beam):
+    if not isinstance(member, Structure):
         raise Unsuitable("only a beam or a rod shows this")
     return member
 
 
-def _beam(scene: Scene) -> Beam:
+def _beam(scene: Scene) -> tuple[Beam, float]:
+    """The beam, and its bending stiffness at midspan, N m²."""
     member = scene.bench.rig.structure
     if not isinstance(member, Beam):
         raise Unsuitable("only a beam shows this")
-    return member
+    return member, float(member.bending_stiffness(np.array([0.5 * member.length]))[0])
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _modal_damping(scene: Scene) -> float:
+    """2 ζ ω of the first elastic mode, 1/s."""
+    modes = scene.bench.rig.modes
+    return float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
 
 
 def _loss(scene: Scene, rng: np.random.Generator) -> OfStrength:
@@ -87,48 +100,42 @@ def _loss(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _support(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    member = _beam(scene)
+    member, stiffness = _beam(scene)
     ends = [(0.0, member.left), (member.length, member.right)]
     ends = [(at, end) for at, end in ends if end.translation == HELD]
     at, end = ends[rng.integers(len(ends))]
-    typical = float(member.bending_stiffness(np.array([0.5 * member.length]))[0]) / member.length
+    typical = stiffness / member.length
     if end.rotation == HELD:
         return lambda s: {"at": at, "rotational_stiffness": 20.0 * typical / s}
     return lambda s: {"at": at, "rotational_stiffness": 0.5 * typical * s}
 
 
 def _axial(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    member = _beam(scene)
-    typical = float(member.bending_stiffness(np.array([0.5 * member.length]))[0]) / member.length**2
-    sign = _sign(rng)
-    return lambda s: {"tension": sign * 0.2 * s * typical}
+    (member, stiffness), sign = _beam(scene), _sign(rng)
+    return lambda s: {"tension": sign * 0.2 * s * (stiffness / member.length**2)}
 
 
 def _stretching(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    modes, member = scene.bench.rig.modes, _beam(scene)
+    modes, (member, stiffness) = scene.bench.rig.modes, _beam(scene)
     if not (member.left.translation == HELD and member.right.translation == HELD):
         raise Unsuitable("only ends held apart stretch the midplane")
     grid = np.linspace(0.0, 1.0, 101) * modes.length
     slopes = modes.phi(grid, 1) @ scene.moved[0].T
     size = float(np.mean(slopes**2)) * modes.length
-    typical = float(member.bending_stiffness(np.array([0.5 * modes.length]))[0]) / modes.length**2
-    return lambda s: {"coefficient": s * typical / size}
+    return lambda s: {"coefficient": s * (stiffness / modes.length**2) / size}
 
 
 def _drag(scene: Scene, rng: np.random.Generator) -> OfStrength:
     modes, member = scene.bench.rig.modes, _member(scene)
     grid = np.linspace(0.0, 1.0, 101) * modes.length
-    speed = float(np.sqrt(np.mean((modes.phi(grid) @ scene.moved[1].T) ** 2)))
-    damping = float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
+    speed, damping = _rms(modes.phi(grid) @ scene.moved[1].T), _modal_damping(scene)
     mass = float(np.mean(member.mass_per_length(grid[1:-1])))
     return lambda s: {"coefficient": 0.5 * s * mass * damping / speed}
 
 
 def _damper(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    where = scene.place(rng, between=True)
-    modes = scene.bench.rig.modes
-    shape = float(np.abs(modes.phi_at(where)).max())
-    damping = float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
+    where, damping = scene.place(rng, between=True), _modal_damping(scene)
+    shape = float(np.abs(scene.bench.rig.modes.phi_at(where)).max())
     return lambda s: {**_told(where), "coefficient": s * damping / shape**2}
 
 
@@ -160,12 +167,12 @@ def _limit(scene: Scene, rng: np.random.Generator) -> Number:
 
 
 def _dead(scene: Scene, rng: np.random.Generator) -> Number:
-    return lambda s: 0.1 * s * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
+    return lambda s: 0.1 * s * _rms(scene.commands[0])
 
 
 def _hysteresis(scene: Scene, rng: np.random.Generator) -> OfStrength:
     which = "all" if rng.random() < 0.6 else str(rng.choice(scene.acting))
-    width = float(rng.uniform(0.3, 1.0)) * float(np.sqrt(np.mean(scene.commands[0] ** 2)))
+    width = float(rng.uniform(0.3, 1.0)) * _rms(scene.commands[0])
     return lambda s: {"input": which, "share": float(-np.expm1(-0.3 * s)), "width": width}
 
 
@@ -206,19 +213,10 @@ def _late(scene: Scene, strength: float) -> float:
     return max(0.5 * strength, 0.05) * scene.bench.sample_time
 
 
-def _time(scene: Scene, rng: np.random.Generator) -> Number:
-    return lambda s: _late(scene, s)
-
-
-def _moved_actuator(scene: Scene, rng: np.random.Generator) -> Numbers:
-    return _moved_port(scene, rng, "input", [a for a in scene.bench.rig.actuators if not a.direct])
-
-
-def _moved_sensor(scene: Scene, rng: np.random.Generator) -> Numbers:
-    return _moved_port(scene, rng, "output", list(scene.bench.rig.sensors))
-
-
-def _moved_port(scene: Scene, rng: np.random.Generator, side: str, ports: Sequence[Actuator | Sensor]) -> Numbers:
+def _moved(side: str, scene: Scene, rng: np.random.Generator) -> Numbers:
+    """An actuator (of side "input") or a sensor ("output") elsewhere."""
+    rig = scene.bench.rig
+    ports: Sequence[Actuator | Sensor] = rig.sensors if side == "output" else [a for a in rig.actuators if not a.direct]
     port, domain = ports[int(rng.integers(len(ports)))], scene.bench.rig.modes.domain
     if isinstance(domain, NamedPoints):
         if domain.positions is None:
@@ -296,10 +294,6 @@ def _drift(scene: Scene, rng: np.random.Generator) -> OfStrength:
     return lambda s: {"rate": sign * min(0.02 * s, 0.5) / duration}
 
 
-def _truncation(scene: Scene, rng: np.random.Generator) -> NoReturn:
-    raise Unsuitable("truncation is drawn with the bench: the nominal model gives up modes")
-
-
 def _cross_talk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     first, second = rng.choice(scene.acting, 2, replace=False)
     sign = _sign(rng)
@@ -307,8 +301,7 @@ def _cross_talk(scene: Scene, rng: np.random.Generator) -> OfStrength:
 
 
 def _bent_command(scene: Scene, rng: np.random.Generator) -> OfStrength:
-    rms = float(np.sqrt(np.mean(scene.commands[0] ** 2)))
-    return lambda s: {"curvature": 0.2 * s / rms}
+    return lambda s: {"curvature": 0.2 * s / _rms(scene.commands[0])}
 
 
 def _bent_reading(scene: Scene, row: int, rng: np.random.Generator) -> Number:
@@ -336,17 +329,16 @@ DRAWS: dict[str, Draw] = {
     "axial_load": _axial,
     "ground_spring": _at_point(lambda p, rng: lambda s: {"stiffness": 0.05 * s * p.stiffness}),
     **{name: _at_point(law.draw) for name, law in POINT_LAWS.items() if law.draw is not None},
-    "truncated_modes": _truncation,
     "modal_damping": _factor("factor", 0.3),
     "point_damper": _damper,
     "air_drag": _drag,
     "midplane_stretching": _stretching,
     "actuator_gain": _drive("gain", _gain, every=0.0),
-    "actuator_lag": _drive("time_constant", _time),
-    "actuator_delay": _drive("delay", _time),
+    "actuator_lag": _drive("time_constant", lambda c, r: lambda s: _late(c, s)),
+    "actuator_delay": _drive("delay", lambda c, r: lambda s: _late(c, s)),
     "actuator_saturation": _drive("limit", _limit),
     "actuator_dead_zone": _drive("width", _dead),
-    "actuator_misplacement": _moved_actuator,
+    "actuator_misplacement": partial(_moved, "input"),
     "actuator_hysteresis": _hysteresis,
     "actuator_bias": _drive("force", _push, every=0.0),
     "actuator_rate_limit": _drive("rate", _rate),
@@ -355,7 +347,7 @@ DRAWS: dict[str, Draw] = {
     "sensor_bias": _reading("bias", _in_rms(0.3)),
     "sensor_drift": _reading("drift_over_record", _in_rms(0.5)),
     "sensor_lag": _sensor_lag,
-    "sensor_misplacement": _moved_sensor,
+    "sensor_misplacement": partial(_moved, "output"),
     "sensor_delay": _reading("delay", lambda c, row, r: lambda s: _late(c, s)),
     "sensor_crosstalk": _crosstalk,
     "swapped_outputs": _swapped_outputs,

@@ -11,6 +11,7 @@ from workbench.structure.domain import Between, centred_at
 from workbench.trials.laws import POINT_LAWS, PointLaw
 from workbench.trials.plant import Plant, with_ports
 
+NONE, UNKNOWN = "none", "unknown"  # kinds of a label: nothing hides, or what no catalogue holds
 Hide = Callable[[Plant, dict[str, Any]], Plant]
 
 

@@ -14,14 +14,13 @@ from workbench.cases.writing import write_case
 from workbench.records.record import Record
 from workbench.trials.benches import Bench, bench_of, draw_bench, experiments, tested
 from workbench.trials.dirt import CLEAN, DIRT_CLASSES, MIMICS, SIZES, TRIPLE, Dirt, draw_dirt
-from workbench.trials.draws import DRAWS, draw_effect
-from workbench.trials.hidden import HIDE, OUTSIDE, hide
+from workbench.trials.draws import draw_effect
+from workbench.trials.hidden import HIDE, NONE, OUTSIDE, UNKNOWN, hide
 from workbench.trials.laws import POINT_LAWS
 from workbench.trials.plant import Plant, SolvedPlant
 from workbench.trials.rigs import FRAMES, MEMBERS, PLATES
 from workbench.trials.scene import Scene, Unsuitable, extent
 
-NONE, UNKNOWN = "none", "unknown"
 KINDS = tuple(HIDE)
 OUTSIDE_KINDS = tuple(OUTSIDE)
 MOST_BENCHES, MOST_DRAWS, MOST_SEEDS = 40, 8, 100
@@ -91,7 +90,7 @@ def make_trial_with_plant(
     """
     if dirt not in DIRT_CLASSES:
         raise ValueError(f"dirt {dirt!r} is none of {', '.join(DIRT_CLASSES)}")
-    unknown = [kind for kind in kinds if kind not in DRAWS]
+    unknown = [kind for kind in kinds if kind not in (*KINDS, *OUTSIDE_KINDS)]
     if unknown:
         raise ValueError(f"kind {unknown[0]!r} is neither in the vocabulary nor among {', '.join(OUTSIDE_KINDS)}")
     rng = np.random.default_rng(seed)
@@ -301,7 +300,7 @@ def draw_kinds(n: int, seed: int, *, like: Case | None = None, structure: str = 
         elif turn < 10:
             drawn.append((str(rng.choice(OUTSIDE_KINDS)),))
         elif turn < 20:
-            drawn.append(_draw_pair(pool, rng))
+            drawn.append(_draw_several(2, pool, rng))
         else:
             drawn.append(singles.pop(0))
     return drawn
@@ -322,7 +321,7 @@ def draw_dirty_kinds(n: int, seed: int, *, dirt: str = "all", size: float | None
         how_large = SIZES[turn % len(SIZES)] if size is None else size
         pool = [k for k in KINDS if k not in MIMICS[name]]
         if name == TRIPLE:
-            kinds = _draw_triple(pool, rng)
+            kinds = tuple(sorted(_draw_several(3, pool, rng)))
         elif (turn // len(SIZES) + turn) % 3 == 2:
             kinds = ()
         else:
@@ -331,18 +330,12 @@ def draw_dirty_kinds(n: int, seed: int, *, dirt: str = "all", size: float | None
     return drawn
 
 
-def _draw_triple(pool: list[str], rng: np.random.Generator) -> tuple[str, ...]:
+def _draw_several(n: int, pool: list[str], rng: np.random.Generator) -> tuple[str, ...]:
+    """n kinds that records can hold apart."""
     while True:
-        kinds = {str(kind) for kind in rng.choice(pool, 3, replace=False)}
-        if "truncated_modes" not in kinds and not any(twins <= kinds for twins in TWINS):
-            return tuple(sorted(kinds))
-
-
-def _draw_pair(pool: list[str], rng: np.random.Generator) -> tuple[str, str]:
-    while True:
-        first, second = (str(kind) for kind in rng.choice(pool, 2, replace=False))
-        if {first, second} not in TWINS and "truncated_modes" not in (first, second):
-            return first, second
+        kinds = tuple(str(kind) for kind in rng.choice(pool, n, replace=False))
+        if "truncated_modes" not in kinds and not any(twins <= set(kinds) for twins in TWINS):
+            return kinds
 
 
 def write_trials(

@@ -9,7 +9,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import NamedPoints, Place
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, PointShapes
@@ -38,9 +38,17 @@ def draw_rig(rng: np.random.Generator, structure: str) -> tuple[Rig, FiniteEleme
     raise ValueError(f"trials are made on {', '.join(STRUCTURES)}; got {structure!r}")
 
 
-def _inputs(places: Sequence[object], hammer: object) -> tuple[Actuator, ...]:
-    actuators = [Actuator(f"F{i + 1}", at) for i, at in enumerate(places)]  # type: ignore[arg-type]
-    return (*actuators, Actuator("hammer", hammer, direct=True))  # type: ignore[arg-type]
+def _inputs(places: Sequence[Place], hammer: Place) -> tuple[Actuator, ...]:
+    actuators = [Actuator(f"F{i + 1}", at) for i, at in enumerate(places)]
+    return (*actuators, Actuator("hammer", hammer, direct=True))
+
+
+def _accelerometers_first(places: Sequence[Place], n: int) -> tuple[Sensor, ...]:
+    """n accelerometers a1, a2, ..., then velocities, numbered on."""
+    return tuple(
+        Sensor(f"a{i + 1}", at, "acceleration") if i < n else Sensor(f"v{i + 1}", at, "velocity")
+        for i, at in enumerate(places)
+    )
 
 
 # --- beams and rods
@@ -60,7 +68,7 @@ def _member(rng: np.random.Generator) -> Rig:
     return Rig(modes, _inputs(places.tolist(), strike), sensors, structure=structure)
 
 
-def _sensors(rng: np.random.Generator, places: np.ndarray, quantities: str) -> tuple[Sensor, ...]:
+def _sensors(places: np.ndarray, quantities: str) -> tuple[Sensor, ...]:
     """d1, d2, ..., v1, ...: a letter of `quantities` a place."""
     words = {"d": "displacement", "v": "velocity", "a": "acceleration"}
     return tuple(
@@ -83,7 +91,7 @@ def _long_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]
     beam = Beam(
         length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left="hinged", right="hinged", damping=_damping(rng)
     )
-    return beam, _sensors(rng, places, "d" * n + "v" * n)
+    return beam, _sensors(places, "d" * n + "v" * n)
 
 
 def _tapered_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
@@ -97,7 +105,7 @@ def _tapered_beam(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ..
         right=ends[1],
         damping=_damping(rng),
     )
-    return beam, _sensors(rng, np.arange(1, n + 1) * 10.0 / (n + 1), "d" * (n // 2) + "v" * (n - n // 2))
+    return beam, _sensors(np.arange(1, n + 1) * 10.0 / (n + 1), "d" * (n // 2) + "v" * (n - n // 2))
 
 
 def _ruler(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
@@ -111,7 +119,7 @@ def _ruler(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
         damping=_damping(rng),
     )
     places = np.r_[np.arange(1, n + 1) * 0.8 / n, 0.8]
-    return beam, _sensors(rng, places, "a" * n + "v")
+    return beam, _sensors(places, "a" * n + "v")
 
 
 def _tapered_rod(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...]]:
@@ -125,7 +133,7 @@ def _tapered_rod(rng: np.random.Generator) -> tuple[Structure, tuple[Sensor, ...
         right="free",
         damping=_damping(rng),
     )
-    return rod, _sensors(rng, np.arange(1, n + 1) / n, "d" * n)
+    return rod, _sensors(np.arange(1, n + 1) / n, "d" * n)
 
 
 # --- plates
@@ -154,12 +162,9 @@ def _plate(rng: np.random.Generator) -> Rig:
     )
     n_actuators, n_sensors = int(rng.integers(2, 4)), int(rng.integers(6, 9))
     places = _scattered(rng, length, n_actuators + 1 + n_sensors)
-    sensors = [
-        Sensor(f"a{i + 1}", at, "acceleration") if i < (n_sensors + 1) // 2 else Sensor(f"v{i + 1}", at, "velocity")
-        for i, at in enumerate(places[n_actuators + 1 :])
-    ]
-    modes = plate.modes(int(rng.integers(14, 17)))
-    return Rig(modes, _inputs(places[:n_actuators], places[n_actuators]), tuple(sensors), structure=plate)
+    *driven, hammer = places[: n_actuators + 1]
+    sensors = _accelerometers_first(places[n_actuators + 1 :], (n_sensors + 1) // 2)
+    return Rig(plate.modes(int(rng.integers(14, 17))), _inputs(driven, hammer), sensors, structure=plate)
 
 
 def _scattered(rng: np.random.Generator, length: tuple[float, float], n: int) -> list[tuple[float, float]]:
@@ -204,11 +209,7 @@ def _frame(rng: np.random.Generator) -> tuple[Rig, FiniteElements]:
     n_actuators, n_sensors = int(rng.integers(2, 4)), int(rng.integers(7, 10))
     *driven, hammer = (str(name) for name in rng.choice(across, n_actuators + 1, replace=False))
     read = [str(name) for name in rng.choice(across, n_sensors, replace=False)]
-    sensors = [
-        Sensor(f"a{i + 1}", at, "acceleration") if i < n_sensors - 2 else Sensor(f"v{i + 1}", at, "velocity")
-        for i, at in enumerate(read)
-    ]
-    return Rig(modes, _inputs(driven, hammer), tuple(sensors)), frame
+    return Rig(modes, _inputs(driven, hammer), _accelerometers_first(read, n_sensors - 2)), frame
 
 
 def _at_points(frame: FiniteElements, nodes: Sequence[str], n_modes: int) -> Modes:

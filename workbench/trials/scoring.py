@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from workbench.structure.domain import Domain, NamedPoints, as_domain
-from workbench.trials.hidden import stands
+from workbench.trials.hidden import NONE, UNKNOWN, stands
 
-NONE, UNKNOWN = "none", "unknown"
 NEAR = 0.02  # of the length: how far off a place may be
 NEAR_IN_DIRT = 0.03  # likewise beside the small errors of a real test
 HONEST = 0.05  # of the nominal residual's mean square: how far off a budget's unexplained share may be
