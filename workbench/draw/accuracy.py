@@ -46,9 +46,8 @@ def peers_errors(
                 transform=ax.get_yaxis_transform(),
             )
         ax.axvline(efficient[level], color=GREY, lw=3, alpha=0.5, zorder=0)
-        ax.set_xscale("log")
+        ax.set(xscale="log", xlabel="error of the worst mode\n[standard errors of the bound]")
         ax.set_title(f"noise {level} dB below the record")
-        ax.set_xlabel("error of the worst mode\n[standard errors of the bound]")
         ax.set_yticks(range(len(by_name)), list(by_name))
         ax.set_ylim(len(by_name) - 0.5, -0.6)
     handles = [
@@ -113,10 +112,8 @@ def size_and_errors(rows: Sequence[Mapping[str, Any]], errors: np.ndarray) -> Fi
     left.set_xticks(samples, [f"{n:,}" for n in samples])
     left.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
     left.minorticks_off()
-    left.set_xlim(0.5 * samples.min(), 1.4 * samples.max())
-    left.set_ylim(0.25 * spent.min(), 60.0)
-    left.set_xlabel(f"samples of {rows[-1]['sensors']} sensors")
-    left.set_ylabel("time to identify [s]")
+    left.set(xlim=(0.5 * samples.min(), 1.4 * samples.max()), ylim=(0.25 * spent.min(), 60.0))
+    left.set(xlabel=f"samples of {rows[-1]['sensors']} sensors", ylabel="time to identify [s]")
     left.legend(loc="lower right")
     edges, x = np.linspace(-4.0, 4.0, 17), np.linspace(-4.0, 4.0, 201)
     right.hist(errors.T, edges, density=True, label=("frequency", "damping"), color=COLOURS[:2], alpha=0.8)

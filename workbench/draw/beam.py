@@ -21,9 +21,8 @@ def plot_ring_down(record: Record, *, stretch: float) -> Figure:
     for j, channel in enumerate(shown.output_channels):
         ax.axhline(j, color=GREY, linewidth=0.4)
         ax.plot(shown.time, j + 0.5 * shown.outputs[j] / size, color=COLOURS[0], linewidth=0.9)
-        ax.text(
-            shown.time[-1], j, f"  x = {channel.at:.3g}" if channel.at is not None else f"  {channel.name}", va="center"
-        )
+        place = channel.name if channel.at is None else f"x = {channel.at:.3g}"
+        ax.text(shown.time[-1], j, f"  {place}", va="center")
     ax.set(xlabel="time [s]", yticks=[], xlim=(shown.time[0], shown.time[-1]))
     ax.set_title("measured ring-down, one line a sensor")
     return figure
@@ -31,18 +30,14 @@ def plot_ring_down(record: Record, *, stretch: float) -> Figure:
 
 def plot_identified(found: Modes, truth: Modes, positions: np.ndarray, *, count: int) -> Figure:
     """Identified eigenfunctions over the true ones, with their values at the sensors."""
-    columns = 3
-    figure, axes = new_figure(
-        -(-count // columns), columns, width=10, height=4.6, sharex=True, sharey=True, squeeze=False
-    )
+    figure, axes = new_figure(-(-count // 3), 3, width=10, height=4.6, sharex=True, sharey=True, squeeze=False)
     x = np.linspace(0.0, truth.length, 301)
     for r, ax in zip(range(count), axes.flat, strict=False):
         sign = np.sign(found.phi(x)[:, r] @ truth.phi(x)[:, r])
         ax.plot(x, truth.phi(x)[:, r], color=GREY, linewidth=4, alpha=0.5, label="true")
         ax.plot(x, sign * found.phi(x)[:, r], color=COLOURS[0], label="identified")
-        ax.plot(
-            positions, sign * found.phi(positions)[:, r], "o", color=COLOURS[1], markersize=4, label="at the sensors"
-        )
+        at_sensors = sign * found.phi(positions)[:, r]
+        ax.plot(positions, at_sensors, "o", color=COLOURS[1], markersize=4, label="at the sensors")
         ax.set_title(f"mode {r + 1}: {found.frequencies_hz[r]:.4f} Hz, ζ = {100 * found.zeta[r]:.2f} %", fontsize=10)
     for ax in axes[-1]:
         ax.set_xlabel("x")

@@ -159,9 +159,8 @@ def plot_spillover_paths(explained: Explanation) -> Figure:
     numbers = [m.mode + 1 for m in moved]
     growth = np.array([m.closed_pole.real for m in moved])
     axes[0].bar(numbers, growth, color=[COLOURS[1] if g > 0 else COLOURS[0] for g in growth])
-    axes[0].plot(
-        numbers, [m.pole.real for m in moved], "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled"
-    )
+    before = [m.pole.real for m in moved]
+    axes[0].plot(numbers, before, "_", color=COLOURS[6], markersize=16, mew=2, label="uncontrolled")
     axes[0].axhline(0.0, color=GREY, linewidth=0.8)
     axes[0].set(xlabel="residual mode", ylabel="growth rate Re λ [1/s]", xticks=numbers)
     axes[0].set_title("above zero the full plant is unstable")
@@ -199,17 +198,14 @@ def plot_how_many(found: dict[str, HowMany], share: float | None = None) -> Figu
     """Energy left of each disturbance when the lowest n modes are controlled: in the others, and by spillover."""
     figure, axes = new_figure(1, len(found), width=11, height=4.5, sharey=True, squeeze=False)
     for ax, (name, result) in zip(axes[0], found.items(), strict=True):
-        total = result.energy.sum()
-        ax.bar(result.counts, result.untouched / total, color=COLOURS[0], label="in modes not controlled")
-        ax.bar(
-            result.counts, result.spilled / total, bottom=result.untouched / total, color=COLOURS[1], label="spillover"
-        )
+        untouched, spilled = result.untouched / result.energy.sum(), result.spilled / result.energy.sum()
+        ax.bar(result.counts, untouched, color=COLOURS[0], label="in modes not controlled")
+        ax.bar(result.counts, spilled, bottom=untouched, color=COLOURS[1], label="spillover")
         if share is not None:
             ax.axhline(share, color=GREY, linestyle="--", label=f"{share:.0%} may be left")
         if result.recommended:
-            ax.axvline(
-                result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=f"control {result.recommended}"
-            )
+            label = f"control {result.recommended}"
+            ax.axvline(result.recommended, color=COLOURS[2], linewidth=6, alpha=0.35, label=label)
         ax.set(xlabel="modes controlled, n", xticks=result.counts, title=name)
         ax.legend()
     axes[0, 0].set_ylabel("share of the disturbance's energy left")
@@ -282,10 +278,10 @@ def plot_drift(rows: Sequence[dict[str, Any]]) -> Figure:
     return figure
 
 
-def plot_switching(law: OnOffLaw, switched: Switched, which: int = 0) -> Figure:
-    """A mode under on-off control: its path in the phase plane with the dead band, and the force over time."""
-    relay, stretches = law.relays[which], switched.stretches[which]
-    response, r = switched.response, law.controlled[which]
+def plot_switching(law: OnOffLaw, switched: Switched) -> Figure:
+    """The first controlled mode under on-off control: its path in the phase plane, and the force over time."""
+    relay, stretches = law.relays[0], switched.stretches[0]
+    response, r = switched.response, law.controlled[0]
     q, v = response.modal[r], response.modal[response.modes.n_modes + r]
     figure, axes = new_figure(1, 2, width=11, height=4.5)
     axes[0].plot(q, v, color=COLOURS[0], linewidth=1.0, label="motion")

@@ -129,8 +129,7 @@ def _plot_places(ax: Axes, verdict: Verdict) -> None:
     for effect in verdict.effects:
         if effect.at is not None and effect.kind.path in ("structure", "environment"):
             ax.axvline(effect.at, color=COLOURS[0])
-    near = abs(np.sort(profile)[-min(3, profile.size)])
-    low = min(max(profile.min(), -50.0 * max(1.0, near)), -1.0)
+    low = _lowest(profile)
     ax.set(xlabel="x [m]", ylim=(low, -0.06 * low))
 
 
@@ -138,15 +137,19 @@ def _map(ax: Axes, verdict: Verdict, domain: Rectangle) -> None:
     """The log-likelihood over a rectangle, its top, and the effects that were named."""
     place = verdict.where.place
     x, y = np.array(place.places).T
-    near = abs(np.sort(place.profile)[-min(3, place.profile.size)])
-    low = min(max(place.profile.min(), -50.0 * max(1.0, near)), -1.0)
-    ax.tricontourf(x, y, np.maximum(place.profile, low), levels=12, cmap="Blues")
+    ax.tricontourf(x, y, np.maximum(place.profile, _lowest(place.profile)), levels=12, cmap="Blues")
     ax.plot(*place.at, "+", color=GREY, markersize=12)
     for effect in verdict.effects:
         if effect.at is not None and effect.kind.path in ("structure", "environment"):
             ax.plot(*effect.at, "o", color=COLOURS[0], fillstyle="none", markersize=9)
     a, b = domain.length
     ax.set(xlabel="x [m]", ylabel="y [m]", xlim=(0.0, a), ylim=(0.0, b), aspect="equal")
+
+
+def _lowest(profile: Floats) -> float:
+    """The log-likelihood that is drawn lowest: what is far less likely than the three likeliest is cut off."""
+    near = abs(np.sort(profile)[-min(3, profile.size)])
+    return float(min(max(profile.min(), -50.0 * max(1.0, near)), -1.0))
 
 
 def _short(where: Where) -> str:

@@ -75,22 +75,13 @@ def distribution_errors(
 def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz: float) -> Figure:
     """Frequencies at each order; dark dots have real shapes (phase collinearity near 1), pale ones complex shapes."""
     figure, ax = new_figure(width=9, height=4.5)
+    look: Any = {"cmap": "Blues", "vmin": 0, "vmax": 1, "s": 22, "edgecolors": GREY, "linewidths": 0.4, "zorder": 3}
     for line, frequency in enumerate(stayed.frequencies_hz):
         ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stable")
     for order, modes in zip(diagram.orders, diagram.found, strict=True):
         keep = modes.frequencies_hz < band_hz
-        dots = ax.scatter(
-            modes.frequencies_hz[keep],
-            np.full(keep.sum(), order),
-            c=modes.phase_collinearity[keep],
-            cmap="Blues",
-            vmin=0,
-            vmax=1,
-            s=22,
-            edgecolors=GREY,
-            linewidths=0.4,
-            zorder=3,
-        )
+        at, collinearity = np.full(keep.sum(), order), modes.phase_collinearity[keep]
+        dots = ax.scatter(modes.frequencies_hz[keep], at, c=collinearity, **look)
     figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
     ax.set(xlabel="frequency, Hz", ylabel="model order (modes)")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
@@ -139,19 +130,11 @@ def placement_on_shapes(modes: Modes, placements: Mapping[str, Any], *, n_contro
         left.plot(placement.positions, np.full(len(placement.positions), level), "^", color=colour, ms=9)
         label = f"{name}: W_R = {placement.residual_work:.2e}, effort {placement.effort:.3g}"
         number = np.arange(n_controlled + 1, modes.n_modes + 1)
-        right.bar(
-            number + (i - 1) * width,
-            np.maximum(placement.by_mode, 1e-12),
-            width,
-            bottom=1e-12,
-            color=colour,
-            label=label,
-        )
+        work = np.maximum(placement.by_mode, 1e-12)
+        right.bar(number + (i - 1) * width, work, width, bottom=1e-12, color=colour, label=label)
     left.set(xlabel="x / length", ylabel="mode shape; actuators below")
     left.legend(loc="upper center", ncols=2)
-    right.set(yscale="log", ylim=(1e-12, None))
-    right.set_xticks(number)
-    right.set(xlabel="residual mode", ylabel="residual work")
+    right.set(yscale="log", ylim=(1e-12, None), xticks=number, xlabel="residual mode", ylabel="residual work")
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0))
     return figure
 
@@ -213,9 +196,7 @@ def places_found(rows: Sequence[Mapping[str, Any]], *, within: float) -> Figure:
         ax.semilogy([row["centre"] for row in missed], [row["error"] for row in missed], "x", color=colour)
     ax.axhline(within, color=GREY, ls="--")
     ax.text(0.01, within * 1.15, f"{100 * within:g} % of the length", color=GREY, va="bottom")
-    ax.set_ylim(1e-6, 1.0)
-    ax.set_xlim(0.0, 1.0)
-    ax.set_xlabel("where the stiffness is lost, x / length")
-    ax.set_ylabel("error of the place / length")
+    ax.set(xlim=(0.0, 1.0), ylim=(1e-6, 1.0))
+    ax.set(xlabel="where the stiffness is lost, x / length", ylabel="error of the place / length")
     figure.legend(loc="outside upper right", ncols=len(levels))
     return figure

@@ -107,7 +107,7 @@ def _height(artist: Artist | BarContainer) -> float:
 def _described(ax: Axes, artist: Artist | BarContainer) -> list[dict[str, Any]]:
     if isinstance(artist, BarContainer):
         boxes = [_box(ax, patch) for patch in artist.patches]
-        colours = [_colour(patch.get_facecolor()) for patch in artist.patches]
+        colours = [to_hex(patch.get_facecolor()) for patch in artist.patches]
         return [{"kind": "bars", "boxes": boxes, "colours": colours, "label": _label(artist)}]
     for kind, describe in KINDS.items():
         if isinstance(artist, kind):
@@ -116,7 +116,7 @@ def _described(ax: Axes, artist: Artist | BarContainer) -> list[dict[str, Any]]:
 
 
 def _line(ax: Axes, line: Line2D) -> list[dict[str, Any]]:
-    style = {"colour": _colour(line.get_color()), "label": _label(line), "alpha": _alpha(line)}
+    style = {"colour": to_hex(line.get_color()), "label": _label(line), "alpha": _alpha(line)}
     style |= {"width": round(line.get_linewidth() * POINTS, 2), "dash": DASHES.get(str(line.get_linestyle()), "")}
     for transform, axis, values in (
         (ax.get_xaxis_transform(), "x", line.get_xdata()),
@@ -159,9 +159,9 @@ def _box(ax: Axes, patch: Rectangle) -> list[float | None]:
 
 def _rectangle(ax: Axes, patch: Rectangle) -> list[dict[str, Any]]:
     faint = to_rgba(patch.get_facecolor())
-    look = {"colours": [_colour(faint)], "alpha": float(faint[3]), "label": _label(patch)}
+    look = {"colours": [to_hex(faint)], "alpha": float(faint[3]), "label": _label(patch)}
     if faint[3] == 0:
-        look = {"colours": ["none"], "edge": _colour(patch.get_edgecolor()), "label": _label(patch)}
+        look = {"colours": ["none"], "edge": to_hex(patch.get_edgecolor()), "label": _label(patch)}
     return [{"kind": "bars", "boxes": [_box(ax, patch)], **look}]
 
 
@@ -169,37 +169,27 @@ def _points(ax: Axes, points: PathCollection) -> list[dict[str, Any]]:
     places = np.asarray(np.ma.filled(points.get_offsets(), np.nan), float)
     x, y = places[:, 0], places[:, 1]
     faces, sizes = np.atleast_2d(points.get_facecolor()), points.get_sizes()
-    colours = [_colour(face) for face in faces] or [_colour(c) for c in np.atleast_2d(points.get_edgecolor())]
+    colours = [to_hex(face) for face in faces] or [to_hex(c) for c in np.atleast_2d(points.get_edgecolor())]
     same = {"colour": colours[0]} if len(colours) <= 1 else {"colours": colours, "colour": colours[0]}
     size = round(float(np.sqrt(np.mean(sizes))) * POINTS, 2)
     return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "width": 0, "marker": "o", "size": size, **same,
              "label": _label(points), "alpha": _alpha(points)}]  # fmt: skip
 
 
-def _polygons(ax: Axes, areas: PolyCollection) -> list[dict[str, Any]]:
-    face = np.atleast_2d(areas.get_facecolor())
-    if len(face) == 0:
+def _areas(ax: Axes, artist: PolyCollection | Polygon) -> list[dict[str, Any]]:
+    faces = np.atleast_2d(artist.get_facecolor())
+    if len(faces) == 0:
         raise Undescribed("areas without a colour")
-    return [
-        {"kind": "area", **dict(zip("xy", map(_numbers, np.asarray(path.vertices).T))), "colour": _colour(face[0]),
-         "alpha": float(face[0][3]), "label": _label(areas)}
-        for path in areas.get_paths()
-    ]  # fmt: skip
-
-
-def _polygon(ax: Axes, patch: Polygon) -> list[dict[str, Any]]:
-    face = to_rgba(patch.get_facecolor())
-    corners = np.asarray(patch.get_xy())
-    x, y = corners[:, 0], corners[:, 1]
-    return [{"kind": "area", "x": _numbers(x), "y": _numbers(y), "colour": _colour(face), "alpha": float(face[3]),
-             "label": _label(patch)}]  # fmt: skip
+    paths = [artist.get_xy()] if isinstance(artist, Polygon) else [path.vertices for path in artist.get_paths()]
+    look = {"colour": to_hex(faces[0]), "alpha": float(faces[0][3]), "label": _label(artist)}
+    return [{"kind": "area", **dict(zip("xy", map(_numbers, np.asarray(path).T))), **look} for path in paths]
 
 
 def _segments(ax: Axes, lines: LineCollection) -> list[dict[str, Any]]:
     gap = np.full((1, 2), np.nan)
     points = np.concatenate([part for segment in lines.get_segments() for part in (np.asarray(segment), gap)])
     x, y = points[:, 0], points[:, 1]
-    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "colour": _colour(np.atleast_2d(lines.get_color())[0]),
+    return [{"kind": "line", "x": _numbers(x), "y": _numbers(y), "colour": to_hex(np.atleast_2d(lines.get_color())[0]),
              "width": round(float(np.mean(lines.get_linewidth())) * POINTS, 2), "dash": "", "label": _label(lines),
              "alpha": _alpha(lines)}]  # fmt: skip
 
@@ -261,7 +251,7 @@ def _words(ax: Axes, text: Text) -> list[dict[str, Any]]:
     else:
         raise Undescribed("a text that is not in the axes' coordinates")
     return [{"kind": "text", "x": x, "y": y, "frame": frame, "text": _text(text.get_text()),
-             "shift": [shift[0] * POINTS, -shift[1] * POINTS], "colour": _colour(text.get_color()),
+             "shift": [shift[0] * POINTS, -shift[1] * POINTS], "colour": to_hex(text.get_color()),
              "across": text.get_horizontalalignment(), "up": text.get_verticalalignment(),
              "size": round(float(text.get_fontsize()) * POINTS, 1)}]  # fmt: skip
 
@@ -269,10 +259,10 @@ def _words(ax: Axes, text: Text) -> list[dict[str, Any]]:
 KINDS: dict[type, Callable[[Axes, Any], list[dict[str, Any]]]] = {
     Line2D: _line,
     Rectangle: _rectangle,
-    Polygon: _polygon,
+    Polygon: _areas,
     PathCollection: _points,
     LineCollection: _segments,
-    PolyCollection: _polygons,
+    PolyCollection: _areas,
     QuadMesh: _mesh,
     AxesImage: _image,
     Text: _words,
@@ -281,10 +271,6 @@ KINDS: dict[type, Callable[[Axes, Any], list[dict[str, Any]]]] = {
 
 def _numbers(values: ArrayLike) -> list[float | None]:
     return [float(f"{v:.6g}") if np.isfinite(v) else None for v in np.asarray(values, float)]
-
-
-def _colour(colour: Any) -> str:
-    return to_hex(colour)
 
 
 def _alpha(artist: Artist) -> float:

@@ -173,6 +173,11 @@ def _seen(at: np.ndarray) -> np.ndarray:
     return np.asarray(np.stack([at[..., 0] + 0.4 * at[..., 1], at[..., 2] + 0.45 * at[..., 1]], axis=-1))
 
 
+def _upwards(shapes: np.ndarray) -> np.ndarray:
+    """(n_spots, 2, n_modes) of displacements (n_spots, n_modes) that are seen as upwards."""
+    return np.stack([np.zeros_like(shapes), shapes], axis=1)
+
+
 def _net(domain: Domain) -> Net:
     return _plate_net(domain) if isinstance(domain, Rectangle) else frame_net(domain)
 
@@ -186,21 +191,18 @@ def _plate_net(domain: Rectangle) -> Net:
     lines += [[i * m + j, i * m + j + m] for i in range(n - 1) for j in range(m)]
     flat = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
-    def moves(modes: Modes) -> np.ndarray:
-        up = modes.phi(places)
-        return np.stack([np.zeros_like(up), up], axis=1)
-
-    return Net(_seen(places @ flat), lines, moves, lambda place: _seen(np.asarray(place)[:2] @ flat))
+    return Net(
+        _seen(places @ flat),
+        lines,
+        lambda modes: _upwards(modes.phi(places)),
+        lambda place: _seen(np.asarray(place)[:2] @ flat),
+    )
 
 
 def scattered_net(places: np.ndarray) -> Net:
     """Sensors on a plate, at places (n_sensors, 2), neighbours joined; what they read moves up, each with its phase."""
     at = np.column_stack([places, np.zeros(len(places))])
-
-    def moves(modes: SampledModes) -> np.ndarray:
-        return np.stack([np.zeros_like(modes.shapes), modes.shapes], axis=1)
-
-    return Net(_seen(at), _neighbours(at), moves, lambda place: _seen(np.r_[place, 0.0]))
+    return Net(_seen(at), _neighbours(at), lambda modes: _upwards(modes.shapes), lambda place: _seen(np.r_[place, 0.0]))
 
 
 def frame_net(domain: Domain) -> Net:

@@ -105,11 +105,6 @@ def _(result: SampledModes) -> Figure:
 
 
 @plot.register
-def _(result: ModalEstimates) -> Figure:
-    return plot(result.modes)
-
-
-@plot.register
 def _(result: Refined) -> Figure:
     figure, axes = new_figure(2, 1, width=9, height=5, sharex=True)
     modes = np.arange(1, result.modes.n_modes + 1)
@@ -125,11 +120,11 @@ plot.register(Explanation, plot_spillover_paths)
 plot.register(Verdict, plot_where)
 plot.register(Redesign, plot_redesign)
 plot.register(Prediction, plot_prediction)
-
-
-@plot.register
-def _(result: Bands) -> Figure:
-    return plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result)
+plot.register(ModalEstimates, lambda result: plot(result.modes))
+plot.register(Bands, lambda result: plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result))
+plot.register(Spillover, lambda result: plot_work({"this design": result}))
+plot.register(HowMany, lambda result: plot_how_many({"energy left of this disturbance": result}))
+plot.register(Distortion, lambda result: plot_distortion([result]))
 
 
 @plot.register
@@ -144,11 +139,6 @@ def _(result: Response) -> Figure:
 
 
 @plot.register
-def _(result: Spillover) -> Figure:
-    return plot_work({"this design": result})
-
-
-@plot.register
 def _(result: Placement) -> Figure:
     figure, ax = new_figure(width=9, height=3.5)
     numbers = len(result.positions) + 1 + np.arange(result.by_mode.size)
@@ -157,11 +147,6 @@ def _(result: Placement) -> Figure:
     ax.set(xlabel="residual mode", ylabel="spillover work, W_r", xticks=numbers)
     ax.set_title(f"actuators at {where}: W_R = {result.residual_work:.3g}, effort {result.effort:.3g}")
     return figure
-
-
-@plot.register
-def _(result: HowMany) -> Figure:
-    return plot_how_many({"energy left of this disturbance": result})
 
 
 @plot.register
@@ -174,11 +159,6 @@ def _(result: ModalFilter) -> Figure:
     ax.set(xlabel="x of the sensor" if along else "sensor", ylabel="weight of its displacement", title="modal filter")
     ax.legend(ncols=2)
     return figure
-
-
-@plot.register
-def _(result: Distortion) -> Figure:
-    return plot_distortion([result])
 
 
 def _point_motion(result: Response, names: Sequence[str]) -> Figure:

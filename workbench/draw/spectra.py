@@ -104,17 +104,12 @@ def plot_distortion(distortions: Sequence[Distortion]) -> Figure:
     )
     for column, found in zip(axes.T, distortions, strict=True):
         shown = found.frequencies_hz < BEYOND * found.frequencies_hz[found.excited].max()
-        lines = (
-            ("excited", found.excited, COLOURS[0]),
-            ("odd", found.odd, COLOURS[1]),
-            ("even", found.even, COLOURS[2]),
-        )
+        lines = {"excited": found.excited, "odd, not excited": found.odd, "even, not excited": found.even}
         for j, ax in enumerate(column[: len(rows)]):
-            for label, kind, colour in lines:
+            for (label, kind), colour in zip(lines.items(), COLOURS, strict=False):
                 chosen = shown & kind
                 at, size = found.frequencies_hz[chosen], found.amplitudes[j, chosen]
                 if at.size:
-                    label = label if kind is found.excited else f"{label}, not excited"
                     ax.semilogy(at, size, ".", color=colour, markersize=3, label=label)
             ax.semilogy(found.frequencies_hz[shown], found.noise[j, shown], color=GREY, linewidth=0.8, label="noise")
         column[0].set_title(found.name)

@@ -228,9 +228,8 @@ def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
     for ax in grid.flat:
         ax.set_aspect("equal")
         ax.axis("off")
-    handles = [
-        Line2D([], [], color=c, marker="o", label=told) for c, told in ((GREY, "at rest"), (COLOURS[0], "moved"))
-    ]
+    states = ((GREY, "at rest"), (COLOURS[0], "moved"))
+    handles = [Line2D([], [], color=colour, marker="o", label=state) for colour, state in states]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
     return figure
 
@@ -238,11 +237,10 @@ def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
 def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, width: float) -> None:
     """Where a field is zero; along edges that hold it, where it is so but for rounding, no line is drawn."""
     nothing = HELD * np.abs(field).max()
-    within = [
+    i, j = (
         slice(int(np.abs(first).max() < nothing), -1 if np.abs(last).max() < nothing else None)
         for first, last in ((field[0], field[-1]), (field[:, 0], field[:, -1]))
-    ]
-    i, j = within
+    )
     ax.contour(x[i], y[j], field[i, j].T, levels=[0.0], colors="black", linewidths=width)
 
 
