@@ -6,7 +6,7 @@ of that noise is estimated from the residual, and the modes from it in turn (`in
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import control
@@ -17,19 +17,21 @@ from scipy.stats import chi2
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, projected, settled
-from workbench.identification.input_output.model_order import ORDER, Selected, evidence_of, fit_of_poles, select_modes
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    added_misfit,
+    only,
+    projected,
+    scaled_vectors,
+    settled,
+)
+from workbench.identification.input_output.model_order import ORDER, Selected, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.modal_estimates import (
-    ParticipatingModes,
-    credible,
-    normalised_shapes,
-    time_derivatives,
-)
+from workbench.identification.signal.modal_estimates import ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Channel, Record
 from workbench.rig.statespace import signal_names
@@ -224,12 +226,11 @@ def identify_driven(
     selected, remarks = _without_artefacts(data, selected, budget)
     if delays is None:
         remarks = (*_late_remarks(data), *remarks)
-    fit, change = joined(data, selected.fit, budget)
-    if fit is not selected.fit:
-        selected = replace(selected, fit=fit, evidence=np.array([evidence_of(fit, r) for r in range(fit.poles.size)]))
+    fit = joined(data, selected.fit, budget)
+    selected = selected if fit is selected.fit else selected.refitted(fit)
     overlap = overlap_remarks(selected.fit.poles, records[0].n_outputs * records[0].n_inputs)
     late = budget.spent("check of modes that change within the record")
-    changes = () if late else change_remarks(data, fit, change, changing)
+    changes = () if late else change_remarks(data, fit, changing)
     return _report(records, data, selected, (*remarks, *overlap, *changes, *budget.remarks))
 
 
@@ -270,22 +271,14 @@ def _with_delays(data: KnownInputs, budget: Budget, **how: Any) -> tuple[KnownIn
     turned = fit.participation.copy()
     turned[:, : data.n_inputs] *= np.exp(np.outer(fit.poles, fraction) * data.dt)
     late = data.delayed_by(whole + fraction)
-    fit = projected(late, fit.poles, turned)
-    fit = settled(late, fit, budget=budget)
-    evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
-    return late, replace(selected, fit=fit, evidence=evidence)
+    return late, selected.refitted(settled(late, projected(late, fit.poles, turned), budget=budget))
 
 
 def _late(data: KnownInputs, selected: Selected, budget: Budget) -> bool:
     """Whether these modes leave what the inputs a sample earlier explain."""
     other = data.delayed_by(data.delays, any_fraction=True)
-    trial = settled(
-        other,
-        projected(other, selected.fit.poles, selected.fit.participation),
-        SELECTION.few_steps,
-        budget,
-        ORDER.decided,
-    )
+    trial = projected(other, selected.fit.poles, selected.fit.participation)
+    trial = settled(other, trial, SELECTION.few_steps, budget, ORDER.decided)
     return bool(act_later(other, trial).any())
 
 
@@ -339,9 +332,7 @@ def _selected(
     doubtful = (selected.evidence < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
     if data.line_std is None or not doubtful.any() or budget.spent("check of doubtful modes"):
         return data, selected
-    sure = settled(
-        data, projected(data, selected.fit.poles[~doubtful], selected.fit.participation[~doubtful]), budget=budget
-    )
+    sure = settled(data, only(data, selected.fit, ~doubtful), budget=budget)
     other = data.weighted_by(data.noise_spectrum(sure))
     other, fewer = _with_noise(other, select_modes(other, start=sure, **how), how, how, budget)
     if budget.spent("check of doubtful modes"):
@@ -363,14 +354,12 @@ def _as_constant(
         return data, selected, ()
     plain, before = data.without_columns(), selected.fit
     fit = settled(plain, projected(plain, before.poles, before.participation), budget=budget)
-    worth = float((((fit.residual**2).sum(axis=0) - (before.residual**2).sum(axis=0)) / before.noise**2).sum())
+    worth = added_misfit(fit, before, before.noise)
     columns = (data.fixed.shape[1] - plain.fixed.shape[1]) * before.noise.size
     changing = data.changing if worth > chi2.isf(FALSE_ALARM, columns) else ()
     data = plain.weighted_by(plain.noise_spectrum(fit))
-    order = np.argsort(np.abs(fit.poles))
-    fit = settled(data, projected(data, fit.poles[order], fit.participation[order]), budget=budget)
-    evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
-    return data, replace(selected, fit=fit, evidence=evidence), changing
+    fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
+    return data, selected.refitted(fit), changing
 
 
 def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) -> tuple[Selected, tuple[str, ...]]:
@@ -379,20 +368,17 @@ def _without_artefacts(data: KnownInputs, selected: Selected, budget: Budget) ->
     fit = selected.fit
     while fit.poles.size > 1:
         std = np.sqrt(np.diag(pole_covariance(fit))).reshape(2, -1)
-        modes = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), fit.amplitudes, data.places)
+        modes = SampledModes.of_poles(fit.poles, fit.amplitudes, data.places)
         good = credible(modes, std[0], std[1], data.highest)
         if good.all() or not good.any():
             break
         out += list(modes.frequencies_hz[~good])
-        fit = settled(data, projected(data, fit.poles[good], fit.participation[good]), budget=budget)
+        fit = settled(data, only(data, fit, good), budget=budget)
     if not out:
         return selected, ()
-    evidence = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
     which = ", ".join(f"{f:.4g}" for f in sorted(out))
-    return (
-        replace(selected, fit=fit, evidence=evidence),
-        (f"left out, as negatively damped, of unknown frequency or beyond Nyquist: poles at {which} Hz",),
-    )
+    remark = f"left out, as negatively damped, of unknown frequency or beyond Nyquist: poles at {which} Hz"
+    return selected.refitted(fit), (remark,)
 
 
 def _oscillate(data: KnownInputs, selected: Selected) -> np.ndarray:
@@ -451,27 +437,19 @@ def _check_inputs(records: Sequence[Record]) -> None:
 
 
 def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, remarks: tuple[str, ...]) -> Driven:
-    fit: Fit = selected.fit
+    fit, n = selected.fit, selected.fit.poles.size
     channels, n_inputs = records[0].output_channels, records[0].n_inputs
     derivative = time_derivatives(channels)[:, None]
-    n = fit.poles.size
-    seen = fit.amplitudes / fit.poles**derivative
-    shapes = normalised_shapes(seen)
-    largest = np.abs(seen).argmax(axis=0)
-    each = np.arange(n)
-    # y = Re Σ a z and H = Σ a l / 2 (s - λ) + conjugate: the participation factors take up the scale of the shape.
-    scale = 0.5 * seen[largest, each] / shapes[largest, each]
-    participation = fit.participation * scale[:, None]
-
+    shapes, participation = scaled_vectors(fit, np.arange(n), derivative)
     noise_ratio, beside = data.noise_ratios(fit)
-    vectors = vector_covariance(fit, noise_ratio, derivative, each, shapes[largest, each], n_inputs)
+    vectors = vector_covariance(fit, noise_ratio, derivative, np.arange(n), shapes, n_inputs)
     direct = np.zeros((len(channels), n_inputs))
     direct_std = np.zeros_like(direct)
     if data.feedthrough:
         direct = fit.coefficients[2 * n : 2 * n + n_inputs].T
         direct_std = fixed_std(fit, noise_ratio, beside)[:n_inputs].T
     return Driven(
-        modes=SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, records[0].positions),
+        modes=SampledModes.of_poles(fit.poles, shapes, records[0].positions),
         covariance=frozen(pole_covariance(fit, noise_ratio)),
         vector_covariance=frozen(vectors),
         participation=frozen(participation[:, :n_inputs], complex),

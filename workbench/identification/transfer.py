@@ -15,16 +15,11 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
-from workbench.identification.input_output.modal_fit import Fit, projected, settled
+from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
-from workbench.identification.input_output.peak_shape import PEAKS, one_for_two, overlap_remarks, parts_of, peaks
+from workbench.identification.input_output.peak_shape import PEAKS, one_uneven_for_two, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
-from workbench.identification.signal.modal_estimates import (
-    SURE,
-    ParticipatingModes,
-    normalised_shapes,
-    time_derivatives,
-)
+from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
@@ -210,7 +205,7 @@ def _modes_of(
 ) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
     fit, parts_hz = _clustered(lines, selected, channels)
-    fit, kept = one_for_two(lines, fit, budget)
+    fit, kept = one_uneven_for_two(lines, fit, budget)
     parts_hz = [parts_hz[r] for r in kept]
     found = peaks(lines, fit)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
@@ -222,22 +217,16 @@ def _modes_of(
     within &= (damped_hz >= edges_hz[0]) & (damped_hz < edges_hz[1])
     inside = np.flatnonzero(within & sure)
     out = ", ".join(f"{f:.4g}" for f in damped_hz[within & ~sure])
-    n = inside.size
-    derivative = time_derivatives(channels)[:, None]
-    poles, participation = fit.poles[inside], fit.participation[inside]
-    seen = fit.amplitudes[:, inside] / poles**derivative
-    largest, each = np.abs(seen).argmax(axis=0), np.arange(n)
-
+    derivative, poles = time_derivatives(channels)[:, None], fit.poles[inside]
+    shapes, participation = scaled_vectors(fit, inside, derivative)
+    vectors = vector_covariance(fit, noise_ratio, derivative, inside, shapes, participation.shape[1])
     both = np.r_[inside, fit.poles.size + inside]
-    shapes = normalised_shapes(seen) if n else seen
     at = np.searchsorted(lines.omega, 2.0 * np.pi * shown_hz[0])
     return TransferModes(
-        modes=SampledModes(np.abs(poles), -poles.real / np.abs(poles), shapes, _places(channels)),
+        modes=SampledModes.of_poles(poles, shapes, _places(channels)),
         covariance=frozen(covariance[np.ix_(both, both)]),
-        vector_covariance=frozen(
-            vector_covariance(fit, noise_ratio, derivative, inside, shapes[largest, each], participation.shape[1])
-        ),
-        participation=frozen(participation * (0.5 * seen[largest, each] / shapes[largest, each])[:, None], complex),
+        vector_covariance=frozen(vectors),
+        participation=frozen(participation, complex),
         misfit=frozen(lines.misfit(fit)),
         evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
@@ -269,7 +258,7 @@ def _clustered(lines: Lines, selected: Selected, channels: Sequence[Channel]) ->
     """The fit with one mode a cluster, and the frequencies of its other members, Hz."""
     fit = selected.fit
     shapes = fit.amplitudes / fit.poles ** time_derivatives(channels)[:, None]
-    seen = SampledModes(np.abs(fit.poles), -fit.poles.real / np.abs(fit.poles), shapes, _places(channels))
+    seen = SampledModes.of_poles(fit.poles, shapes, _places(channels))
     parts = parts_of(fit.poles, seen.phase_collinearity, selected.evidence)
     kept = np.setdiff1d(np.arange(fit.poles.size), [r for each in parts.values() for r in each])
     parts_hz = [tuple(sorted(fit.poles.imag[parts.get(int(r), [])] / (2.0 * np.pi))) for r in kept]

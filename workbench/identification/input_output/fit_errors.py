@@ -10,34 +10,32 @@ from dataclasses import replace
 
 import numpy as np
 
+from workbench.arrays import scaled_inverse
 from workbench.identification.input_output.modal_fit import Fit, Part, free_parameters, moves, normal
+from workbench.identification.signal.modal_estimates import by_poles
 
 Figures = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
     """Of the free unknowns; `noise_ratio` is κ, (n_outputs, n_modes)."""
-    h = normal(fit, fit.noise)[0]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
-    bound = np.linalg.pinv(h * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+    bound = scaled_inverse(normal(fit, fit.noise)[0])
     if np.all(noise_ratio == 1.0):
         return bound
+    each = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
     rescaled = tuple(
-        replace(part, coefficients=part.coefficients * _by_column(part, rows))
-        for part, rows in _by_part(fit, noise_ratio)
+        replace(part, coefficients=part.coefficients * _by_column(part, each[outputs]))
+        for part, outputs in fit.outputs()
     )
     return np.asarray(bound @ normal(replace(fit, parts=rescaled), fit.noise)[0] @ bound)
 
 
 def pole_covariance(fit: Fit, noise_ratio: np.ndarray | float = 1.0) -> np.ndarray:
-    """Of (ω, ζ), (2 n_modes, 2 n_modes): with λ = x + iy, dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
+    """Of (ω, ζ), (2 n_modes, 2 n_modes)."""
     n, q = fit.poles.size, fit.participation.shape[1] + 1
     free = free_parameters(fit)
     at = np.searchsorted(free, np.r_[q * np.arange(n), q * n + q * np.arange(n)])
-    x, y, omega = fit.poles.real, fit.poles.imag, np.abs(fit.poles)
-    jacobian = np.block(
-        [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
-    )
+    jacobian = by_poles(fit.poles)
     return np.asarray(jacobian @ covariance(fit, noise_ratio)[np.ix_(at, at)] @ jacobian.T)
 
 
@@ -52,21 +50,20 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
     n, p = fit.participation.shape
     free, size, at = free_parameters(fit), n * (p + 1), (fit.poles, fit.participation, fit.amplitudes)
     drift = np.concatenate([-np.einsum("ct,tkj->ckj", part.tilt, moves(fit, part)) for part in fit.parts], axis=2)
-    changes, output = [], 0
+    changes = []
     for column in _root(covariance(fit, noise_ratio)).T:
         whole = np.zeros(2 * size)
         whole[free] = column
         step = (whole[:size] + 1j * whole[size:]).reshape(n, p + 1)
         c = np.einsum("ckj,k->cj", drift, whole)
         changes.append((step[:, 0], step[:, 1:], (c[:n] - 1j * c[n : 2 * n]).T))
-    for part, rows in _by_part(fit, noise_ratio):
+    for part, outputs in fit.outputs():
         spread = _root(part.spread[: 2 * n, : 2 * n])
-        for level in np.sqrt(rows):
-            for column in (np.tile(level, 2)[:, None] * spread).T:
+        for output in range(outputs.start, outputs.stop):
+            for column in (np.tile(np.sqrt(noise_ratio[output]), 2)[:, None] * spread).T:
                 a = np.zeros_like(fit.amplitudes)
                 a[output] = fit.noise[output] * (column[:n] - 1j * column[n:])
                 changes.append((np.zeros_like(fit.poles), np.zeros_like(fit.participation), a))
-            output += 1
     found = []
     for change in changes:
         # Central differences of a figure along one direction of the error ellipsoid, at a thousandth of its length.
@@ -77,7 +74,7 @@ def errors(fit: Fit, figures: Figures, noise_ratio: np.ndarray) -> np.ndarray:
 
 
 def vector_covariance(
-    fit: Fit, noise_ratio: np.ndarray, derivative: np.ndarray, kept: np.ndarray, scale: np.ndarray, n_inputs: int
+    fit: Fit, noise_ratio: np.ndarray, derivative: np.ndarray, kept: np.ndarray, shapes: np.ndarray, n_inputs: int
 ) -> np.ndarray:
     """Of each mode's shape over its largest entry, real part, then of its participation factors, real and imaginary.
 
@@ -85,7 +82,7 @@ def vector_covariance(
         noise_ratio: κ, (n_outputs, n_modes).
         derivative: (n_outputs, 1) in time, of what each output measures.
         kept: (n_kept,) the modes that are reported.
-        scale: (n_kept,) their largest entries, as they are reported.
+        shapes: (n_outputs, n_kept) as they are reported, see `scaled_vectors`.
         n_inputs: how many excitations, the first ones, are inputs.
 
     Returns:
@@ -96,6 +93,7 @@ def vector_covariance(
         return np.zeros((0, k, k))
     largest = np.abs(fit.amplitudes[:, kept] / fit.poles[kept] ** derivative).argmax(axis=0)
     each = np.arange(kept.size)
+    scale = shapes[largest, each]
 
     def figures(poles: np.ndarray, participation: np.ndarray, amplitudes: np.ndarray) -> np.ndarray:
         seen = amplitudes[:, kept] / poles[kept] ** derivative
@@ -115,20 +113,12 @@ def fixed_std(fit: Fit, noise_ratio: np.ndarray, fixed: np.ndarray) -> np.ndarra
         noise_ratio: κ, (n_outputs, n_modes).
         fixed: κ of each fixed column and output, (n_fixed, n_outputs).
     """
-    bound, free, n, found, first = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, [], 0
-    for part in fit.parts:
-        outputs = slice(first, first + part.residual.shape[1])
-        first = outputs.stop
+    bound, free, n, found = covariance(fit, noise_ratio), free_parameters(fit), 2 * fit.poles.size, []
+    for part, outputs in fit.outputs():
         drift = np.einsum("ct,tkj->ckj", part.tilt[n:], moves(fit, part)[:, free])
         own = np.diag(part.spread)[n:, None] * fit.noise[outputs] ** 2 * fixed[:, outputs]
         found.append(np.sqrt(own + np.einsum("ckj,kl,clj->cj", drift, bound, drift)))
     return np.hstack(found)
-
-
-def _by_part(fit: Fit, noise_ratio: np.ndarray | float) -> list[tuple[Part, np.ndarray]]:
-    edges = np.cumsum([part.residual.shape[1] for part in fit.parts])[:-1]
-    each = np.broadcast_to(noise_ratio, (fit.noise.size, fit.poles.size))
-    return list(zip(fit.parts, np.split(each, edges), strict=True))
 
 
 def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:

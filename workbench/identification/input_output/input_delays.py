@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from workbench.identification.input_output.fit_errors import fixed_std
 from workbench.identification.input_output.known_inputs import KnownInputs, sources
 from workbench.identification.input_output.modal_fit import Fit
-from workbench.identification.input_output.model_order import evidence_of
+from workbench.identification.input_output.model_order import evidence_of_each
 from workbench.identification.signal.searches import FALSE_ALARM
 from workbench.records.record import Record
 
@@ -112,12 +112,12 @@ def fractions(data: KnownInputs, fit: Fit, derivative: np.ndarray) -> np.ndarray
         fit: to it.
         derivative: (n_outputs, 1) of displacement, that each output measures.
     """
-    n, q = fit.poles.size, data.n_inputs
+    q = data.n_inputs
     columns, noise = _columns(data, fit)
     seen = fit.amplitudes / fit.poles**derivative
     turn = np.exp(-0.5j * np.angle((seen**2).sum(axis=0)))
     phase = np.angle(1j * fit.participation[:, :q] / turn[:, None])
-    evidence = np.array([evidence_of(fit, r) for r in range(n)])
+    evidence = evidence_of_each(fit)
     size = np.abs(fit.participation[:, :q]) ** 2
     known = (evidence / (evidence + DELAYS.known))[:, None] * size / size.sum(axis=1, keepdims=True)
     cost = np.zeros((TRIED.size, q))

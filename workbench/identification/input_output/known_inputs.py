@@ -26,7 +26,7 @@ from scipy.signal import lfilter
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import covariance
-from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, moves
+from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, modal_coordinate, moves
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
 from workbench.identification.signal.projection import noise_along, noise_near, variances
 from workbench.identification.signal.searches import SELECTION
@@ -143,10 +143,8 @@ class KnownInputs:
 
     def noise(self, fit: Fit) -> np.ndarray:
         """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
-        level = (
-            np.array([np.sqrt((size**2).mean(axis=0)) for size in self.line_std]) if self.line_std is not None else 1.0
-        )
-        return np.asarray(np.sqrt(variances(*self._squares(fit))) * level)
+        levels = 1.0 if self.line_std is None else [np.sqrt((size**2).mean(axis=0)) for size in self.line_std]
+        return np.asarray(np.sqrt(variances(*self._squares(fit))) * levels)
 
     def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
         """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""
@@ -181,7 +179,8 @@ class KnownInputs:
         """κ, noise over its mean, about each mode, (n_outputs, n_modes), and along each fixed column, (n_fixed,
         n_outputs): records weighted by the energy of the mode in each."""
         std = np.sqrt(variances(*self._squares(fit)))
-        coordinates = [self._modal_coordinate(pole, l_r) for pole, l_r in zip(fit.poles, fit.participation)]
+        each = zip(fit.poles, fit.participation)
+        coordinates = [modal_coordinate(self.responses(pole), l_r) for pole, l_r in each]
         near, beside, energy, power = [], [], [], []
         for k, rows in enumerate(self.rows):
             left = self._samples(fit.residual[rows] / std[k])
@@ -194,10 +193,6 @@ class KnownInputs:
             energy.append(np.column_stack([squares @ (x[rows] ** 2 + y[rows] ** 2) for x, y in coordinates]))
             power.append((squares @ self.fixed[rows] ** 2).T)
         return np.average(near, axis=0, weights=energy), np.average(beside, axis=0, weights=np.array(power) + 1e-300)
-
-    def _modal_coordinate(self, pole: complex, l_r: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        real, imaginary = self.responses(pole)
-        return real @ l_r.real - imaginary @ l_r.imag, real @ l_r.imag + imaginary @ l_r.real
 
     def _squares(self, fit: Fit) -> tuple[np.ndarray, np.ndarray]:
         """Squares of the residual and their degrees of freedom."""
@@ -248,7 +243,7 @@ class KnownInputs:
 
     def modal_coordinate(self, pole: complex, l_r: np.ndarray) -> list[np.ndarray]:
         """z of a mode at the samples of each record, (n_samples,) complex each."""
-        z = np.column_stack(self._modal_coordinate(pole, l_r))
+        z = np.column_stack(modal_coordinate(self.responses(pole), l_r))
         return [self._samples(z[part]) @ np.array([1.0, 1j]) for part in self.rows]
 
     def rows_of(self, samples: Sequence[np.ndarray]) -> Floats:

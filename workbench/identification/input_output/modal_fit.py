@@ -11,12 +11,14 @@ the Gauss-Newton matrix H, and H^-1 in the noise of the outputs is the Cramér-R
 is held: the shape carries its scale.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
+from workbench.identification.signal.modal_estimates import normalised_shapes
 from workbench.identification.signal.searches import FIT, Budget, minimise
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -102,6 +104,13 @@ class Fit:
         squares = (left**2).sum(axis=0)
         return np.asarray(np.sqrt(np.maximum(squares, 1e-28 * squares.max() + 1e-300) / free))
 
+    def outputs(self) -> Iterator[tuple[Part, slice]]:
+        """The parts, and which outputs each holds."""
+        first = 0
+        for part in self.parts:
+            yield part, slice(first, first + part.residual.shape[1])
+            first += part.residual.shape[1]
+
 
 def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Fit:
     """The shapes that belong to given poles and participation, by least squares."""
@@ -113,18 +122,26 @@ def projected(data: Measurement, poles: np.ndarray, participation: np.ndarray) -
     return Fit(poles, participation, tuple(parts))
 
 
+def modal_coordinate(response: Pair, l_r: np.ndarray) -> Pair:
+    """Real and imaginary part of z_r, (n_rows,) each, from `Measurement.responses` and participation factors."""
+    real, imaginary = response
+    return real @ l_r.real - imaginary @ l_r.imag, real @ l_r.imag + imaginary @ l_r.real
+
+
 def columns(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> Pair:
     """Modal coordinates and fixed columns, Φ (n_rows, n_columns), and tangents T (n_rows, n_tangents), not weighted."""
     responses = [data.responses(pole) for pole in poles]
     slopes = [data.slopes(pole, l_r) for pole, l_r in zip(poles, participation)]
-    coordinates, tangents = [], []
-    for k in (0, 1):  # real parts, imaginary parts
-        whole = [a[0] @ l_r.real - a[1] @ l_r.imag for a, l_r in zip(responses, participation)]
-        turned = [a[0] @ l_r.imag + a[1] @ l_r.real for a, l_r in zip(responses, participation)]
-        coordinates += turned if k else whole
-        tangents += [np.column_stack([s[k], a[k]]) for s, a in zip(slopes, responses)]
-    phi = np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed
+    coordinates = [modal_coordinate(a, l_r) for a, l_r in zip(responses, participation)]
+    both = (0, 1)  # real parts, imaginary parts
+    phi = np.column_stack([*(z[k] for k in both for z in coordinates), data.fixed]) if coordinates else data.fixed
+    tangents = [np.column_stack([s[k], a[k]]) for k in both for s, a in zip(slopes, responses)]
     return phi, np.hstack(tangents) if tangents else np.zeros((data.values.shape[0], 0))
+
+
+def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
+    """χ² that one fit leaves beyond what another does, outputs in units of `noise`."""
+    return float((((fewer.residual**2).sum(axis=0) - (more.residual**2).sum(axis=0)) / noise**2).sum())
 
 
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
@@ -137,6 +154,21 @@ def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     residual = y - q @ qy
     inverse = solve_triangular(r, np.eye(r.shape[0])) / size[:, None]
     return Part(residual, inverse @ qy, rest.T @ rest, rest.T @ residual, inverse @ inverse.T, inverse @ qt)
+
+
+def scaled_vectors(fit: Fit, kept: np.ndarray, derivative: np.ndarray) -> Pair:
+    """Shapes of displacement, (n_outputs, n_kept), largest entry 1, and participation factors, (n_kept, n_excitations).
+
+    y = Re Σ a z and H = Σ a l / 2 (s - λ) + conjugate: the participation factors take up the scale of the shape.
+
+    Args:
+        kept: (n_kept,) the modes.
+        derivative: (n_outputs, 1) in time, of what each output measures.
+    """
+    seen = fit.amplitudes[:, kept] / fit.poles[kept] ** derivative
+    shapes = normalised_shapes(seen) if kept.size else seen
+    at = np.abs(seen).argmax(axis=0), np.arange(kept.size)
+    return shapes, fit.participation[kept] * (0.5 * seen[at] / shapes[at])[:, None]
 
 
 def free_parameters(fit: Fit) -> np.ndarray:
@@ -162,11 +194,10 @@ def moves(fit: Fit, part: Part) -> np.ndarray:
 def normal(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Gauss-Newton matrix and right-hand side of the free unknowns, outputs in units of their noise."""
     n, q = fit.poles.size, fit.participation.shape[1] + 1
-    size, first = n * q, 0
+    size = n * q
     h, g = np.zeros((2 * size, 2 * size)), np.zeros(2 * size)
-    for part in fit.parts:
-        w = 1.0 / noise[first : first + part.residual.shape[1]]
-        first += w.size
+    for part, outputs in fit.outputs():
+        w = 1.0 / noise[outputs]
         a = np.repeat(part.coefficients[:n] * w, q, axis=0)
         b = np.repeat(part.coefficients[n : 2 * n] * w, q, axis=0)
         aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
@@ -232,6 +263,11 @@ class _OutputError:
 
     def negligible(self, decrease: float, cost: float) -> bool:
         return decrease <= max(self.least * cost / self.data.values.size, FIT.round_off * self.signal)
+
+
+def only(data: Measurement, fit: Fit, kept: np.ndarray) -> Fit:
+    """Some of the modes of a fit, in this order, by index or by flag; their poles and participation as they are."""
+    return projected(data, fit.poles[kept], fit.participation[kept])
 
 
 def settled(

@@ -11,7 +11,9 @@ from workbench.identification.input_output.modal_fit import (
     Fit,
     Measurement,
     free_parameters,
+    modal_coordinate,
     moves,
+    only,
     projected,
     search,
     settled,
@@ -52,6 +54,10 @@ class Selected:
     limit: float
     full: bool
 
+    def refitted(self, fit: Fit) -> "Selected":
+        """The modes of another fit, with their evidence in it."""
+        return replace(self, fit=fit, evidence=evidence_of_each(fit))
+
 
 def select_modes(
     data: Measurement,
@@ -81,9 +87,8 @@ def select_modes(
             pass  # modes that cannot be distinguished: without a start
     fit = selection.select(fit)
     order = np.argsort(np.abs(fit.poles))
-    evidence = np.array([evidence_of(fit, r) for r in order])
-    ordered = projected(data, fit.poles[order], fit.participation[order])
-    return Selected(replace(ordered, converged=fit.converged, steps=fit.steps), evidence, problem.limit, selection.full)
+    ordered = replace(only(data, fit, order), converged=fit.converged, steps=fit.steps)
+    return Selected(ordered, evidence_of_each(fit)[order], problem.limit, selection.full)
 
 
 def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALSE_ALARM) -> Fit:
@@ -92,8 +97,7 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
     All residues are fitted at once, of any rank, and the pole that explains least is left out until none explains as
     little as noise would.
     """
-    inside = (poles.imag > 0) & (poles.imag < data.highest) & (-poles.real < SELECTION.most_damped * np.abs(poles))
-    poles = poles[inside & (poles.real < data.resolution / (2.0 * np.pi))]
+    poles = poles[_can_ring(data, poles) & (poles.real < data.resolution / (2.0 * np.pi))]
     size = 2 * data.responses((-0.1 + 0.5j) * data.highest)[0].shape[1]
     x = np.hstack([*(np.hstack(data.responses(pole)) for pole in poles), data.fixed])
     scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
@@ -126,10 +130,9 @@ def fit_of_poles(data: Measurement, poles: np.ndarray, false_alarm: float = FALS
             spreads[k] = (spread - spread[:, out] @ taken[:, : len(scale)])[np.ix_(rest, rest)]
             coefficients[k] = (coefficients[k] - spread[:, out] @ taken[:, len(scale) :])[rest]
         poles, scale = np.delete(poles, weakest), scale[rest]
-    residues = (np.hstack(coefficients) / scale[:, None])[: poles.size * size].reshape(
-        poles.size, size, data.values.shape[1]
-    )
-    norms = scale[: poles.size * size].reshape(poles.size, size)
+    of_poles = slice(poles.size * size)
+    residues = (np.hstack(coefficients) / scale[:, None])[of_poles].reshape(poles.size, size, data.values.shape[1])
+    norms = scale[of_poles].reshape(poles.size, size)
     participation = [_of_rank_one(each, norm) for each, norm in zip(residues, norms, strict=True)]
     return projected(data, poles, np.array(participation, complex).reshape(poles.size, size // 2))
 
@@ -205,8 +208,7 @@ class _Modes:
                 break
             out = weak[np.argsort(evidence[weak])[: (weak.size + 1) // 2]]
             rest = np.delete(np.arange(model.poles.size), out)
-            fewer = projected(self.data, model.poles[rest], model.participation[rest])
-            model = settled(self.data, fewer, SELECTION.few_steps, self.budget, ORDER.decided)
+            model = settled(self.data, only(self.data, model, rest), SELECTION.few_steps, self.budget, ORDER.decided)
         return model if model is whole else self.settled(model)
 
     def suspects(self, model: Fit) -> Iterator[tuple[complex, Fit, bool]]:
@@ -217,13 +219,9 @@ class _Modes:
             threshold = self.threshold(model, pole)
             doubtful = near and whole_evidence[r] < ORDER.distinct * threshold
             if spurious[r] or doubtful or evidence_of(model, r) < SELECTION.weak * threshold:
-                rest = np.delete(np.arange(model.poles.size), r)
-                without = projected(self.data, model.poles[rest], model.participation[rest])
-                yield (
-                    complex(pole),
-                    settled(self.data, without, SELECTION.few_steps, self.budget, ORDER.decided),
-                    bool(spurious[r]),
-                )
+                without = only(self.data, model, np.delete(np.arange(model.poles.size), r))
+                without = settled(self.data, without, SELECTION.few_steps, self.budget, ORDER.decided)
+                yield complex(pole), without, bool(spurious[r])
 
     def _near(self, pole: complex, rejected: list[tuple[complex, float]]) -> bool:
         return any(abs(pole.imag - o.imag) < max(self.data.resolution, 0.5 * abs(o.real)) for o, _ in rejected)
@@ -234,9 +232,12 @@ def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
     width = np.maximum(np.abs(fit.poles.real), 0.5 * data.resolution)
     beside = [fit.poles + 1j * k * width for k in (-4.0, -2.0, -1.0, 1.0, 2.0, 4.0)]
     tries = np.concatenate([data.candidates(fit.residual / fit.noise), *beside])
-    return np.asarray(
-        tries[(tries.imag > 0) & (tries.imag < data.highest) & (-tries.real < SELECTION.most_damped * np.abs(tries))]
-    )
+    return np.asarray(tries[_can_ring(data, tries)])
+
+
+def _can_ring(data: Measurement, poles: np.ndarray) -> np.ndarray:
+    """Which poles are of a frequency that the measurement holds, and not damped too much to ring."""
+    return (poles.imag > 0) & (poles.imag < data.highest) & (-poles.real < SELECTION.most_damped * np.abs(poles))
 
 
 def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
@@ -274,10 +275,8 @@ def weights_of(data: Measurement) -> list[np.ndarray]:
 
 def basis_of(data: Measurement, fit: Fit, weights: np.ndarray | float = 1.0) -> np.ndarray:
     """Orthonormal basis (n_rows, n_columns) of the modal coordinates of a fit and the fixed columns, weighted."""
-    coordinates = []
-    for pole, l_r in zip(fit.poles, fit.participation):
-        real, imaginary = data.responses(pole)
-        coordinates += [real @ l_r.real - imaginary @ l_r.imag, real @ l_r.imag + imaginary @ l_r.real]
+    each = zip(fit.poles, fit.participation)
+    coordinates = [part for pole, l_r in each for part in modal_coordinate(data.responses(pole), l_r)]
     phi = weights * (np.column_stack([*coordinates, data.fixed]) if coordinates else data.fixed)
     return np.linalg.qr(phi / np.maximum(np.linalg.norm(phi, axis=0), 1e-300))[0]
 
@@ -286,7 +285,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     """Which are damped too much to ring, or split another mode that has their shape, participation and band."""
     poles = fit.poles
     shapes = fit.amplitudes / fit.noise[:, None]
-    strength = np.array([evidence_of(fit, r) for r in range(poles.size)])
+    strength = evidence_of_each(fit)
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + data.resolution
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
@@ -298,12 +297,15 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
 def evidence_of(fit: Fit, r: int) -> float:
     """χ² of a mode's shape in the noise, poles and participation held."""
     both, noise, found = [r, fit.poles.size + r], fit.noise, 0.0
-    first = 0
-    for part in fit.parts:
-        c = part.coefficients[both] / noise[first : first + part.residual.shape[1]]
-        first += c.shape[1]
+    for part, outputs in fit.outputs():
+        c = part.coefficients[both] / noise[outputs]
         found += float((c * np.linalg.solve(part.spread[np.ix_(both, both)], c)).sum())
     return found
+
+
+def evidence_of_each(fit: Fit) -> np.ndarray:
+    """`evidence_of` each mode, (n_modes,)."""
+    return np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
 
 
 def whole_evidence_of(fit: Fit) -> np.ndarray:
@@ -320,12 +322,10 @@ def whole_evidence_of(fit: Fit) -> np.ndarray:
         size = 2 * drifts.shape[1]
         spread = drifts.reshape(size, -1) @ bound @ drifts.reshape(size, -1).T
         spread = spread.reshape(2, size // 2, 2, size // 2)
-        first = 0
-        for part in fit.parts:
+        for part, outputs in fit.outputs():
             own = part.spread[np.ix_(both, both)]
-            for j in range(first, first + part.residual.shape[1]):
+            for j in range(outputs.start, outputs.stop):
                 spread[:, j, :, j] += own * fit.noise[j] ** 2
-            first += part.residual.shape[1]
         c = amplitudes[:, r].ravel()
         spread = spread.reshape(size, size)
         scale = 1.0 / np.sqrt(np.maximum(np.diag(spread), 1e-300))

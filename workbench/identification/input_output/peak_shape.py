@@ -21,10 +21,9 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Floats
-from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
-from workbench.identification.input_output.model_order import evidence_of
+from workbench.identification.input_output.modal_fit import Fit, columns
 from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.input_output.time_variance import CHANGING, pairs_alike
+from workbench.identification.input_output.time_variance import one_for_two
 from workbench.identification.signal.searches import Budget
 
 
@@ -93,32 +92,23 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
         value = found[both]
         evidence[r] = value @ np.linalg.pinv(covariance[np.ix_(both, both)], hermitian=True) @ value
         scatter[r] = np.sqrt(np.hypot(*value) / size[r])
-        uneven[r] = evidence[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2) and scatter[r] > PEAKS.matters * abs(
-            pole.real
-        )
+        sure = evidence[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2)
+        uneven[r] = sure and scatter[r] > PEAKS.matters * abs(pole.real)
     return Peaks(uneven, scatter, evidence)
 
 
-def one_for_two(lines: Lines, fit: Fit, budget: Budget) -> tuple[Fit, np.ndarray]:
+def one_uneven_for_two(lines: Lines, fit: Fit, budget: Budget) -> tuple[Fit, np.ndarray]:
     """The fit with one mode for two that are alike, where the further term of the one explains the other.
 
     Returns:
         The fit, and which modes of the first are left in it.
     """
-    kept = np.arange(fit.poles.size)
-    for r, s in pairs_alike(fit):
-        if budget.spent("check of modes that change"):
-            break
-        evidence = [evidence_of(fit, r), evidence_of(fit, s)]
-        strong, weak = (r, s) if evidence[0] > evidence[1] else (s, r)
-        left = np.delete(kept, weak)
-        one = settled(lines, projected(lines, fit.poles[left], fit.participation[left]), budget=budget)
-        found, at = peaks(lines, one), int(np.searchsorted(left, strong))
-        worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / one.noise**2).sum())
-        if found.uneven[at] and found.evidence[at] > CHANGING.instead * worth:
-            fewer, which = one_for_two(lines, one, budget)
-            return fewer, left[which]
-    return fit, kept
+
+    def evidence(one: Fit, at: int) -> float:
+        found = peaks(lines, one)
+        return float(found.evidence[at]) if found.uneven[at] else -np.inf
+
+    return one_for_two(lines, fit, budget, evidence, "check of modes that change")
 
 
 def _third(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,16 +12,17 @@ z' = (λ + α t + κ |z|²) z + l u, its motion is the series of Volterra in α 
 the modes are searched beside these columns up to the third order.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
 
-from workbench.arrays import Floats
+from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, columns, projected, settled
-from workbench.identification.input_output.model_order import evidence_of
+from workbench.identification.input_output.modal_fit import Fit, Measurement, added_misfit, columns, only, settled
+from workbench.identification.input_output.model_order import evidence_of, evidence_of_each
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
 
@@ -75,8 +76,7 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
         moved = (moved - q @ (q.T @ moved)) / noise
         products += moved.T @ moved
         along += moved.T @ (left / noise)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(products), 1e-300))
-    inverse = np.linalg.pinv(products * np.outer(scale, scale), hermitian=True) * np.outer(scale, scale)
+    inverse = scaled_inverse(products)
     change, deviation = inverse @ along, np.sqrt(np.diag(inverse))
     omega, span = np.abs(poles), 2.0 * np.pi / data.resolution
     moving, error = np.abs(change[n:]), deviation[n:]
@@ -88,26 +88,39 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     return Change(change[n:] / omega, error / omega, sure)
 
 
-def joined(data: KnownInputs, fit: Fit, budget: Budget, change: Change | None = None) -> tuple[Fit, Change | None]:
-    """The fit with one mode for two that are alike, where a change of the one within the record explains the other.
+def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
+    """The fit with one mode for two that are alike, where a change of the one within the record explains the other."""
 
-    With it the change of its modes, where that is known.
+    def evidence(one: Fit, at: int) -> float:
+        change = changes_in_time(data, one)
+        return float((change.frequency[at] / change.deviation[at]) ** 2) if change.sure[at] else -np.inf
+
+    return one_for_two(data, fit, budget, evidence, "check of modes that change within the record")[0]
+
+
+def one_for_two(
+    data: Measurement, fit: Fit, budget: Budget, change: Callable[[Fit, int], float], check: str
+) -> tuple[Fit, np.ndarray]:
+    """The fit with one mode for two that are alike, where a change of the one explains what the other does.
 
     Args:
-        change: of the modes of the fit, where it is known.
+        change: χ² of the change of a mode of a fit, by its index; -inf where it does not count.
+        check: what this check is called where the time is up.
+
+    Returns:
+        The fit, and which modes of the first are left in it.
     """
-    for r, s in pairs_alike(fit):
-        if budget.spent("check of modes that change within the record"):
+    kept = np.arange(fit.poles.size)
+    for pair in _pairs_alike(fit):
+        if budget.spent(check):
             break
-        evidence = [evidence_of(fit, r), evidence_of(fit, s)]
-        strong, weak = (r, s) if evidence[0] > evidence[1] else (s, r)
-        kept = np.delete(np.arange(fit.poles.size), weak)
-        one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), budget=budget)
-        of_one, at = changes_in_time(data, one), int(np.searchsorted(kept, strong))
-        worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / one.noise**2).sum())
-        if of_one.sure[at] and (of_one.frequency[at] / of_one.deviation[at]) ** 2 > CHANGING.instead * worth:
-            return joined(data, one, budget, of_one)
-    return fit, change
+        weak, strong = sorted(pair, key=lambda r: evidence_of(fit, r))
+        left = np.delete(kept, weak)
+        one = settled(data, only(data, fit, left), budget=budget)
+        if change(one, int(np.searchsorted(left, strong))) > CHANGING.instead * added_misfit(one, fit, one.noise):
+            fewer, which = one_for_two(data, one, budget, change, check)
+            return fewer, left[which]
+    return fit, kept
 
 
 def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit] | None:
@@ -116,7 +129,7 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
     A change that is not small makes many modes beside one. Where they go, and the one is found to change, its motion
     follows the change with time or amplitude. None where no mode is so.
     """
-    strength = np.array([evidence_of(fit, r) for r in range(fit.poles.size)])
+    strength = evidence_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
     beside: list[Floats] = []
@@ -129,10 +142,10 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
         if out[r] or not others.size or budget.spent("check of modes that change within the record"):
             continue
         kept = np.delete(np.arange(fit.poles.size), others)
-        one = settled(data, projected(data, fit.poles[kept], fit.participation[kept]), SELECTION.few_steps, budget)
+        one = settled(data, only(data, fit, kept), SELECTION.few_steps, budget)
         at = int(np.searchsorted(kept, r))
         moved = _motion(data, one.poles[at], one.participation[at])
-        worth = float((((one.residual**2).sum(axis=0) - (fit.residual**2).sum(axis=0)) / fit.noise**2).sum())
+        worth = added_misfit(one, fit, fit.noise)
         phi = columns(data, one.poles, one.participation)[0]
         if _explained(data, one, phi, moved, fit.noise) > CHANGING.instead * worth:
             beside.append(moved)
@@ -140,9 +153,8 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
             out[others] = True
     if not beside:
         return None
-    kept = np.flatnonzero(~out)
     data = data.with_columns(_independent(np.hstack(beside)), tuple(changing))
-    return data, projected(data, fit.poles[kept], fit.participation[kept])
+    return data, only(data, fit, ~out)
 
 
 def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:
@@ -199,7 +211,7 @@ def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise:
     return found
 
 
-def pairs_alike(fit: Fit) -> list[tuple[int, int]]:
+def _pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     """Modes near each other with shapes alike, the nearest first."""
     poles, alike = fit.poles, mac(fit.amplitudes, fit.amplitudes) > CHANGING.alike
     apart = np.abs(np.subtract.outer(poles.imag, poles.imag))
@@ -208,17 +220,11 @@ def pairs_alike(fit: Fit) -> list[tuple[int, int]]:
     return sorted(((int(r), int(s)) for r, s in both), key=lambda pair: apart[pair])
 
 
-def change_remarks(
-    data: KnownInputs, fit: Fit, change: Change | None, changing: tuple[complex, ...] = ()
-) -> tuple[str, ...]:
-    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way.
-
-    Args:
-        change: of the modes of the fit; None where it is not known yet.
-    """
+def change_remarks(data: KnownInputs, fit: Fit, changing: tuple[complex, ...] = ()) -> tuple[str, ...]:
+    """A remark on the modes that change within a record: evenly with time, or, near the poles named, in another way."""
     if not fit.poles.size:
         return ()
-    change = changes_in_time(data, fit) if change is None else change
+    change = changes_in_time(data, fit)
     names = [f"mode {r + 1} ({np.abs(pole) / (2.0 * np.pi):.4g} Hz)" for r, pole in enumerate(fit.poles)]
     sure = change.sure & (np.abs(change.frequency) < CHANGING.reach)
     words = [f"{names[r]} by about {100 * change.frequency[r]:+.1g} %" for r in np.flatnonzero(sure)]
