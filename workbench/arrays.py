@@ -1,4 +1,4 @@
-"""The types of arrays in annotations, np.ndarray where numbers may be real or complex; the root of a matrix."""
+"""The types of arrays in annotations, np.ndarray where numbers may be real or complex; root and inverse of a matrix."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,3 +13,14 @@ def symmetric_root(matrix: np.ndarray) -> Floats:
     """R with R Rᵀ = matrix, a covariance say, which rounding or close modes may have made singular."""
     values, vectors = np.linalg.eigh(matrix)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+def scaled_inverse(matrix: np.ndarray, rcond: float = 1e-15) -> Floats:
+    """Pseudo-inverse of normal equations, a symmetric matrix, each unknown in units of its own diagonal entry's root.
+
+    Args:
+        rcond: singular values of the scaled matrix below this share of the largest count as zero.
+    """
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    units = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(matrix * units, rcond=rcond, hermitian=True) * units)

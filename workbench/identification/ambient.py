@@ -14,7 +14,12 @@ import numpy as np
 from scipy.stats import chi2
 
 from workbench.identification.output_only.subspace import StablePole, Subspace
-from workbench.identification.signal.modal_estimates import ModalEstimates, normalised_shapes, time_derivatives
+from workbench.identification.signal.modal_estimates import (
+    ModalEstimates,
+    by_poles,
+    normalised_shapes,
+    time_derivatives,
+)
 from workbench.identification.signal.projection import project
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel, Record
@@ -145,13 +150,11 @@ def _report(
     record: Record, found: Sequence[StablePole], limit: float, decays: tuple[Record, ...], budget: Budget
 ) -> AmbientModes:
     poles = np.array([mode.pole for mode in found])
-    omega, n = np.abs(poles), poles.size
-    modes = SampledModes(omega, -poles.real / omega, _shapes(decays, poles), record.positions)
+    n = poles.size
+    modes = SampledModes.of_poles(poles, _shapes(decays, poles), record.positions)
     covariance = np.zeros((2 * n, 2 * n))
     for r, mode in enumerate(found):
-        # λ = x + iy: dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³
-        x, y, w = mode.pole.real, mode.pole.imag, omega[r]
-        jacobian = np.array([[x / w, y / w], [-(y**2) / w**3, x * y / w**3]])
+        jacobian = by_poles(poles[[r]])
         covariance[np.ix_([r, n + r], [r, n + r])] = jacobian @ mode.variance @ jacobian.T
     evidence = np.array([mode.evidence for mode in found])
     return AmbientModes(modes, frozen(covariance), frozen(evidence), limit, decays, budget.remarks)

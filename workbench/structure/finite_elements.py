@@ -16,13 +16,15 @@ from workbench.structure.damping import Damping, ModalDamping, ViscousDamping
 from workbench.structure.domain import ROTATIONS, Between, NamedPoints, Where
 from workbench.structure.modes import Modes
 from workbench.structure.printed import Printed, counted
-from workbench.structure.supports import Attachment, PointMass, PointSpring
+from workbench.structure.supports import Attachment, PointDamper, PointMass, PointSpring
 
 SYMMETRIC = 1e-9  # of the largest entry: more is no rounding of the program that wrote the matrix
 SINGULAR = 1e-12  # smallest pivot of K over the largest: below it the structure can move as a rigid body
 MASSLESS = 1e-12  # of the largest ν = 1 / (ω² - σ): below it a motion has no mass
 SHIFT = 1e-11  # of the highest ω², by which K is shifted where it is singular
 ROUNDING = 64.0 * np.finfo(float).eps  # of φᵀ |K| φ: a smaller ω² cannot be distinguished from zero
+
+MATRICES = {PointMass: "mass", PointSpring: "stiffness", PointDamper: "damping"}  # that an attachment adds to
 
 Matrix: TypeAlias = sparray | spmatrix | np.ndarray
 
@@ -156,17 +158,13 @@ class FiniteElements(Printed):
         n = len(self.nodes.names)
         added: dict[str, list[tuple[np.ndarray, float]]] = {"mass": [], "stiffness": [], "damping": []}
         for part in parts:
+            kind, places = MATRICES[type(part)], [part.at]
             if isinstance(part, PointMass):
                 if isinstance(part.at, Between):
                     raise ValueError(f"{part}: a mass stands at one point; give it at each of the two")
-                added["mass"] += [(self._row(name), part.mass) for name in self.nodes.translations(str(part.at))]
-                turning, kind = part.rotary_inertia, "mass"
-            elif isinstance(part, PointSpring):
-                added["stiffness"].append((self._row(part.at), part.stiffness))
-                turning, kind = part.rotational_stiffness, "stiffness"
-            else:
-                added["damping"].append((self._row(part.at), part.coefficient))
-                turning, kind = part.rotational_coefficient, "damping"
+                places = [*self.nodes.translations(str(part.at))]
+            linear, turning = part.pair
+            added[kind] += [(self._row(at), linear) for at in places]
             if turning:
                 added[kind].append((self._rotation(part), turning))
         damping: Any = self.damping

@@ -190,13 +190,12 @@ class _Member(Printed):
                 elif spring:
                     springs.append((spring, segments.evaluation(at, derivative)))
         for part in self.attachments:
-            if isinstance(part, PointMass):
-                for derivative, value in enumerate((part.mass, part.rotary_inertia)):
-                    row = self._seen_at(segments, position(part.at), derivative)
+            for derivative, value in enumerate(part.pair):
+                row = self._seen_at(segments, position(part.at), derivative)
+                if isinstance(part, PointMass):
                     mass += value * row.T @ row
-            elif isinstance(part, PointSpring):
-                for derivative, value in enumerate((part.stiffness, part.rotational_stiffness)):
-                    springs.append((value, self._seen_at(segments, position(part.at), derivative)))
+                elif isinstance(part, PointSpring):
+                    springs.append((value, row))
         for spring, row in springs:
             rigidity += spring * row.T @ row
         free = np.setdiff1d(np.arange(segments.n_functions), held)
@@ -207,9 +206,8 @@ class _Member(Printed):
         # relative to them and not to the highest frequency the basis can carry. σ keeps K + σ M definite where the
         # ends leave rigid-body modes.
         middle = np.linspace(0.05, 0.95, 19) * self.length
-        shift = (
-            np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle)) * (np.pi / self.length) ** (2 * order)
-        )
+        typical = np.mean(stiffness(middle)) / np.mean(self.mass_per_length(middle))
+        shift = typical * (np.pi / self.length) ** (2 * order)
         try:
             _, vectors = eigh(mass, rigidity + shift * mass, subset_by_index=[free.size - n_modes, free.size - 1])
         except LinAlgError as error:
@@ -255,7 +253,7 @@ class _Member(Printed):
             matrix = self.damping.matrix(omega)
         for part in self.attachments:
             if isinstance(part, PointDamper):
-                for derivative, value in enumerate((part.coefficient, part.rotational_coefficient)):
+                for derivative, value in enumerate(part.pair):
                     if value:
                         row = self._seen_at(segments, position(part.at), derivative) @ coefficients
                         matrix = matrix + value * row.T @ row

@@ -308,6 +308,11 @@ class SampledModes(Printed):
     shapes: Complexes
     positions: np.ndarray
 
+    @classmethod
+    def of_poles(cls, poles: Complexes, shapes: np.ndarray, positions: np.ndarray) -> "SampledModes":
+        """Modes of poles λ (n_modes,), rad/s, by rising |λ|: ω = |λ| and ζ = -Re λ / |λ|."""
+        return cls(np.abs(poles), -poles.real / np.abs(poles), shapes, positions)
+
     def __post_init__(self) -> None:
         freeze(self, "omega", "zeta")
         freeze(self, "shapes", dtype=complex)

@@ -42,19 +42,12 @@ def attach(
             extra_damping.append(part)
             continue
         target = mass if isinstance(part, PointMass) else stiffness
-        pair = (
-            (part.mass, part.rotary_inertia)
-            if isinstance(part, PointMass)
-            else (part.stiffness, part.rotational_stiffness)
-        )
-        for derivative, value in enumerate(pair):
+        for derivative, value in enumerate(part.pair):
             if value:
                 shapes = _moved(modes, part, derivative)
                 target += value * shapes.T @ shapes
     if any(isinstance(part, PointMass | PointSpring) for part in attachments):
-        eigenvalues, vectors = _eigen(stiffness, mass)
-        vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
-        omega = np.sqrt(np.maximum(eigenvalues, 0.0))
+        omega, vectors = _eigen(stiffness, mass)
         if modes.proportional:
             # a rigid mode has no ratio: what damps it stays as it is
             damping = np.diag(np.where(modes.omega > 0, 2.0 * modes.zeta * omega, np.diag(modes.damping)))
@@ -63,18 +56,11 @@ def attach(
     else:
         omega, vectors, damping = modes.omega, np.eye(n), modes.damping
     for part in extra_damping:
-        for derivative, value in enumerate((part.coefficient, part.rotational_coefficient)):
+        for derivative, value in enumerate(part.pair):
             if value:
                 shape = _moved(modes, part, derivative) @ vectors
                 damping = damping + value * shape.T @ shape
-    unchanged = modes.shapes
-    return Modes(
-        omega=omega,
-        damping=damping,
-        shapes=lambda located, derivative: unchanged(located, derivative) @ vectors,
-        domain=modes.domain,
-        essential=modes.essential,
-    )
+    return _combined(modes, vectors, omega, damping)
 
 
 def truncation_error(modes: Modes, attachments: tuple[Attachment, ...]) -> np.ndarray:
@@ -122,14 +108,7 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
     basis = np.zeros((modes.n_modes, alone + len(places)))
     basis[:own, :own] = np.eye(own)
     basis[own:, own:alone] = rest.T
-    full = modes.shapes
-    reduced = Modes(
-        omega=np.zeros(basis.shape[1]),
-        damping=np.zeros(basis.shape[1]),
-        shapes=lambda located, derivative: full(located, derivative) @ basis,
-        domain=modes.domain,
-        essential=modes.essential,
-    )
+    reduced = _combined(modes, basis, *np.zeros((2, basis.shape[1])))
     mass, stiffness = basis.T @ basis, basis.T @ (modes.omega[:, None] ** 2 * basis)
     stiffness[alone:, alone:] = np.eye(len(places))  # of unit energy, as the others
     mass[alone:, alone:] = np.eye(len(places)) / modes.omega[-1] ** 2
@@ -138,20 +117,10 @@ def _with_residual(modes: Modes, attachments: tuple[Attachment, ...], kept: int,
         if places:
             shapes = shapes.copy()
             shapes[:, alone + places.index(part.at)] = np.sqrt(residual)
-        value = part.mass if isinstance(part, PointMass) else part.stiffness
         target = mass if isinstance(part, PointMass) else stiffness
-        target += value * shapes.T @ shapes
-    eigenvalues, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
-    vectors = vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)
-    omega = np.sqrt(np.maximum(eigenvalues, 0.0))
-    through = basis @ vectors
-    changed = Modes(
-        omega=omega,
-        damping=modes.zeta[:kept],
-        shapes=lambda located, derivative: full(located, derivative) @ through,
-        domain=modes.domain,
-        essential=modes.essential,
-    )
+        target += part.pair[0] * shapes.T @ shapes
+    omega, vectors = _eigen(stiffness, mass, subset_by_index=[0, kept - 1])
+    changed = _combined(modes, basis @ vectors, omega, modes.zeta[:kept])
     return attach(changed, tuple(part for part in attachments if isinstance(part, PointDamper)))
 
 
@@ -164,11 +133,24 @@ def _moved(modes: Modes, part: Attachment, derivative: int) -> np.ndarray:
     return modes.phi_at(part.at, derivative)[None, :]
 
 
+def _combined(modes: Modes, vectors: np.ndarray, omega: np.ndarray, damping: np.ndarray) -> Modes:
+    """Modes whose shapes are the columns of `vectors` (n_modes, n_combined) in those at hand."""
+    shapes = modes.shapes
+    return Modes(
+        omega=omega,
+        damping=damping,
+        shapes=lambda located, derivative: shapes(located, derivative) @ vectors,
+        domain=modes.domain,
+        essential=modes.essential,
+    )
+
+
 def _eigen(stiffness: np.ndarray, mass: np.ndarray, **which: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies, rad/s, and vectors of K v = ω² M v, each with its own mode positive."""
     try:
         eigenvalues, vectors = eigh(stiffness, mass, **which)
     except LinAlgError as error:
         raise ValueError("more mass is taken away than there is: a negative one is too large") from error
     if eigenvalues[0] < -ROUNDING * eigenvalues[-1]:
         raise ValueError("the structure is unstable with these springs: one of negative stiffness is too strong")
-    return eigenvalues, vectors
+    return np.sqrt(np.maximum(eigenvalues, 0.0)), vectors * np.where(np.diag(vectors) < 0, -1.0, 1.0)

@@ -107,6 +107,12 @@ class _Attached(AtPlace):
             if name != "at" and not np.isfinite(value):
                 raise ValueError(f"the {name.replace('_', ' ')} of a {type(self).__name__} must be finite; got {value}")
 
+    @property
+    def pair(self) -> tuple[float, float]:
+        """The figure that counts for displacement, and the one that counts for rotation."""
+        _, linear, angular = vars(self).values()
+        return linear, angular
+
 
 @dataclass(frozen=True)
 class PointMass(_Attached):

@@ -32,6 +32,7 @@ MOST_FUNCTIONS = 3000  # of the eigenvalue problem: so many take ten seconds
 MOST_STATIC = 5000  # of a static response: a Cholesky factor only
 RIGID = 1e-12  # of the scale of ω²: below it a mode moves as a rigid body
 REPEATED = 1e-9  # relative difference of ω² below which modes count as repeated
+UNSTABLE = "the tension compresses the surface beyond buckling: an eigenvalue ω² is negative; lower its magnitude"
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +124,7 @@ def _static_response(problem: SurfaceProblem, at: tuple[float, float], level: in
     try:
         factor = cho_factor(matrix, overwrite_a=True, check_finite=False)
     except LinAlgError as error:
-        raise ValueError(_unstable()) from error
+        raise ValueError(UNSTABLE) from error
     row = point_row(x_axis, y_axis, at)
     response = cho_solve(factor, row)
     response /= np.sqrt(row @ response)  # of unit energy, so that the matrices stay well scaled
@@ -145,7 +146,7 @@ def _ritz(
     try:
         inverse, vectors = eigh(mass, stiffness, subset_by_index=[mass.shape[0] - n_modes, mass.shape[0] - 1])
     except LinAlgError as error:
-        raise ValueError(_unstable()) from error
+        raise ValueError(UNSTABLE) from error
     inverse, vectors = inverse[::-1], vectors[:, ::-1]
     vectors = vectors / np.sqrt(np.sum(vectors * (mass @ vectors), axis=0))
     functions = Functions(*axes, vectors[:n].reshape(axes[0].n, axes[1].n, n_modes))
@@ -153,7 +154,7 @@ def _ritz(
     # from the derivatives themselves, where all functions are polynomials on one grid: no digit is lost
     values = 1.0 / inverse - problem.scale if statics else functions.energies(problem)
     if (values < -1e-7 * problem.scale).any():
-        raise ValueError(_unstable())
+        raise ValueError(UNSTABLE)
     values = np.where(values < RIGID * problem.scale, 0.0, values)
     order = np.argsort(values, kind="stable")
     found = _shared(SurfaceModes(np.sqrt(values), tuple(parts), np.inf), np.eye(n_modes)[:, order])
@@ -216,7 +217,3 @@ def _signs(found: SurfaceModes, problem: SurfaceProblem) -> np.ndarray:
     values = found.shapes(way)
     moves = np.abs(values) > 0.02 * np.abs(values).max(axis=0)
     return np.where(values[moves.argmax(axis=0), np.arange(values.shape[1])] < 0, -1.0, 1.0)
-
-
-def _unstable() -> str:
-    return "the tension compresses the surface beyond buckling: an eigenvalue ω² is negative; lower its magnitude"

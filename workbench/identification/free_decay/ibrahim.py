@@ -107,12 +107,12 @@ def signal_subspace(records: Sequence[Record], order: int, *, delays: int | None
             f" {delays} delays were taken. Measure longer or ask for fewer modes"
         )
     hankel = np.hstack([_hankel(r.outputs, delays) for r in records])
-    left = (
-        svd(hankel, full_matrices=False, lapack_driver="gesdd")[0]
-        if min(hankel.shape) < 4 * order
-        else (_leading_left(hankel, order))
-    )
-    return left[:, :order]
+    if min(hankel.shape) < 4 * order:
+        return np.asarray(svd(hankel, full_matrices=False, lapack_driver="gesdd")[0][:, :order])
+    # an orthogonal factorisation of the longer side first
+    if hankel.shape[1] > hankel.shape[0]:
+        hankel = np.asarray(np.linalg.qr(hankel.T, mode="r")).T
+    return np.asarray(svd(hankel, full_matrices=False)[0][:, :order])
 
 
 def shift_eigenpairs(basis: np.ndarray, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
@@ -130,13 +130,9 @@ def as_modes(mu: np.ndarray, vectors: np.ndarray, record: Record, branch: int = 
     vectors = vectors[:, upper] if branch % 2 == 0 else vectors[:, upper].conj()
     turns = (branch + 1) // 2
     poles = (np.log(seen) + 2j * np.pi * turns) / record.sample_time
-    omega = np.abs(poles)
-    order = np.argsort(omega)
-    derivative = time_derivatives(record.output_channels)
-    shapes = vectors / poles ** derivative[:, None]
-    return SampledModes(
-        omega[order], -(poles.real / omega)[order], normalised_shapes(shapes)[:, order], record.positions
-    )
+    order = np.argsort(np.abs(poles))
+    shapes = normalised_shapes(vectors / poles ** time_derivatives(record.output_channels)[:, None])
+    return SampledModes.of_poles(poles[order], shapes[:, order], record.positions)
 
 
 def _default_delays(m: int, lengths: Sequence[int], order: int) -> int:
@@ -151,13 +147,6 @@ def _hankel(outputs: np.ndarray, delays: int) -> np.ndarray:
     """Delayed copies stacked, delay by delay: (n_outputs * delays, n_samples - delays + 1)."""
     columns = outputs.shape[1] - delays + 1
     return np.vstack([outputs[:, d : d + columns] for d in range(delays)])
-
-
-def _leading_left(matrix: np.ndarray, order: int) -> np.ndarray:
-    """Leading left singular vectors, by an orthogonal factorisation of the longer side first."""
-    if matrix.shape[1] > matrix.shape[0]:
-        matrix = np.asarray(np.linalg.qr(matrix.T, mode="r")).T
-    return np.asarray(svd(matrix, full_matrices=False)[0][:, :order])
 
 
 @dataclass(frozen=True, eq=False)

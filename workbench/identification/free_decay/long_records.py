@@ -22,12 +22,17 @@ from scipy.fft import next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2
 
-from workbench.identification.free_decay.refinement import as_refined, in_coloured_noise, noise_level, search, unshaped
+from workbench.identification.free_decay.refinement import (
+    as_refined,
+    identified,
+    in_coloured_noise,
+    noise_level,
+    search,
+)
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import Projection, forget_transforms
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
-from workbench.structure.modes import frozen
 
 
 @dataclass(frozen=True)
@@ -188,12 +193,10 @@ class _Search:
     def report(self) -> Identified:
         found = self.records, self.poles, self.fits, self.noise
         refined = as_refined(*found, converged=self.converged, steps=self.steps)
-        evidence = self.evidence()[np.argsort(np.abs(self.poles))]
-        rejected = sorted(self.rejected, key=lambda pair: abs(pair[0]))
-        noise = unshaped(np.array([pole for pole, _ in rejected], complex), self.records[0])
         refined = in_coloured_noise(refined, self.records, self.fits)
-        tried = frozen([strength for _, strength in rejected])
-        return Identified(refined, frozen(evidence), self.limit, noise, tried, self.budget.remarks)
+        evidence = self.evidence()[np.argsort(np.abs(self.poles))]
+        found_modes = identified(refined, evidence, self.limit, self.rejected, self.records[0])
+        return replace(found_modes, remarks=self.budget.remarks)
 
     def _size(self, rate: float) -> tuple[int, int]:
         """Samples that one of this rate lasts, and the length of a transform that resolves its frequency."""

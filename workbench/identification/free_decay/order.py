@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from workbench.arrays import Complexes
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
-from workbench.identification.free_decay.refinement import in_coloured_noise, refine, search, unshaped
+from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import differ, project, variances, whitened
@@ -35,7 +35,6 @@ from workbench.identification.signal.searches import (
     spurious_modes,
 )
 from workbench.records.record import Record
-from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
 
 
@@ -254,16 +253,8 @@ class _FreeDecay:
             poles = poles[~lost]
             refined = refine(records, unshaped(poles, records[0]), offset=True, budget=self.budget)
         evidence = self.evidence(replace(model, poles=poles))[np.argsort(np.abs(poles))]
-        rejected = sorted(self.rejected, key=lambda pair: abs(pair[0]))
-        noise_modes = unshaped(np.array([pole for pole, _ in rejected], complex), records[0])
-        return Identified(
-            in_coloured_noise(refined, records),
-            frozen(evidence),
-            self.limit,
-            noise_modes,
-            frozen([gain for _, gain in rejected]),
-            self.budget.remarks,
-        )
+        found = identified(in_coloured_noise(refined, records), evidence, self.limit, self.rejected, records[0])
+        return replace(found, remarks=self.budget.remarks)
 
     def _lost(self, poles: np.ndarray, refined: np.ndarray) -> np.ndarray:
         """Which modes are no more where they were selected: what else is in a record than modes has drawn them off,
@@ -343,8 +334,7 @@ class _Grid:
         fastest = 0.1 * np.pi / dt
         rates = np.r_[0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))]
         inside = (omega > np.pi / span) & (omega < np.pi / dt - np.pi / span)
-        self.columns = np.flatnonzero(inside)
-        self.rates = rates
+        self.columns, self.rates = np.flatnonzero(inside), rates
         self.poles = -rates[:, None] + 1j * omega[inside]
         self.allowed = rates[:, None] < SELECTION.most_damped * omega[inside]
         self.n_cells = int(self.allowed.sum())
@@ -397,9 +387,8 @@ class _Grid:
         """Which overlap with a mode so far."""
         near = np.zeros(self.poles.shape, bool)
         for pole in poles:
-            near |= np.abs(self.poles.imag - pole.imag) < 3.0 * (
-                2.0 * self.bin_width + abs(pole.real) + self.rates[:, None]
-            )
+            reach = 3.0 * (2.0 * self.bin_width + abs(pole.real) + self.rates[:, None])
+            near |= np.abs(self.poles.imag - pole.imag) < reach
         return near
 
 

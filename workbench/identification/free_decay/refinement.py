@@ -15,9 +15,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from workbench.arrays import symmetric_root
+from workbench.arrays import scaled_inverse, symmetric_root
 from workbench.identification.signal.data_quality import check_same_sensors
-from workbench.identification.signal.modal_estimates import Refined, normalised_shapes, time_derivatives
+from workbench.identification.signal.modal_estimates import (
+    Identified,
+    Refined,
+    by_poles,
+    normalised_shapes,
+    time_derivatives,
+)
 from workbench.identification.signal.projection import Projection, noise_near, project, variances
 from workbench.identification.signal.searches import FIT, Budget, minimise
 from workbench.records.record import Record
@@ -27,10 +33,17 @@ from workbench.threads import one_blas_thread
 
 def unshaped(poles: np.ndarray, record: Record) -> SampledModes:
     """Modes of which only the poles are known, by rising frequency: a start for `refine`."""
-    omega = np.abs(poles)
-    order = np.argsort(omega)
     shapes = np.ones((record.n_outputs, poles.size), complex)
-    return SampledModes(omega[order], (-poles.real / omega)[order], shapes, record.positions)
+    return SampledModes.of_poles(poles[np.argsort(np.abs(poles))], shapes, record.positions)
+
+
+def identified(
+    refined: Refined, evidence: np.ndarray, limit: float, rejected: Sequence[tuple[complex, float]], record: Record
+) -> Identified:
+    """Refined modes with their evidence (n_modes,), beside the poles rejected as noise, each with its own."""
+    noise = sorted(rejected, key=lambda pair: abs(pair[0]))
+    modes = unshaped(np.array([pole for pole, _ in noise], complex), record)
+    return Identified(refined, frozen(evidence), limit, modes, frozen([strength for _, strength in noise]))
 
 
 def in_coloured_noise(
@@ -88,30 +101,18 @@ def as_refined(
             given.
     """
     n = poles.size
-    h, _ = normal_equations(fits, 1.0 / noise)
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(h), 1e-300))
-    covariance = np.linalg.pinv(h * np.outer(scale, scale), rcond=1e-14, hermitian=True) * np.outer(scale, scale)
+    covariance = scaled_inverse(normal_equations(fits, 1.0 / noise)[0], rcond=1e-14)
     if noise_ratio is not None:
         disturbed = normal_equations(fits, 1.0 / noise, np.sqrt(noise_ratio).swapaxes(1, 2))[0]
         covariance = covariance @ disturbed @ covariance
-    omega = np.abs(poles)
-    sigma, omega_d = -poles.real, poles.imag
-    # ω² = σ² + ω_d² and ζ = σ/ω carry the covariance of (σ, ω_d) to that of (ω, ζ).
-    jacobian = np.block(
-        [
-            [np.diag(sigma / omega), np.diag(omega_d / omega)],
-            [np.diag(omega_d**2 / omega**3), np.diag(-sigma * omega_d / omega**3)],
-        ]
-    )
-    order = np.argsort(omega)
+    jacobian = by_poles(poles) * np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
+    order = np.argsort(np.abs(poles))
     both = np.r_[order, order + n]
     variance = noise[:, :, None] ** 2 * np.ones(n) * (1.0 if noise_ratio is None else noise_ratio)
     derivative = time_derivatives(records[0].output_channels)
     shapes, shape_covariance = _mean_shapes(fits, derivative, covariance, variance)
     return Refined(
-        modes=SampledModes(
-            omega[order], (sigma / omega)[order], normalised_shapes(shapes)[:, order], records[0].positions
-        ),
+        modes=SampledModes.of_poles(poles[order], normalised_shapes(shapes)[:, order], records[0].positions),
         covariance=frozen((jacobian @ covariance @ jacobian.T)[np.ix_(both, both)]),
         amplitudes=tuple(frozen(fit.complex_amplitudes[:, order], complex) for fit in fits),
         shape_covariance=frozen(shape_covariance[order]),

@@ -234,12 +234,9 @@ class Bands(Printed):
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         largest = np.abs(self.phi).max(axis=0)
-        rows = [
-            (str(r + 1), f"{100 * std:.2g}", f"{100 * part:.2g}", f"{width:.2f}")
-            for r, (std, part, width) in enumerate(
-                zip(self.std.max(axis=0) / largest, self.interpolation_std.max(axis=0) / largest, self.width)
-            )
-        ]
+        shares = self.std.max(axis=0) / largest, self.interpolation_std.max(axis=0) / largest
+        each = enumerate(zip(*shares, self.width))
+        rows = [(str(r + 1), f"{100 * std:.2g}", f"{100 * part:.2g}", f"{width:.2f}") for r, (std, part, width) in each]
         headings = ("mode", "standard error [% of largest]", "of it by interpolation", "half width [standard errors]")
         line = f"bands of {counted(len(rows), 'eigenfunction')} at {counted(len(self.x), 'place')}, {self.level:.0%}"
         return line, headings, rows, ()
@@ -260,6 +257,31 @@ class Bands(Printed):
         """Lower and upper edge of the interval at each place by itself, (n_points, n_modes) each."""
         width = float(ndtri(0.5 * (1.0 + self.level)))
         return self.phi - width * self.std, self.phi + width * self.std
+
+
+def check_level(level: float) -> None:
+    """Refuse a probability of a confidence band that is none.
+
+    Raises:
+        ValueError: a level outside 0..1.
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
+
+
+def deviation_and_width(root: np.ndarray, level: float, rng: np.random.Generator) -> tuple[np.ndarray, float]:
+    """Standard errors (n_points,) of a curve whose errors have the covariance R Rᵀ, and how many hold it whole.
+
+    Args:
+        root: R, (n_points, any).
+        level: probability with which the whole curve lies within so many standard errors.
+    """
+    std = np.linalg.norm(root, axis=1)
+    unsure = std > BANDS.held * std.max()
+    if not unsure.any():
+        return std, 0.0
+    drawn = (root[unsure] / std[unsure, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))
+    return std, float(np.quantile(np.abs(drawn).max(axis=0), level))
 
 
 @one_blas_thread
@@ -293,8 +315,7 @@ def eigenfunction_bands(
             that the shapes contradict; as `eigenfunctions`.
     """
     x = np.atleast_1d(np.asarray(x, float))
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
+    check_level(level)
     slack = 1e-9 * length
     if not ((x >= -slack) & (x <= length + slack)).all():
         outside = x[~((x >= -slack) & (x <= length + slack))][0]
@@ -326,9 +347,5 @@ def eigenfunction_bands(
                 error *= np.sqrt(roughness)
                 interpolation[:, r] = np.linalg.norm(error, axis=1)
                 root = np.hstack([root, error])
-            std[:, r] = np.linalg.norm(root, axis=1)
-            unsure = std[:, r] > BANDS.held * std[:, r].max()
-            if unsure.any():
-                drawn = (root[unsure] / std[unsure, r, None]) @ rng.standard_normal((root.shape[1], BANDS.draws))
-                width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
+            std[:, r], width[r] = deviation_and_width(root, level, rng)
     return Bands(frozen(x), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)

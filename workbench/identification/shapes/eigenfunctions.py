@@ -232,12 +232,8 @@ class Splines:
         check_along(sampled)
         where: dict[str, Any] = {"length": length, "ends": ends}
         degrees = np.full(sampled.n_modes, degree) if degree else best_degrees(sampled, **where)
-        return cls(
-            tuple(
-                (interpolating_spline(sampled.positions, degree=int(d), **where), np.flatnonzero(degrees == d))
-                for d in np.unique(degrees)
-            )
-        )
+        each = [(int(d), np.flatnonzero(degrees == d)) for d in np.unique(degrees)]
+        return cls(tuple((interpolating_spline(sampled.positions, degree=d, **where), modes) for d, modes in each))
 
     def __call__(self, values: np.ndarray, x: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Splines through values (n_sensors, n_modes), at x: (n_points, n_modes)."""
@@ -257,7 +253,8 @@ class Inertia:
     def weighted(self, spline: Spline, length: float) -> list[tuple[np.ndarray, np.ndarray, int]]:
         """Places, their weights, and whether it is the value or the slope whose square they weigh."""
         breaks = [b for b in self.density.breaks if 0 < b < length]
-        x, weights = quadrature(np.concatenate([spline.knots, breaks]), spline.degree)
+        # exact for products of two splines with a cubic weight
+        x, weights = gauss_between(np.unique(np.concatenate([spline.knots, breaks])), spline.degree + 3)
         at = np.array([point.at for point in self.point_masses])
         return [
             (x, weights * self.density(x), 0),
@@ -283,11 +280,6 @@ def mass_matrix(spline: Spline, inertia: Inertia, length: float) -> np.ndarray:
         along = spline.matrix(x, derivative)
         found += along.T @ (weights[:, None] * along)
     return found
-
-
-def quadrature(knots: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss points and weights between the knots, exact for products of two splines with a cubic weight."""
-    return gauss_between(np.unique(knots), degree + 3)
 
 
 def check_along(sampled: SampledModes) -> None:

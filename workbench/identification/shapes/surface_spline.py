@@ -18,7 +18,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2
 
 from workbench.arrays import symmetric_root
-from workbench.identification.shapes.bands import BANDS, Bands
+from workbench.identification.shapes.bands import BANDS, Bands, check_level, deviation_and_width
 from workbench.identification.signal.modal_estimates import ShapeEstimates, check_placed, normalised_shapes
 from workbench.structure.domain import Rectangle
 from workbench.structure.modes import Modes, SampledModes, frozen
@@ -119,10 +119,8 @@ class SurfaceSpline:
         assert isinstance(self.edges, Mapping)
         for side, edge in self.edges.items():
             i = SIDES.index(side)
-            along, across = (
-                (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge,
-                np.full(SURFACE.per_edge, float(i % 2)),
-            )
+            along = (np.arange(SURFACE.per_edge) + 0.5) / SURFACE.per_edge
+            across = np.full(SURFACE.per_edge, float(i % 2))
             points = np.column_stack([across, along] if i < 2 else [along, across]) * (a, b)
             for order in HELD_BY[edge]:
                 found.append((points, ((order, 0) if i < 2 else (0, order))))
@@ -258,8 +256,7 @@ def surface_bands(
     Raises:
         ValueError: a level outside 0..1; as `surface_eigenfunctions`.
     """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"the level of a confidence band lies between 0 and 1; got {level}")
+    check_level(level)
     sampled = found.modes
     spline, scaled = _scaled(sampled, length, mass_per_area, edges)
     at, rng = spline.domain.locate(at), np.random.default_rng(seed)
@@ -273,18 +270,12 @@ def surface_bands(
         factor = scaled[:, r] @ values[:, r] / (values[:, r] @ values[:, r])  # 1 / √q
         own = found.shape_covariance[r] * factor**2
         phi[:, r] = along @ scaled[:, r]
-        weighing = (weights * (inside @ scaled[:, r])) @ inside
-        noise = (along - np.outer(phi[:, r], weighing)) @ _root(own)
-        rough = spline.roughness(scaled[:, r], own)
-        missed = root[: len(at)] - np.outer(phi[:, r], (weights * (inside @ scaled[:, r])) @ root[len(at) :])
-        missed = np.sqrt(rough) * missed
+        weighing = weights * (inside @ scaled[:, r])
+        noise = (along - np.outer(phi[:, r], weighing @ inside)) @ _root(own)
+        missed = root[: len(at)] - np.outer(phi[:, r], weighing @ root[len(at) :])
+        missed = np.sqrt(spline.roughness(scaled[:, r], own)) * missed
         interpolation[:, r] = np.linalg.norm(missed, axis=1)
-        both = np.hstack([noise, missed])
-        std[:, r] = np.linalg.norm(both, axis=1)
-        unsure = std[:, r] > BANDS.held * std[:, r].max()
-        if unsure.any():
-            drawn = (both[unsure] / std[unsure, r, None]) @ rng.standard_normal((both.shape[1], BANDS.draws))
-            width[r] = np.quantile(np.abs(drawn).max(axis=0), level)
+        std[:, r], width[r] = deviation_and_width(np.hstack([noise, missed]), level, rng)
     return Bands(frozen(at), frozen(phi), frozen(std), frozen(interpolation), frozen(width), level)
 
 

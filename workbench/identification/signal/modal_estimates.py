@@ -238,6 +238,14 @@ def credible(modes: SampledModes, omega_std: np.ndarray, zeta_std: np.ndarray, n
     return np.asarray(~growing & (omega_std < modes.omega) & (modes.omega < nyquist))
 
 
+def by_poles(poles: np.ndarray) -> np.ndarray:
+    """∂(ω, ζ)/∂(x, y) of poles λ = x + iy, (2 n_modes, 2 n_modes): dω = (x dx + y dy)/ω, dζ = -(y² dx - x y dy)/ω³."""
+    x, y, omega = poles.real, poles.imag, np.abs(poles)
+    return np.block(
+        [[np.diag(x / omega), np.diag(y / omega)], [np.diag(-(y**2) / omega**3), np.diag(x * y / omega**3)]]
+    )
+
+
 def check_placed(sampled: SampledModes) -> None:
     """Refuse a sensor without a place.
 

@@ -22,7 +22,7 @@ from workbench.identification.updating.distributions import Basis
 from workbench.structure.member import Bar, Beam
 from workbench.structure.polynomials import Segments
 from workbench.structure.profile import Profile
-from workbench.structure.supports import HELD, PointMass, PointSpring
+from workbench.structure.supports import HELD, PointDamper, PointMass
 
 EXTRA_DEGREES = 4
 RIGID = 1e-10  # of the eigenvalue of a half wave
@@ -254,8 +254,6 @@ def _fixed(nominal: Bar | Beam, segments: Segments, order: int) -> tuple[np.ndar
         held += [order * node + derivative for derivative, spring in enumerate(springs[:order]) if spring == HELD]
         add(stiffness, at, [0.0 if spring == HELD else spring for spring in springs])
     for part in nominal.attachments:
-        if isinstance(part, PointMass):
-            add(mass, cast(float, part.at), (part.mass, part.rotary_inertia))
-        elif isinstance(part, PointSpring):
-            add(stiffness, cast(float, part.at), (part.stiffness, part.rotational_stiffness))
+        if not isinstance(part, PointDamper):
+            add(mass if isinstance(part, PointMass) else stiffness, cast(float, part.at), part.pair)
     return mass, stiffness, np.setdiff1d(np.arange(segments.n_functions), held)

@@ -19,7 +19,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2 as chi2_distribution
 
-from workbench.arrays import Floats, symmetric_root
+from workbench.arrays import Floats, scaled_inverse, symmetric_root
 from workbench.identification.updating.distributions import KNOWN_TOLERANCE, Basis
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
@@ -41,6 +41,7 @@ class ProblemSettings:
 
 
 PROBLEM = ProblemSettings()
+INDISTINCT = 1e-12  # of normal equations: directions of the parameters that the data say nothing of
 FROM_EDGES = np.array([[0.5, 0.5], [-1.0, 1.0]])  # centre and width of where a loss begins and ends
 
 
@@ -234,7 +235,7 @@ class Problem:
         """
         if z.size == self.n_free:
             slopes = self.misses(z)[1]
-            return _inverse(slopes.T @ slopes)
+            return scaled_inverse(slopes.T @ slopes, INDISTINCT)
         carry = block_diag(np.eye(z.size - 2), FROM_EDGES)
         return np.asarray(carry @ self._by_edges(self._edges_inside(z)) @ carry.T)
 
@@ -242,7 +243,7 @@ class Problem:
         """The bound with the edges of the loss in place of centre and width."""
         slopes = self.misses(z)[1]
         slopes = np.hstack([slopes[:, :-2], slopes[:, -2:] @ FROM_EDGES])
-        return _inverse(slopes.T @ slopes)
+        return scaled_inverse(slopes.T @ slopes, INDISTINCT)
 
     def _edges_inside(self, z: np.ndarray) -> np.ndarray:
         """The same with each edge of the loss at least one standard error inside; itself where they are."""
@@ -272,10 +273,8 @@ class Problem:
         """Free parameters, a loss with them, of the series nearest to a structure found with other terms."""
         nominal, length = self.task.nominal, self.task.nominal.length
         x = (np.arange(100) + 0.5) / 100 * length
-        mass, stiffness = (
-            found.mass(x) / nominal.mass_per_length(x),
-            found.stiffness(x) / self.series.nominal_stiffness(x),
-        )
+        mass = found.mass(x) / nominal.mass_per_length(x)
+        stiffness = found.stiffness(x) / self.series.nominal_stiffness(x)
         if found.loss is None:
             return self._nearest(x, mass, stiffness)
         whole = stiffness / found.loss.of(Profile.constant(1.0), length)(x)
@@ -353,8 +352,3 @@ def _uncertain(
     )
     profile = smooth if loss is None else loss.of(smooth, length)
     return UncertainProfile(profile, lambda x: values(x, draws, None if loss is None else loss_draws))
-
-
-def _inverse(normal: np.ndarray) -> np.ndarray:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-12, hermitian=True) * np.outer(scale, scale)
