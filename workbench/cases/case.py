@@ -148,7 +148,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
     if not isinstance(kind, str) or kind not in STRUCTURES:
         raise CaseError(f"[structure]: kind is beam, rod, plate or modal; got {shown(kind)}")
     check_keys(table, STRUCTURES[kind], "[structure]")
-    _check_ports(inputs, outputs, "at", MORE[kind])
+    _check_ports(inputs, outputs, "at", kind)
     common: dict[str, Any] = {
         "length": number(table, "length", "[structure]"),
         "mass_per_length": profile(table, "mass_per_length"),
@@ -171,7 +171,7 @@ def _member_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: li
 
 def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: list[dict[str, Any]]) -> Rig:
     check_keys(table, PLATE, "[structure]")
-    _check_ports(inputs, outputs, "at", MORE["plate"])
+    _check_ports(inputs, outputs, "at", "plate")
     edges = table.get("edges")
     if not isinstance(edges, dict):
         raise CaseError(f"[structure]: edges must be a table of {', '.join(EDGES)}; got {shown(edges)}")
@@ -186,7 +186,6 @@ def _plate_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
         damping=ModalDamping(number(table, "damping_ratio", "[structure]", low=0.0)),
     )
     modes = structure.modes(count(table, "modes", MOST_MODES))
-
     return _rig_of(modes, inputs, outputs, lambda e, where: tuple(numbers(e, "at", where, 2).tolist()), structure)
 
 
@@ -194,7 +193,7 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     """Plain modal data, or a single degree of freedom with mass, damping and stiffness."""
     single = "mass" in table
     check_keys(table, SINGLE if single else MODAL, "[structure]")
-    _check_ports(inputs, outputs, "shape", MORE["modal"])
+    _check_ports(inputs, outputs, "shape", "modal")
     if single:
         mass = number(table, "mass", "[structure]", low=1e-300)
         stiffness = number(table, "stiffness", "[structure]", low=0.0)
@@ -208,13 +207,8 @@ def _modal_rig(table: dict[str, Any], inputs: list[dict[str, Any]], outputs: lis
     else:
         omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
         damping = _modal_damping(table, omega)
-        values = np.array(
-            [
-                numbers(e, "shape", f"{key} {e['name']!r}", omega.size)
-                for key, entries in (("[[input]]", inputs), ("[[output]]", outputs))
-                for e in entries
-            ]
-        )
+        ports = [("[[input]]", e) for e in inputs] + [("[[output]]", e) for e in outputs]
+        values = np.array([numbers(e, "shape", f"{key} {e['name']!r}", omega.size) for key, e in ports])
     points = NamedPoints(tuple(e["name"] for e in (*inputs, *outputs)))
     modes = Modes(omega=omega, damping=damping, shapes=PointShapes(values), domain=points)
     return _rig_of(modes, inputs, outputs, lambda e, _: e["name"])
@@ -225,7 +219,7 @@ def _rig_at_points(
 ) -> Rig:
     """Modal data at named points, which a table beside the case file lists."""
     check_keys(table, MODAL, "[structure]")
-    _check_ports(inputs, outputs, "point", MORE["points"])
+    _check_ports(inputs, outputs, "point", "points")
     omega = 2.0 * np.pi * numbers(table, "natural_frequencies_hz", "[structure]")
     damping = _modal_damping(table, omega)
     file = inside(path.parent, text(table, "points", "[structure]"), "[structure] points")
@@ -258,12 +252,8 @@ def _modal_damping(table: dict[str, Any], omega: np.ndarray) -> np.ndarray:
     return np.diag(rates)
 
 
-def _check_ports(
-    inputs: list[dict[str, Any]],
-    outputs: list[dict[str, Any]],
-    place: str,
-    more: tuple[tuple[str, ...], tuple[str, ...]],
-) -> None:
+def _check_ports(inputs: list[dict[str, Any]], outputs: list[dict[str, Any]], place: str, kind: str) -> None:
+    more = MORE[kind]
     for key, entries, keys in (("input", inputs, (*INPUT, *more[0])), ("output", outputs, (*OUTPUT, *more[1]))):
         for entry in entries:
             check_keys(entry, (*keys, place), f"[[{key}]] {entry['name']!r}")
@@ -404,14 +394,13 @@ def _read_record(folder: Path, entry: dict[str, Any], rig: Rig, path: Path) -> R
         )
     for sensor in rig.sensors:
         if np.ptp(arrays[sensor.name]) == 0:
-            raise CaseError(
-                f"{file}: output {sensor.name!r} is flat at {arrays[sensor.name][0]:g}: is the sensor alive?"
-            )
+            level = arrays[sensor.name][0]
+            raise CaseError(f"{file}: output {sensor.name!r} is flat at {level:g}: is the sensor alive?")
     inputs, outputs = (np.array([arrays[port.name] for port in ports]) for ports in (rig.actuators, rig.sensors))
     return rig.record(inputs, outputs, sample_time=sample_time, name=name, input_hold=_hold(entry, where))
 
 
-def _signals(record: Record) -> dict[str, np.ndarray]:
+def signals_of(record: Record) -> dict[str, np.ndarray]:
     """The time and the channels of a record of any format, by name."""
     channels = (*zip(record.input_names, record.inputs), *zip(record.output_names, record.outputs))
     return {"t": record.time, **dict(channels)}
@@ -422,7 +411,7 @@ def _arrays(file: Path, where: str) -> dict[str, np.ndarray]:
         raise CaseError(f"{where}: there is no file {file}")
     try:
         check_file(file)
-        arrays = load_arrays(file) if file.suffix == ".npz" else _signals(read_record(file))
+        arrays = load_arrays(file) if file.suffix == ".npz" else signals_of(read_record(file))
     except RecordFileError as error:
         raise CaseError(str(error)) from error
     for name, values in arrays.items():

@@ -7,7 +7,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from workbench.cases.case import Case
+from workbench.cases.case import Case, signals_of
 from workbench.cases.points import write_points
 from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, shape_of
@@ -41,8 +41,7 @@ def write_case(case: Case, folder: str | Path) -> Path:
     blocks = [f"title = {_text(case.name)}", *_rig(case.rig, folder)]
     for record, use in [*((r, "fit") for r in case.fit), *((r, "validate") for r in case.validation)]:
         file = f"records/{record.name}.npz"
-        arrays: dict[str, Any] = {"t": record.time, **dict(zip(record.input_names, record.inputs, strict=True))}
-        arrays |= dict(zip(record.output_names, record.outputs, strict=True))
+        arrays: dict[str, Any] = {**signals_of(record)}
         np.savez_compressed(folder / file, **arrays)
         hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
         blocks.append(

@@ -94,17 +94,13 @@ def filtered(law: Law, filter_: ModalFilter) -> Controller:
     if filter_.slope.size:
         weights.append(filter_.slope)
         kinds.append(("slope", "angular velocity", "s"))
-    columns, sensors = [], []
-    for order in (0, 1):
-        for weight, kind in zip(weights, kinds, strict=True):
-            columns.append(
-                np.vstack([np.zeros_like(weight)] * order + [weight] + [np.zeros_like(weight)] * (1 - order))
-            )
-            sensors += [
-                Sensor(f"{'v' if order else 'y'}{kind[2]}{i + 1}", place, kind[order])
-                for i, place in enumerate(filter_.places)
-            ]
-    estimator = np.hstack(columns)
+    sensors = [
+        Sensor(f"{'yv'[order]}{kind[2]}{i + 1}", place, kind[order])
+        for order in (0, 1)
+        for kind in kinds
+        for i, place in enumerate(filter_.places)
+    ]
+    estimator = np.kron(np.eye(2), np.hstack(weights))
     empty = np.zeros((0, 0)), np.zeros((0, estimator.shape[1])), np.zeros((len(law.actuators), 0))
     again = None if filter_.designed_by is None else partial(_filtered_anew, filter_.designed_by)
     name = f"{law.name} through a modal filter"

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from workbench.arrays import Floats
 from workbench.design.estimation.controller import Controller, reading
 from workbench.design.laws.coupled import controlled_plant
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, positive_definite
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.sensors import Sensor
 from workbench.structure.modes import Modes
@@ -59,8 +59,8 @@ def kalman(
     """
     a, b, c = observed_plant(modes, law, sensors)
     n = law.n_controlled
-    push = _intensity(disturbance, n, "disturbance")
-    spread = _intensity(noise, len(sensors), "noise")
+    push = positive_definite(disturbance, n, f"the disturbance must be positive, one figure or {n}")
+    spread = positive_definite(noise, len(sensors), f"the noise must be positive, one figure or {len(sensors)}")
     try:
         gain, _, _ = control.lqe(a, np.vstack([np.zeros((n, n)), np.eye(n)]), c, push, spread)
     except (np.linalg.LinAlgError, ValueError) as error:
@@ -90,14 +90,6 @@ def observed_plant(modes: Modes, law: Law, sensors: Sequence[Sensor]) -> tuple[F
             raise DesignError(f"rates alone do not show where rigid-body mode {r + 1} is; add a displacement sensor")
     a, b = controlled_plant(modes, index, law.actuators)
     return a, b, c
-
-
-def _intensity(value: ArrayLike, size: int, name: str) -> np.ndarray:
-    value = np.asarray(value, float)
-    matrix = value * np.eye(size) if value.ndim == 0 else np.diag(value) if value.ndim == 1 else value
-    if matrix.shape != (size, size) or not (np.linalg.eigvalsh(0.5 * (matrix + matrix.T)) > 0).all():
-        raise DesignError(f"the {name} must be positive, one figure or {size}; got {value}")
-    return matrix
 
 
 def _controller(

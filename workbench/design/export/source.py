@@ -64,46 +64,38 @@ class _Numbers:
     """The numbers of a controller as text, without those that do nothing."""
 
     def __init__(self, controller: DigitalController, infinite: str) -> None:
-        def text(value: float) -> str:
+        def text(value: Any) -> Any:
+            if np.ndim(value):
+                return [text(each) for each in value]
             return repr(float(value)) if np.isfinite(value) else infinite if value > 0 else f"-{infinite}"
 
-        def table(values: np.ndarray) -> list[list[str]]:
-            return [[text(value) for value in row] for row in values]
-
-        def row(values: np.ndarray) -> list[str]:
-            return [text(value) for value in values]
-
         one, relays, friction = controller, controller.relays, controller.friction
-        n_states, n_commands = one.a.shape[0], len(one.actuators)
-        self.sizes = {
-            "n_states": n_states,
-            "n_readings": len(one.sensors),
-            "n_commands": n_commands,
-            "n_outputs": one.d.shape[0],
-        }
-        self.matrices: dict[str, Any] = {"D": table(one.d)}
+        n_states = one.a.shape[0]
+        self.sizes = {"n_states": n_states, "n_readings": len(one.sensors), "n_outputs": one.d.shape[0]}
+        self.sizes["n_commands"] = len(one.actuators)
+        self.matrices: dict[str, Any] = {"D": text(one.d)}
         self.vectors: dict[str, Any] = {}
         if n_states:
-            self.matrices |= {"A": table(one.a), "B": table(one.b), "C": table(one.c)}
+            self.matrices |= {"A": text(one.a), "B": text(one.b), "C": text(one.c)}
             if one.e.any():
-                self.matrices["E"] = table(one.e)
+                self.matrices["E"] = text(one.e)
         if one.offset.any() or (one.scale != 1).any():
-            self.vectors |= {"SCALE": row(one.scale), "OFFSET": row(one.offset)}
+            self.vectors |= {"SCALE": text(one.scale), "OFFSET": text(one.offset)}
         if relays is not None:
-            self.matrices["SPREAD"] = table(relays.spread)
-            self.vectors |= {"FORCE": row(relays.force), "DEAD_BAND": row(relays.dead_band)}
+            self.matrices["SPREAD"] = text(relays.spread)
+            self.vectors |= {"FORCE": text(relays.force), "DEAD_BAND": text(relays.dead_band)}
         if friction is not None:
-            self.matrices |= {"PUSH": table(friction.push), "SPEED_Y": table(friction.of_reading)}
+            self.matrices |= {"PUSH": text(friction.push), "SPEED_Y": text(friction.of_reading)}
             if n_states:
-                self.matrices["SPEED_Z"] = table(friction.of_state)
-            self.vectors |= {"FRICTION": row(friction.force), "SMOOTHING": row(friction.smoothing)}
+                self.matrices["SPEED_Z"] = text(friction.of_state)
+            self.vectors |= {"FRICTION": text(friction.force), "SMOOTHING": text(friction.smoothing)}
         for name, values in (("LIMIT", one.limit), ("RATE", one.rate)):
             if np.isfinite(values).any():
-                self.vectors[name] = row(values)
+                self.vectors[name] = text(values)
         if one.dead_zone.any():
-            self.vectors |= {"DEAD_ZONE": row(one.dead_zone), "ONSET": row(one.onset)}
+            self.vectors |= {"DEAD_ZONE": text(one.dead_zone), "ONSET": text(one.onset)}
         if one.bias.any():
-            self.vectors["BIAS"] = row(one.bias)
+            self.vectors["BIAS"] = text(one.bias)
 
 
 def _equations(given: _Numbers) -> list[str]:

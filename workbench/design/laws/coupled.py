@@ -7,7 +7,14 @@ import control
 import numpy as np
 from numpy.typing import ArrayLike
 
-from workbench.design.laws.law import DesignError, Law, controllable_input, controlled_indices, participation
+from workbench.design.laws.law import (
+    DesignError,
+    Law,
+    controllable_input,
+    controlled_indices,
+    participation,
+    positive_definite,
+)
 from workbench.design.laws.pole_assignment import assign
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
@@ -44,13 +51,8 @@ def coupled_lqr(
         controllable_input(modes, [r for r in index if modes.damping[r, r] <= 0], actuators)
     a, b = controlled_plant(modes, index, actuators)
     q = np.diag(np.r_[modes.omega[list(index)] ** 2, np.ones(len(index))])
-    r = np.asarray(weight, float)
-    r = r * np.eye(len(actuators)) if r.ndim == 0 else np.diag(r) if r.ndim == 1 else r
-    known = r.shape == (len(actuators),) * 2 and np.isfinite(r).all()
-    if not known or not (np.linalg.eigvalsh(0.5 * (r + r.T)) > 0).all():
-        raise DesignError(
-            f"the control weight must be positive definite, {len(actuators)} by {len(actuators)}; got {r}"
-        )
+    size = len(actuators)
+    r = positive_definite(weight, size, f"the control weight must be positive definite, {size} by {size}")
     try:
         gain, _, poles = control.lqr(a, b, q, r)
     except (np.linalg.LinAlgError, ValueError, control.ControlSlycot) as error:

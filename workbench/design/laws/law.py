@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from workbench.rig.actuators import Actuator
 from workbench.rig.statespace import input_matrix
@@ -58,17 +59,27 @@ class Law(Printed):
         line = f"{self.name}, u = -K x: mode{'s' * several} {numbered(self.controlled)} by {count} actuator"
         line += "s" * (count > 1)
         modes = [str(r + 1) for r in self.controlled]
-        headings = [
-            "actuator",
-            "at" if isinstance(self.actuators[0].at, str) else "place [m]",
-            *(f"q{r}" for r in modes),
-            *(f"q{r}'" for r in modes),
-        ]
+        place = "at" if isinstance(self.actuators[0].at, str) else "place [m]"
+        headings = ["actuator", place, *(f"q{r}" for r in modes), *(f"q{r}'" for r in modes)]
         rows = [
             [a.name, place_text(a.at), *(f"{k:.4g}" for k in gains)]
             for a, gains in zip(self.actuators, self.gain, strict=True)
         ]
         return line, headings, rows, ()
+
+
+def positive_definite(value: ArrayLike, size: int, refusal: str) -> np.ndarray:
+    """A number, a diagonal (size,) or a matrix (size, size) as a matrix.
+
+    Raises:
+        DesignError: `refusal`, and the value, where that is not positive definite.
+    """
+    given = np.asarray(value, float)
+    matrix = given * np.eye(size) if given.ndim == 0 else np.diag(given) if given.ndim == 1 else given
+    fits = matrix.shape == (size, size) and np.isfinite(matrix).all()
+    if not fits or not (np.linalg.eigvalsh(0.5 * (matrix + matrix.T)) > 0).all():
+        raise DesignError(f"{refusal}; got {given}")
+    return matrix
 
 
 def controlled_indices(modes: Modes, controlled: int | Sequence[int]) -> tuple[int, ...]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import cpu_count
 from typing import TypeVar
 
@@ -122,12 +122,8 @@ def run_loop(rig: Rig, controller: DigitalController, test: LoopTest, *, substep
     if test.impulse_at is not None:
         start[1] = test.impulse * modes.phi_at(test.impulse_at)
     points = [e for e in rig.elements if isinstance(e, PointElement)]
-    shape = (len(actuators), test.n_samples)
-    out = (
-        *(np.zeros((n, test.n_samples)) for _ in range(2)),
-        *(np.zeros(shape) for _ in range(2)),
-        *(np.zeros((len(points), test.n_samples)) for _ in range(3)),
-    )
+    rows = (n, n, len(actuators), len(actuators), *[len(points)] * 3)
+    out = tuple(np.zeros((size, test.n_samples)) for size in rows)
     damping, coupling, spread = structure_arrays(rig)
     bounded = loop_record(
         (np.array(modes.omega), damping, coupling, float(rig.stiffness_rate), *spread),
@@ -159,11 +155,7 @@ def of_loops(
     rigs: Sequence[Rig], controller: DigitalController, test: LoopTest, kept: Callable[[Rig, LoopRun], K]
 ) -> list[K]:
     """What is kept of the run of each of many rigs: a thousand runs fill the memory, a few figures of each do not."""
-    seeds = [test.seed if test.seed is None else test.seed + i for i in range(len(rigs))]
-    tests = [
-        LoopTest(test.n_samples, test.sample_time, test.impulse_at, test.impulse, test.forces, test.ports, s)
-        for s in seeds
-    ]
+    tests = [test if test.seed is None else replace(test, seed=test.seed + i) for i in range(len(rigs))]
     with ThreadPoolExecutor(cpu_count() or 1) as pool:
         return list(pool.map(lambda rig, one: kept(rig, run_loop(rig, controller, one)), rigs, tests))
 

@@ -13,7 +13,13 @@ from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.loop.closed_loop import close_loop, initial_response
 from workbench.design.spillover.explain import Explanation, explain_spillover
-from workbench.design.spillover.spillover import Spillover, effort, finite_spillover, quadratic_cost
+from workbench.design.spillover.spillover import (
+    Spillover,
+    check_final_time,
+    effort,
+    finite_spillover,
+    quadratic_cost,
+)
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import NamedPoints, Place
@@ -93,8 +99,7 @@ def compare(
         weight: R of the cost.
         final_time: s, of work and peak force.
     """
-    if not (np.isfinite(final_time) and final_time > 0):
-        raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
+    check_final_time(final_time)
     time = np.linspace(0.0, final_time, SHOWN_INSTANTS)
     rows = []
     for law in laws:

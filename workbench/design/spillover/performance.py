@@ -8,7 +8,7 @@ from workbench.design.laws.law import DesignError
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.closed_loop import ClosedLoop
 from workbench.design.loop.on_off_response import respond_on_off
-from workbench.design.spillover.spillover import on_off_work, second_moments
+from workbench.design.spillover.spillover import check_final_time, on_off_work, second_moments
 from workbench.rig.statespace import input_matrix
 from workbench.structure.modes import Modes
 
@@ -41,7 +41,8 @@ def performance(loop: ClosedLoop, state: np.ndarray, *, weight: float, final_tim
         weight: R of the actuator forces.
         final_time: s.
     """
-    _check(weight, final_time)
+    _check_weight(weight)
+    check_final_time(final_time)
     modes, n = loop.modes, loop.modes.n_modes
     margin = loop.margin
     if not loop.stable:
@@ -61,19 +62,17 @@ def on_off_performance(
     modes: Modes, law: OnOffLaw, state: np.ndarray, *, weight: float, final_time: float
 ) -> Performance:
     """The same of on-off control, whose motion is exact and whose integrals are sums over it."""
-    _check(weight, final_time)
+    _check_weight(weight)
+    check_final_time(final_time)
     time = np.linspace(0.0, final_time, INSTANTS)
     response = respond_on_off(modes, law, state, time).response
     own = list(law.controlled)
     effort = float(np.trapezoid((response.forces**2).sum(axis=0), time))
     energy = float(np.trapezoid(2.0 * response.energy[own].sum(axis=0), time))
-    return Performance(
-        energy + weight * effort, effort, on_off_work(modes, law, state, final_time).residual_total, np.nan
-    )
+    spilled = on_off_work(modes, law, state, final_time).residual_total
+    return Performance(energy + weight * effort, effort, spilled, np.nan)
 
 
-def _check(weight: float, final_time: float) -> None:
-    if not (np.isfinite(final_time) and final_time > 0):
-        raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
+def _check_weight(weight: float) -> None:
     if not weight > 0:
         raise DesignError(f"the control weight R must be positive; got {weight:g}")

@@ -87,10 +87,7 @@ def force_transform(modes: Modes, law: Law, state: Floats, s: Complexes) -> Comp
         state: (2 n_modes,) at t = 0, all modes; only the controlled ones matter.
         s: (n_s,) complex, rad/s.
     """
-    a, b = controlled_plant(modes, law.controlled, law.actuators)
-    loop = a - b @ law.gain
-    index = list(law.controlled)
-    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+    loop, start = _controlled_loop(modes, law, state)
     values, vectors = np.linalg.eig(loop)
     if np.linalg.cond(vectors) < 1e6:
         weights = -(law.gain @ vectors) * np.linalg.solve(vectors, start.astype(complex))
@@ -110,8 +107,7 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
     """
     n, index = modes.n_modes, list(law.controlled)
     residual = [r for r in range(n) if r not in law.controlled]
-    a, b = controlled_plant(modes, law.controlled, law.actuators)
-    if np.linalg.eigvals(a - b @ law.gain).real.max() >= 0:
+    if np.linalg.eigvals(_controlled_loop(modes, law, state)[0]).real.max() >= 0:
         raise DesignError("the controlled modes do not settle, so their work has no limit; take a finite time")
     if np.diag(modes.damping).max() > 0:
         raise DesignError(
@@ -125,13 +121,26 @@ def spillover(modes: Modes, law: Law, state: np.ndarray) -> Spillover:
         force = input_matrix(modes, law.actuators)[residual]
         push = np.einsum("rj,jr->r", force, force_transform(modes, law, state, 1j * omega))
         moving = state[[n + r for r in residual]] + 1j * omega * state[residual]
-        work[residual] = 0.5 * np.abs(push) ** 2 + _cross(push, moving)
+        # z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)
+        work[residual] = 0.5 * np.abs(push) ** 2 + (np.conj(moving) * push).real
     return Spillover(work, law.controlled, np.inf)
 
 
-def _cross(push: Complexes, moving: Complexes) -> Floats:
-    """The share of W_r from motion already there: with z = q' + iω q leaves z(∞) e^{-iωt} = z0 + F(iω)."""
-    return (np.conj(moving) * push).real
+def _controlled_loop(modes: Modes, law: Law, state: Floats) -> tuple[Floats, Floats]:
+    """A - B K of the controlled modes alone, and their part (2 n_controlled,) of a state of all modes."""
+    a, b = controlled_plant(modes, law.controlled, law.actuators)
+    index = list(law.controlled)
+    return a - b @ law.gain, np.r_[state[index], state[[modes.n_modes + r for r in index]]]
+
+
+def check_final_time(final_time: float) -> None:
+    """Refuse a time until which nothing can be summed.
+
+    Raises:
+        DesignError: a time that is not positive and finite.
+    """
+    if not (np.isfinite(final_time) and final_time > 0):
+        raise DesignError(f"the final time must be positive and finite; got {final_time:g}")
 
 
 def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> Spillover:
@@ -140,8 +149,7 @@ def finite_spillover(loop: ClosedLoop, state: np.ndarray, final_time: float) -> 
     W_r = ∫ b_rᵀF q_r' dt is the integral of a quadratic form of the state, taken from one matrix exponential
     (Van Loan, IEEE Trans. Automatic Control 23 (1978) 395).
     """
-    if not (np.isfinite(final_time) and final_time > 0):
-        raise ValueError(f"the final time must be positive and finite; got {final_time}")
+    check_final_time(final_time)
     n = loop.modes.n_modes
     state = np.r_[state, np.zeros(loop.matrix.shape[0] - np.size(state))]
     moments = second_moments(loop.matrix, state, final_time)
@@ -186,11 +194,14 @@ def second_moments(a: Floats, state: Floats, final_time: float) -> Floats:
 
 def effort(modes: Modes, law: Law, state: np.ndarray) -> float:
     """∫ Fᵀ F dt over all time, exact modal coordinates fed back, by a Lyapunov equation."""
-    a, b = controlled_plant(modes, law.controlled, law.actuators)
-    index = list(law.controlled)
-    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
-    gramian = solve_continuous_lyapunov(a - b @ law.gain, -np.outer(start, start))
-    return float(np.trace(law.gain @ gramian @ law.gain.T))
+    return float(np.trace(law.gain @ _gramian(modes, law, state) @ law.gain.T))
+
+
+def _gramian(modes: Modes, law: Law, state: Floats) -> Floats:
+    """∫ x xᵀ dt over all time of the controlled modes, (2 n_controlled, 2 n_controlled)."""
+    loop, start = _controlled_loop(modes, law, state)
+    gramian: Floats = solve_continuous_lyapunov(loop, -np.outer(start, start))
+    return gramian
 
 
 def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np.ndarray) -> float:
@@ -199,16 +210,10 @@ def quadratic_cost(modes: Modes, law: Law, state: np.ndarray, weight: float | np
     Args:
         weight: R, a number or (n_actuators, n_actuators); R BᵀB weighs modal forces, R fᵀf.
     """
-    a, b = controlled_plant(modes, law.controlled, law.actuators)
-    index = list(law.controlled)
-    start = np.r_[state[index], state[[modes.n_modes + r for r in index]]]
-    gramian = solve_continuous_lyapunov(a - b @ law.gain, -np.outer(start, start))
-    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + _weighted(law.gain, weight)
-    return float(np.trace(q @ gramian))
-
-
-def _weighted(gain: Floats, weight: float | Floats) -> Floats:
-    return gain.T @ weight @ gain if isinstance(weight, np.ndarray) and weight.ndim else weight * gain.T @ gain
+    index, gain = list(law.controlled), law.gain
+    r = gain.T @ weight @ gain if isinstance(weight, np.ndarray) and weight.ndim else weight * gain.T @ gain
+    q = np.diag(np.r_[modes.omega[index] ** 2, np.ones(len(index))]) + r
+    return float(np.trace(q @ _gramian(modes, law, state)))
 
 
 def modal_cost(modes: Modes, law: Law, state: np.ndarray, weight: float) -> float:

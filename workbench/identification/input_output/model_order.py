@@ -237,7 +237,8 @@ def _to_try(data: Measurement, fit: Fit) -> np.ndarray:
 
 def _can_ring(data: Measurement, poles: np.ndarray) -> np.ndarray:
     """Which poles are of a frequency that the measurement holds, and not damped too much to ring."""
-    return (poles.imag > 0) & (poles.imag < data.highest) & (-poles.real < SELECTION.most_damped * np.abs(poles))
+    ringing = -poles.real < SELECTION.most_damped * np.abs(poles)
+    return np.asarray(ringing & (poles.imag > 0) & (poles.imag < data.highest))
 
 
 def _added(data: Measurement, bases: list[np.ndarray], left: np.ndarray, pole: complex) -> tuple[float, np.ndarray]:
