@@ -17,14 +17,7 @@ from scipy.stats import chi2
 from workbench.identification.input_output.fit_errors import fixed_std, pole_covariance, vector_covariance
 from workbench.identification.input_output.input_delays import act_later, first_lags, fractions
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import (
-    Fit,
-    added_misfit,
-    only,
-    projected,
-    scaled_vectors,
-    settled,
-)
+from workbench.identification.input_output.modal_fit import Fit, added_misfit, only, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import ORDER, Selected, fit_of_poles, select_modes
 from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks

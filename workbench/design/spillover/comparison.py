@@ -13,13 +13,7 @@ from workbench.design.laws.imsc import imsc, imsc_poles
 from workbench.design.laws.law import DesignError, Law, controlled_indices
 from workbench.design.loop.closed_loop import close_loop, initial_response
 from workbench.design.spillover.explain import Explanation, explain_spillover
-from workbench.design.spillover.spillover import (
-    Spillover,
-    check_final_time,
-    effort,
-    finite_spillover,
-    quadratic_cost,
-)
+from workbench.design.spillover.spillover import Spillover, check_final_time, effort, finite_spillover, quadratic_cost
 from workbench.rig.actuators import Actuator
 from workbench.rig.sensors import Sensor
 from workbench.structure.domain import NamedPoints, Place
