@@ -23,7 +23,7 @@ from workbench.identification.input_output.noise_spectrum import alike
 from workbench.identification.input_output.peak_shape import overlap_remarks
 from workbench.identification.input_output.subspace_poles import subspace_poles
 from workbench.identification.input_output.time_variance import beside_changing, change_remarks, joined
-from workbench.identification.signal.data_quality import check_same_sensors
+from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import ParticipatingModes, credible, time_derivatives
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, SELECTION, Budget, Progress
 from workbench.records.record import Channel, Record
@@ -194,8 +194,7 @@ def identify_driven(
         ValueError: no inputs, inputs that never move or move alike; records that differ; too few samples; no mode.
     """
     budget = Budget(seconds, progress)
-    records = [records] if isinstance(records, Record) else list(records)
-    check_same_sensors(records)
+    records = of_same_sensors(records)
     _check_inputs(records)
     straight = records[0].input_hold == "first" if straight is None else straight
     data = KnownInputs(

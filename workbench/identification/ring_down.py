@@ -16,7 +16,7 @@ from workbench.identification.free_decay.ibrahim import stabilise, stable_modes,
 from workbench.identification.free_decay.order import identify_within
 from workbench.identification.free_decay.preparation import decay_start, without_drift, without_polynomial
 from workbench.identification.free_decay.refinement import in_coloured_noise, refine, unshaped
-from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors, data_faults
+from workbench.identification.signal.data_quality import check_data_quality, data_faults, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified, OfRefined, Refined
 from workbench.identification.signal.projection import forget_transforms, power_of, power_sums, project
 from workbench.identification.signal.searches import SECONDS, Budget, Progress
@@ -108,8 +108,7 @@ def ring_down(
             freely.
     """
     budget = Budget(seconds, progress)
-    records = [records] if isinstance(records, Record) else list(records)
-    check_same_sensors(records)
+    records = of_same_sensors(records)
     cut, notes = [], []
     for record in records:
         begins, notes_here = (start, []) if start is not None else _start(record)

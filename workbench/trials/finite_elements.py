@@ -18,6 +18,7 @@ from workbench.structure.domain import Between, NamedPoints, Where, position
 from workbench.structure.finite_elements import FiniteElements
 from workbench.structure.member import Bar, Beam, Structure
 from workbench.structure.modes import Modes, freeze
+from workbench.structure.profile import Profile
 from workbench.structure.supports import HELD
 
 ELEMENTS = 240
@@ -79,8 +80,8 @@ def element_modes(
     beam = isinstance(member, Beam)
     special = [*places, *(a for a, _ in (*altered.masses, *altered.springs))]
     special += [at + side * width / 2 for at, width, _ in altered.losses for side in (-1, 1)]
-    profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
-    special += [*member.mass_per_length.breaks, *profile.breaks, *(part.at for part in member.attachments)]
+    breaks = [*member.mass_per_length.breaks, *_stiffness(member).breaks]
+    special += [*breaks, *(part.at for part in member.attachments)]
     nodes = _nodes(np.array(special, float), member.length)
     basis = Basis(MeshLine(nodes), ElementLineHermite() if beam else ElementLineP2(), intorder=8)
     strain, mass, slopes, strain_energy = _matrices(basis, member, altered)
@@ -184,8 +185,7 @@ def _node(nodes: np.ndarray, at: float) -> int:
 
 def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sparray, sparray, sparray, Functional]:
     """Of strain, mass and slopes, and the strain energy of one shape, twice."""
-    bar = isinstance(member, Bar)
-    profile = member.axial_stiffness if isinstance(member, Bar) else member.bending_stiffness
+    profile = _stiffness(member)
 
     def rigidity(x: Floats) -> Floats:
         values: Floats = altered.stiffness_factor * profile(x) * _waves(altered.stiffness_waves, x / member.length)
@@ -193,29 +193,19 @@ def _matrices(basis: Basis, member: Structure, altered: Alterations) -> tuple[sp
             values = values * np.where(np.abs(x - at) < width / 2, 1.0 - loss, 1.0)
         return values
 
-    def bending(u: Any, v: Any, w: Any) -> Any:
-        return rigidity(w.x[0]) * dd(u)[0, 0] * dd(v)[0, 0]
+    def strain(u: Any) -> Any:
+        return d(u)[0] if isinstance(member, Bar) else dd(u)[0, 0]
 
-    def slope(u: Any, v: Any, w: Any) -> Any:
-        return d(u)[0] * d(v)[0]
+    def density(x: Floats) -> Floats:
+        return np.asarray(member.mass_per_length(x) * _waves(altered.mass_waves, x / member.length))
 
-    def stretching(u: Any, v: Any, w: Any) -> Any:
-        return rigidity(w.x[0]) * d(u)[0] * d(v)[0]
-
-    def inertia(u: Any, v: Any, w: Any) -> Any:
-        x = w.x[0]
-        return member.mass_per_length(x) * _waves(altered.mass_waves, x / member.length) * u * v
-
-    def energy(w: Any) -> Any:
-        return rigidity(w.x[0]) * (d(w["shape"])[0] if bar else dd(w["shape"])[0, 0]) ** 2
-
-    strain = BilinearForm(stretching if bar else bending).assemble(basis)
-    return (
-        strain,
-        BilinearForm(inertia).assemble(basis).tolil(),
-        BilinearForm(slope).assemble(basis),
-        Functional(energy),
+    forms = (
+        lambda u, v, w: rigidity(w.x[0]) * strain(u) * strain(v),
+        lambda u, v, w: density(w.x[0]) * u * v,
+        lambda u, v, w: d(u)[0] * d(v)[0],
     )
+    stiffness, mass, slopes = (BilinearForm(form).assemble(basis) for form in forms)
+    return stiffness, mass.tolil(), slopes, Functional(lambda w: rigidity(w.x[0]) * strain(w["shape"]) ** 2)
 
 
 def _waves(waves: tuple[float, ...], share: np.ndarray) -> np.ndarray:
@@ -245,6 +235,10 @@ def _attached(member: Structure, name: str) -> list[tuple[float, float]]:
 def _typical(member: Structure) -> float:
     """A frequency of the size of the first elastic one, rad/s."""
     order = 2 if isinstance(member, Beam) else 1
-    profile = member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness
     x = np.linspace(0.05, 0.95, 19) * member.length
-    return float(np.sqrt(profile(x).mean() / member.mass_per_length(x).mean()) * (np.pi / member.length) ** order)
+    ratio = _stiffness(member)(x).mean() / member.mass_per_length(x).mean()
+    return float(np.sqrt(ratio) * (np.pi / member.length) ** order)
+
+
+def _stiffness(member: Structure) -> Profile:
+    return member.bending_stiffness if isinstance(member, Beam) else member.axial_stiffness

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import lstsq, svd
 
-from workbench.identification.signal.data_quality import check_same_sensors
+from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import normalised_shapes, time_derivatives
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, mac
@@ -82,8 +82,7 @@ def stacked_delays(
     Raises:
         ValueError: too few samples, records that differ in sensors or rate.
     """
-    records = [records] if isinstance(records, Record) else list(records)
-    check_same_sensors(records)
+    records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * n_modes, delays=delays)
     mu, vectors = shift_eigenpairs(basis, records[0].n_outputs)
     return as_modes(mu, vectors, records[0], branch)
@@ -188,8 +187,7 @@ def stabilise(records: Record | Sequence[Record], *, orders: Sequence[int], dela
     Raises:
         ValueError: fewer samples than the highest order needs.
     """
-    records = [records] if isinstance(records, Record) else list(records)
-    check_same_sensors(records)
+    records = of_same_sensors(records)
     basis = signal_subspace(records, 2 * max(orders), delays=delays)
     found = []
     for n in orders:

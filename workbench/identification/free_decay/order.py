@@ -21,7 +21,7 @@ from workbench.arrays import Complexes
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
-from workbench.identification.signal.data_quality import check_data_quality, check_same_sensors
+from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors
 from workbench.identification.signal.modal_estimates import Identified
 from workbench.identification.signal.projection import differ, project, variances, whitened
 from workbench.identification.signal.searches import (
@@ -82,7 +82,7 @@ def identify(
         ValueError: no mode rises above the noise; a faulty channel (`check_data_quality`); records that differ in
             sensors or rate; too few samples.
     """
-    records = [records] if isinstance(records, Record) else list(records)
+    records = of_same_sensors(records)
     found = identify_within(records, Budget(seconds, progress), most_modes=most_modes, false_alarm=false_alarm)
     return found.without_artefacts(np.pi / records[0].sample_time)
 
@@ -91,7 +91,6 @@ def identify_within(
     records: Sequence[Record], budget: Budget, *, most_modes: int | None = None, false_alarm: float = FALSE_ALARM
 ) -> Identified:
     """`identify`, on a budget that others share, artefacts included."""
-    check_same_sensors(records)
     for record in records:
         check_data_quality(record)
     shortest = min(records, key=lambda record: record.n_samples)

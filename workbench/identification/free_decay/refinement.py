@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from workbench.arrays import scaled_inverse, symmetric_root
-from workbench.identification.signal.data_quality import check_same_sensors
+from workbench.identification.signal.data_quality import of_same_sensors
 from workbench.identification.signal.modal_estimates import (
     Identified,
     Refined,
@@ -24,7 +24,7 @@ from workbench.identification.signal.modal_estimates import (
     normalised_shapes,
     time_derivatives,
 )
-from workbench.identification.signal.projection import Projection, noise_near, project, variances
+from workbench.identification.signal.projection import Projection, noise_near, pole_blocks, project, variances
 from workbench.identification.signal.searches import FIT, Budget, minimise
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
@@ -138,17 +138,11 @@ def normal_equations(
     factors = np.broadcast_to(factor, (len(fits), n, weights.shape[1]))
     for fit, weight, by in zip(fits, weights, factors, strict=True):
         a, b = fit.coefficients[:n] * weight * by, fit.coefficients[n : 2 * n] * weight * by
-        aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
-        (cc, cs), (sc, ss) = fit.gram.reshape(2, n, 2, n).transpose(0, 2, 1, 3)
-        h[:n, :n] += aa * cc + ab * cs + ab.T * sc + bb * ss
-        h[n:, n:] += bb * cc - ab.T * cs - ab * sc + aa * ss
-        cross = -(ab * cc) + aa * cs - bb * sc + ab.T * ss
-        h[:n, n:] += cross
-        h[n:, :n] += cross.T
-        x, y = fit.slopes[:n] * weight, fit.slopes[n:] * weight
-        g[:n] += -(a * x + b * y).sum(axis=1)
-        g[n:] += (b * x - a * y).sum(axis=1)
-    return h, g
+        matrix, right = pole_blocks(a, b, fit.gram, fit.slopes[:n] * weight, fit.slopes[n:] * weight)
+        h += matrix
+        g += right
+    decay = np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
+    return h * np.outer(decay, decay), g * decay
 
 
 def _mean_shapes(
@@ -230,8 +224,7 @@ def refine(
     Raises:
         ValueError: fewer samples than unknowns; no modes to start from.
     """
-    records = [records] if isinstance(records, Record) else list(records)
-    check_same_sensors(records)
+    records = of_same_sensors(records)
     if start.n_modes == 0:
         raise ValueError("there is no mode to refine; identify with more modes or a longer record first")
     unknowns = 2 * start.n_modes + int(offset)

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 
 from workbench.identification.signal.modal_estimates import normalised_shapes
+from workbench.identification.signal.projection import pole_blocks
 from workbench.identification.signal.searches import FIT, Budget, minimise
 
 Pair = tuple[np.ndarray, np.ndarray]
@@ -200,16 +201,9 @@ def normal(fit: Fit, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         w = 1.0 / noise[outputs]
         a = np.repeat(part.coefficients[:n] * w, q, axis=0)
         b = np.repeat(part.coefficients[n : 2 * n] * w, q, axis=0)
-        aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
-        (cc, cs), (sc, ss) = part.gram.reshape(2, size, 2, size).transpose(0, 2, 1, 3)
-        h[:size, :size] += aa * cc + ab * cs + ab.T * sc + bb * ss
-        h[size:, size:] += bb * cc - ab.T * cs - ab * sc + aa * ss
-        cross = ab * cc - aa * cs + bb * sc - ab.T * ss
-        h[:size, size:] += cross
-        h[size:, :size] += cross.T
-        x, y = part.slopes[:size] * w, part.slopes[size:] * w
-        g[:size] += (a * x + b * y).sum(axis=1)
-        g[size:] += (b * x - a * y).sum(axis=1)
+        matrix, right = pole_blocks(a, b, part.gram, part.slopes[:size] * w, part.slopes[size:] * w)
+        h += matrix
+        g += right
     free = free_parameters(fit)
     return h[np.ix_(free, free)], g[free]
 

@@ -238,9 +238,8 @@ def _apart(one: StablePole, other: StablePole) -> float:
 
 
 def _same(one: StablePole, other: StablePole) -> bool:
-    return _apart(one, other) < 0.25 * SUBSPACE.near + 0.5 * (abs(one.pole.real) + abs(other.pole.real)) / abs(
-        other.pole
-    )
+    half_widths = 0.5 * (abs(one.pole.real) + abs(other.pole.real)) / abs(other.pole)
+    return _apart(one, other) < 0.25 * SUBSPACE.near + half_widths
 
 
 def _covariances(outputs: np.ndarray, n_lags: int) -> np.ndarray:

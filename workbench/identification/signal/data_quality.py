@@ -70,8 +70,13 @@ def check_data_quality(record: Record) -> None:
         raise ValueError(f"record {record.name!r}: {fault.message}")
 
 
-def check_same_sensors(records: Sequence[Record]) -> None:
-    """Refuse no records, records that differ in outputs or sample time, and one that is given twice."""
+def of_same_sensors(records: Record | Sequence[Record]) -> list[Record]:
+    """The records, or the one, as a list.
+
+    Raises:
+        ValueError: no records, records that differ in outputs or sample time, and one that is given twice.
+    """
+    records = [records] if isinstance(records, Record) else list(records)
     if not records:
         raise ValueError("identification needs at least one record")
     first = records[0]
@@ -94,6 +99,7 @@ def check_same_sensors(records: Sequence[Record]) -> None:
                     f"records {other.name!r} and {record.name!r} hold the same measurement, which would count twice:"
                     " give it once"
                 )
+    return records
 
 
 def _dead(record: Record) -> Iterator[DataFault]:

@@ -26,6 +26,7 @@ from scipy.linalg import cho_factor, cho_solve, qr, solve_toeplitz, solve_triang
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
+from workbench.arrays import Floats
 from workbench.records.record import Record
 
 
@@ -49,6 +50,24 @@ class ProjectionSettings:
 
 
 PROJECTION = ProjectionSettings()
+
+
+def pole_blocks(a: np.ndarray, b: np.ndarray, gram: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[Floats, Floats]:
+    """Gauss-Newton matrix (2 n, 2 n) and right-hand side (2 n,) of complex unknowns, real parts first.
+
+    Of readings Re Σ (a - ib) z whose tangents ∂z, real and imaginary parts, are known projected:
+
+    Args:
+        a, b: (n, n_outputs) cosine and sine amplitudes, in units of the noise.
+        gram: (2 n, 2 n) of the tangents among themselves.
+        x, y: (n, n_outputs) of their real and imaginary parts with the residual, in units of the noise.
+    """
+    n = len(a)
+    aa, ab, bb = a @ a.T, a @ b.T, b @ b.T
+    (cc, cs), (sc, ss) = gram.reshape(2, n, 2, n).transpose(0, 2, 1, 3)
+    cross = ab * cc - aa * cs + bb * sc - ab.T * ss
+    upper, lower = aa * cc + ab * cs + ab.T * sc + bb * ss, bb * cc - ab.T * cs - ab * sc + aa * ss
+    return np.block([[upper, cross], [cross.T, lower]]), np.r_[(a * x + b * y).sum(axis=1), (b * x - a * y).sum(axis=1)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -243,16 +243,29 @@ def _sampled(modes: Modes, derivative: int, breaks: Sequence[float]) -> tuple[np
     return modes.phi(x, derivative), weights, x
 
 
-def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Least squares of matrix @ c = target with rows @ c = values held exactly."""
+def held_exactly(rows: np.ndarray, values: np.ndarray, what: str, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients c with rows @ c = values, and the directions (n_terms, n_free) that keep it.
+
+    Args:
+        what: the values are, in words.
+        size: of them, that their errors are judged by.
+
+    Raises:
+        ValueError: values that no coefficients give.
+    """
     particular = np.linalg.lstsq(rows, values, rcond=None)[0]
     left = np.abs(rows @ particular - values).max()
-    if left > KNOWN_TOLERANCE * max(np.abs(values).max(), 1e-300):
+    if left > KNOWN_TOLERANCE * size:
         raise ValueError(
-            f"the series with {rows.shape[1]} terms cannot take the {rows.shape[0]} known masses (off by {left:.3g});"
+            f"the series with {rows.shape[1]} terms cannot take the {rows.shape[0]} known {what} (off by {left:.3g});"
             " use more terms or fewer known places"
         )
-    free = null_space(rows)
+    return particular, null_space(rows)
+
+
+def _constrained(matrix: np.ndarray, target: np.ndarray, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Least squares of matrix @ c = target with rows @ c = values held exactly."""
+    particular, free = held_exactly(rows, values, "masses", max(np.abs(values).max(), 1e-300))
     if free.shape[1] == 0:
         return np.asarray(particular)
     return np.asarray(particular + free @ np.linalg.lstsq(matrix @ free, target - matrix @ particular, rcond=None)[0])

@@ -15,12 +15,12 @@ from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag, null_space
+from scipy.linalg import block_diag
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from workbench.arrays import Floats, scaled_inverse, symmetric_root
-from workbench.identification.updating.distributions import KNOWN_TOLERANCE, Basis
+from workbench.identification.updating.distributions import Basis, held_exactly
 from workbench.identification.updating.self_check import SelfCheck
 from workbench.identification.updating.sensitivity import LocalLoss, SeriesStructure
 from workbench.identification.updating.structure_task import TASK, FittedStructure, Task, UncertainProfile
@@ -317,14 +317,7 @@ def _held(basis: Basis, known: np.ndarray, nominal: Profile, what: str) -> tuple
     if basis.n_terms == 0 or len(known) == 0:
         return np.zeros(basis.n_terms), np.eye(basis.n_terms)
     rows, wanted = basis.functions(known[:, 0]), known[:, 1] / nominal(known[:, 0]) - 1.0
-    particular = np.linalg.lstsq(rows, wanted, rcond=None)[0]
-    left = np.abs(rows @ particular - wanted).max()
-    if left > KNOWN_TOLERANCE * max(np.abs(wanted).max(), 1.0):
-        raise ValueError(
-            f"the series with {basis.n_terms} terms cannot take the {len(known)} known {what} (off by {left:.3g} of the"
-            " nominal); use more terms or fewer known places"
-        )
-    return particular, null_space(rows)
+    return held_exactly(rows, wanted, f"{what} over the nominal", max(np.abs(wanted).max(), 1.0))
 
 
 def _uncertain(
