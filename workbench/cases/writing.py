@@ -21,6 +21,7 @@ from workbench.structure.profile import Profile
 from workbench.structure.supports import NAMED_EDGES, NAMED_ENDS, Edge, End
 
 POINTS = "points.csv"
+EDGES = ("simply supported", "clamped", "free")
 Support = TypeVar("Support", End, Edge)
 Port = Actuator | Sensor
 
@@ -44,9 +45,8 @@ def write_case(case: Case, folder: str | Path) -> Path:
         arrays: dict[str, Any] = {**signals_of(record)}
         np.savez_compressed(folder / file, **arrays)
         hold = {} if record.input_hold == "zero" else {"input_hold": record.input_hold}
-        blocks.append(
-            _table("[[record]]", name=record.name, file=file, sample_time=record.sample_time, use=use, **hold)
-        )
+        entry = {"name": record.name, "file": file, "sample_time": record.sample_time, "use": use, **hold}
+        blocks.append(_table("[[record]]", **entry))
     path = folder / "case.toml"
     path.write_text("\n\n".join(blocks) + "\n", encoding="utf-8")
     return path
@@ -109,10 +109,7 @@ def _plate(plate: Plate, n_modes: int) -> str:
         length=list(plate.length),
         **{name: float(quantity(0.0, 0.0)) for name, quantity in constants.items()},
         poisson_ratio=plate.poisson_ratio,
-        edges={
-            side: _named(edge, ("simply supported", "clamped", "free"), NAMED_EDGES)
-            for side, edge in plate.edges.items()
-        },
+        edges={side: _named(edge, EDGES, NAMED_EDGES) for side, edge in plate.edges.items()},
         damping_ratio=_damping_ratio(plate),
         modes=n_modes,
     )

@@ -1,7 +1,7 @@
 """`workbench redesign`: the controller that holds on the real structure."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -10,12 +10,6 @@ from workbench.cli.control import check_rate, count_of, law_from, observed
 from workbench.cli.possible import possible_rig
 from workbench.cli.rig_file import impulse_place
 from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from workbench.arrays import Floats
-    from workbench.records.record import Record
 
 
 @guarded
@@ -70,6 +64,8 @@ def redesign(
 
     Example: workbench redesign cases/arm --verdict verdict.json --control 2 --damping 0.05 --to controller.c
     """
+    import numpy as np
+
     from workbench.cases.case import read_case
     from workbench.design.export.export import check_name
     from workbench.design.laws.law import controlled_indices
@@ -90,7 +86,8 @@ def redesign(
     controlled = controlled_indices(rig.modes, count)
     struck = None if impulse_at is None else impulse_place(rig, impulse_at)
     sample_time = records[0].sample_time if rate_hz is None else 1.0 / rate_hz
-    test = impulse_test(rig, controlled, sample_time, struck, level=_largest(records), seed=seed)
+    level = np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0)
+    test = impulse_test(rig, controlled, sample_time, struck, level=level, seed=seed)
     own = law_from(rig, law, count, weight, damping, impulse_at=test.impulse_at, impulse=test.impulse)
     in_use: Design = own
     if estimator is not None:
@@ -125,9 +122,3 @@ def redesign(
     target = page or Path("out") / f"{found.name}-redesign.html"
     shown = (found.validation or found.fit)[0]
     say(f"  page       {short(redesign_page(result, target, name=found.name, record=shown, folder=case))}")
-
-
-def _largest(records: "Sequence[Record]") -> "Floats":
-    import numpy as np
-
-    return np.asarray(np.max([np.abs(record.outputs).max(axis=1) for record in records], axis=0))

@@ -35,16 +35,9 @@ def peers_errors(
             missed, false = (sum(s[what] for s in scores) for what in ("missed", "false"))
             ratio = sum(s["seconds"] for s in scores) / ours
             time = "" if row == 0 else f", {ratio:.2g} × our time"
-            ax.text(
-                0.99,
-                row - 0.38,
-                f"{missed} missed, {false} false{time}",
-                ha="right",
-                va="center",
-                fontsize=8.5,
-                color=GREY if missed + false == 0 else "black",
-                transform=ax.get_yaxis_transform(),
-            )
+            look = {"fontsize": 8.5, "color": GREY if missed + false == 0 else "black"}
+            place = {"ha": "right", "va": "center", "transform": ax.get_yaxis_transform()}
+            ax.text(0.99, row - 0.38, f"{missed} missed, {false} false{time}", **look, **place)
         ax.axvline(efficient[level], color=GREY, lw=3, alpha=0.5, zorder=0)
         ax.set(xscale="log", xlabel="error of the worst mode\n[standard errors of the bound]")
         ax.set_title(f"noise {level} dB below the record")

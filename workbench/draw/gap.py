@@ -156,11 +156,6 @@ def _short(where: Where) -> str:
     return " to ".join(map(str, where)) if isinstance(where, Between) else str(where)
 
 
-def _there(verdict: Verdict, where: Where) -> str:
-    text = verdict.nominal.modes.domain.text(where)
-    return text if isinstance(where, Between) else f"at {text}"
-
-
 def plot_unmodelled_force(verdict: Verdict) -> Figure:
     """The force missing at its place beside other effects and freed figures, over displacement and velocity."""
     evidence = verdict.attribution.evidence
@@ -170,13 +165,15 @@ def plot_unmodelled_force(verdict: Verdict) -> Figure:
         evidence = Evidence.of(apply_all(verdict.nominal, beside), verdict.attribution.search.data)
     place = evidence.place(chosen[0].at if chosen else verdict.where.at)
     figure, axes = new_figure(1, 2, width=10, height=3.8, sharey=True)
+    there = verdict.nominal.modes.domain.text(place.at)
+    there = there if isinstance(place.at, Between) else f"at {there}"
     step = max(1, place.force.size // 4000)
     for ax, series, name in (
         (axes[0], place.displacement, "displacement [m]"),
         (axes[1], place.velocity, "velocity [m/s]"),
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
-        ax.set_xlabel(f"{name} {_there(verdict, place.at)}")
+        ax.set_xlabel(f"{name} {there}")
         law = _law(chosen, series, name)
         if law is not None:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")

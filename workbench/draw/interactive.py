@@ -97,11 +97,8 @@ def _artists(ax: Axes) -> list[Artist | BarContainer]:
     bars = [c for c in ax.containers if isinstance(c, BarContainer) and c.patches]
     of_bars = {id(patch) for c in bars for patch in c.patches}
     alone = [a for a in (*ax.collections, *ax.images, *ax.patches, *ax.lines, *ax.texts) if a.get_visible()]
-    return sorted([*bars, *(a for a in alone if id(a) not in of_bars)], key=_height)
-
-
-def _height(artist: Artist | BarContainer) -> float:
-    return artist.patches[0].get_zorder() if isinstance(artist, BarContainer) else artist.get_zorder()
+    marks: list[Artist | BarContainer] = [*bars, *(a for a in alone if id(a) not in of_bars)]
+    return sorted(marks, key=lambda mark: (mark.patches[0] if isinstance(mark, BarContainer) else mark).get_zorder())
 
 
 def _described(ax: Axes, artist: Artist | BarContainer) -> list[dict[str, Any]]:

@@ -57,7 +57,8 @@ def plot_surface_modes(
         for along in _held_edges(x, y, fields):
             ax.plot(*along, color=COLOURS[6], linewidth=4, solid_capstyle="butt", clip_on=False)
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
-    _sides(axes[columns * ((count - 1) // columns)], modes)
+    a, b = x[-1], y[-1]
+    axes[columns * ((count - 1) // columns)].set(xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
     handles = [
         Swatch(facecolor=RED, label="up"),
         Swatch(facecolor=BLUE, label="down"),
@@ -283,13 +284,6 @@ def _panels(modes: Modes, count: int, columns: int) -> tuple[Figure, list[Axes]]
     for ax in grid.flat[count:]:
         ax.set_visible(False)
     return figure, list(grid.flat[:count])
-
-
-def _sides(ax: Axes, modes: Modes) -> None:
-    """The lengths of the sides, m."""
-    assert isinstance(modes.domain, Rectangle)
-    a, b = modes.domain.length
-    ax.set(xticks=(0.0, a), yticks=(0.0, b), xlabel="x [m]", ylabel="y [m]")
 
 
 def _bare(ax: Axes, modes: Modes) -> None:

@@ -119,10 +119,8 @@ def ring_down(
     try:
         found, cut, more = _without_drift(cut, n_modes, budget)
     except np.linalg.LinAlgError:
-        found, more = (
-            _by_stabilisation(cut, budget),
-            ["model order by stabilisation diagram: by likelihood there is none"],
-        )
+        found = _by_stabilisation(cut, budget)
+        more = ["model order by stabilisation diagram: by likelihood there is none"]
     found = found.without_artefacts(np.pi / cut[0].sample_time, growing=True)
     _check_decays(cut, found.refined)
     found = found.without_artefacts(np.pi / cut[0].sample_time)
@@ -165,11 +163,8 @@ def _without_drift(
     cleared, size = records, np.zeros((len(records), records[0].n_outputs))
     # A drift larger than the modes would be searched for modes first; a parabola is none.
     drifts = [without_drift(record, poles, most=RING_DOWN.parabola) for record in records]
-    pairs = zip(drifts, records, strict=True)
-    if any(
-        (drift.record.outputs.var(axis=1) < RING_DOWN.dominant * record.outputs.var(axis=1)).any()
-        for drift, record in pairs
-    ):
+    variances = [(d.record.outputs.var(axis=1), r.outputs.var(axis=1)) for d, r in zip(drifts, records, strict=True)]
+    if any((left < RING_DOWN.dominant * whole).any() for left, whole in variances):
         cleared, size = [drift.record for drift in drifts], np.array([drift.size for drift in drifts])
     span = max(record.n_samples * record.sample_time for record in records)
     for _ in range(RING_DOWN.drift_rounds):
@@ -230,9 +225,8 @@ def _check_undriven(record: Record) -> None:
     about = about.astype(np.float32)
     correlation = irfft(_power(about, 2 * n), 2 * n)[1:n] / (n - np.arange(1, n)) / len(about)
     forget_transforms(n)
-    soon, late = (
-        float(np.sqrt((part**2).mean())) for part in (correlation[: n // 20 + 1], correlation[n // 3 : n // 2])
-    )
+    stretches = correlation[: n // 20 + 1], correlation[n // 3 : n // 2]
+    soon, late = (float(np.sqrt((part**2).mean())) for part in stretches)
     # Noise is uncorrelated, and holds no mode; other checks say so.
     oscillates = soon > RING_DOWN.uncorrelated / np.sqrt(n)
     if (

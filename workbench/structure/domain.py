@@ -326,7 +326,9 @@ class NamedPoints:
         Raises:
             PlaceError: positions are not known.
         """
-        return float(np.linalg.norm(np.ptp(self._positions, axis=0)))
+        if self.positions is None:
+            raise PlaceError("the positions of the named points are not known, so there is no distance; give positions")
+        return float(np.linalg.norm(np.ptp(self.positions, axis=0)))
 
     def __str__(self) -> str:
         return f"{len(self.names)} named points"
@@ -334,12 +336,6 @@ class NamedPoints:
     def __repr__(self) -> str:
         first = ", ".join(self.names[:4]) + (", ..." if len(self.names) > 4 else "")
         return f"<NamedPoints: {len(self.names)} points, {first}>"
-
-    @property
-    def _positions(self) -> np.ndarray:
-        if self.positions is None:
-            raise PlaceError("the positions of the named points are not known, so there is no distance; give positions")
-        return self.positions
 
     def locate(self, places: Any) -> np.ndarray:
         """Indices (n_places,) of named points.
@@ -351,7 +347,8 @@ class NamedPoints:
         found = [self._index.get(name, -1) if isinstance(name, str) else -1 for name in names]
         if -1 in found:
             name = names[found.index(-1)]
-            raise PlaceError(f"there is no point {name!r}; {self._known(name)}: give one of these{self._alike(name)}")
+            meant = "".join(f"; did you mean {alike!r}?" for alike in get_close_matches(str(name), self.names, n=1))
+            raise PlaceError(f"there is no point {name!r}; {self._known(name)}: give one of these{meant}")
         return np.array(found, int)
 
     def _known(self, name: Any) -> str:
@@ -361,11 +358,6 @@ class NamedPoints:
         if node is None or points == [node]:  # a point alone is no node that a name could begin with
             return f"the points are {_some(self.names)}"
         return f"node {node!r} has {_some(points)}"
-
-    def _alike(self, name: Any) -> str:
-        """The name that is spelled most like another one, as a question; nothing where none is."""
-        alike = get_close_matches(str(name), self.names, n=1)
-        return f"; did you mean {alike[0]!r}?" if alike else ""
 
     def slope(self, places: Any, derivative: Derivative, direction: str | None) -> tuple[Any, Derivative, float]:
         """Names, derivative 0 and sign: the point of the same node that moves or turns in the direction."""

@@ -94,7 +94,7 @@ class FiniteElements(Printed):
             raise ValueError(f"from 1 to {n} modes can be asked of {n} degrees of freedom; got {n_modes}")
         if _negative_pivots(self.mass):
             raise ValueError("the mass matrix is not positive: some motion would have negative kinetic energy")
-        shift, factor = self._factor()
+        shift, factor = self._shifted_factor()
         if n_modes < n:
             inverse = LinearOperator((n, n), matvec=factor.solve, dtype=float)
             start = np.random.default_rng(0).standard_normal(n)
@@ -103,7 +103,10 @@ class FiniteElements(Printed):
             except ArpackError:  # hardly more motions have mass than modes are asked for
                 shapes = self._massive_shapes(n_modes, shift)
         else:
-            shapes = self._all_shapes()
+            try:
+                shapes = eigh(self.stiffness.toarray(), self.mass.toarray())[1]
+            except LinAlgError as error:
+                raise ValueError("some motion has no mass, so there are fewer modes; ask for fewer") from error
         sizes = np.sum(shapes * (self.mass @ shapes), axis=0)
         if (sizes <= 0).any():
             raise ValueError("the mass matrix is not positive: a mode has no kinetic energy")
@@ -126,13 +129,6 @@ class FiniteElements(Printed):
         else:
             damping = self.damping.matrix(omega)  # type: ignore[union-attr]
         return Modes(omega=omega, damping=damping, shapes=lambda index, _: shapes[index], domain=self.nodes)
-
-    def _all_shapes(self) -> Floats:
-        try:
-            shapes: Floats = eigh(self.stiffness.toarray(), self.mass.toarray())[1]
-        except LinAlgError as error:
-            raise ValueError("some motion has no mass, so there are fewer modes; ask for fewer") from error
-        return shapes
 
     def _massive_shapes(self, n_modes: int, shift: float) -> Floats:
         """The lowest shapes by LAPACK, M φ = ν (K - σ M) φ, with ν = 0 for each motion that has no mass."""
@@ -194,7 +190,7 @@ class FiniteElements(Printed):
             raise ValueError(f"{part}: give it at a point that is a rotation: rx, ry or rz of the node")
         return self._row(part.at)
 
-    def _factor(self) -> tuple[float, SuperLU]:
+    def _shifted_factor(self) -> tuple[float, SuperLU]:
         """A shift σ ≤ 0 and the factors of K - σ M: no shift unless the structure can move as a rigid body."""
         try:
             factor = _factor(self.stiffness)

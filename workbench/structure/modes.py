@@ -119,9 +119,8 @@ class Modes(Printed):
                 )
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        rows = [
-            (str(r + 1), f"{f:.6g}", f"{100 * z:.4g}") for r, (f, z) in enumerate(zip(self.frequencies_hz, self.zeta))
-        ]
+        each = enumerate(zip(self.frequencies_hz, self.zeta))
+        rows = [(str(r + 1), f"{f:.6g}", f"{100 * z:.4g}") for r, (f, z) in each]
         coupled = () if self.proportional else ("damping couples the modes; the ratios are those of its diagonal",)
         line = f"{counted(self.n_modes, 'mode')}, {_range_hz(self.frequencies_hz)}, on {self.domain}"
         return line, ("mode", "frequency [Hz]", "damping [%]"), rows, coupled

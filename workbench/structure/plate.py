@@ -103,9 +103,7 @@ class Plate(_Surface):
     attachments: tuple[Attachment, ...] = ()
     tension: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    if (
-        TYPE_CHECKING
-    ):  # the door is wider than the fields: short forms become `Field`, `Edge` and a triple on the way in
+    if TYPE_CHECKING:  # the door is wider than the fields: short forms become `Field`, `Edge` and a triple
 
         def __init__(
             self,

@@ -180,8 +180,7 @@ def _evaluation(nodes: bytes, degrees: tuple[int, ...], continuity: int, places:
         local = 2.0 * (x[here] - segments.nodes[s]) / h - 1.0
         coefficients = _derived(degrees[s], continuity, derivative)
         values = eval_legendre(np.arange(coefficients.shape[0]), local[:, None]) @ coefficients
-        matrix[np.ix_(np.flatnonzero(here), segments.indices(s))] = (
-            values * segments.scales(s) * (2.0 / h) ** derivative
-        )
+        values = values * segments.scales(s) * (2.0 / h) ** derivative
+        matrix[np.ix_(np.flatnonzero(here), segments.indices(s))] = values
     matrix.flags.writeable = False
     return matrix

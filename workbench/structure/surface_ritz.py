@@ -201,9 +201,8 @@ def _uncoupling(found: SurfaceModes, problem: SurfaceProblem) -> np.ndarray:
     if not joins.size:
         return rotation
     a, b = problem.length
-    slopes = found.products(lambda x, y: a**2 + 0 * x * y, (1, 0)) + found.products(
-        lambda x, y: 0.5 * b**2 + 0 * x * y, (0, 1)
-    )
+    slopes = found.products(lambda x, y: a**2 + 0 * x * y, (1, 0))
+    slopes = slopes + found.products(lambda x, y: 0.5 * b**2 + 0 * x * y, (0, 1))
     for cluster in np.split(joins, np.flatnonzero(np.diff(joins) > 1) + 1):
         index = slice(cluster[0], cluster[-1] + 2)
         rotation[index, index] = eigh(slopes[index, index])[1]

@@ -38,7 +38,7 @@ def _factor(name: str, size: float) -> Draw:
     return draw
 
 
-def _stiff(scene: Scene) -> float:
+def _typical_stiffness(scene: Scene) -> float:
     """A stiffness that matters at a point, N/m: that of the first elastic mode."""
     modes = scene.bench.rig.modes
     first = int(np.argmax(modes.omega > 0))
@@ -48,7 +48,7 @@ def _stiff(scene: Scene) -> float:
     return float(modes.omega[first] ** 2 / np.max(shape**2))
 
 
-def _told(where: Where) -> Numbers:
+def _place(where: Where) -> Numbers:
     """A place in the words of the case format."""
     if isinstance(where, Between):
         return {"between": list(where)}
@@ -61,8 +61,8 @@ def _at_point(make: Callable[[PointSizes, np.random.Generator], Strengths]) -> D
     def draw(scene: Scene, rng: np.random.Generator) -> OfStrength:
         where = scene.place(rng, between=True)
         w, v = map(_rms, scene.motion_at(where))
-        law = make(PointSizes(_stiff(scene), w, v, scene.bench.level), rng)
-        return lambda s: {**_told(where), **law(s)}
+        law = make(PointSizes(_typical_stiffness(scene), w, v, scene.bench.level), rng)
+        return lambda s: {**_place(where), **law(s)}
 
     return draw
 
@@ -92,7 +92,7 @@ def _modal_damping(scene: Scene) -> float:
     return float(2.0 * modes.zeta[0] * modes.omega[modes.omega > 0][0])
 
 
-def _loss(scene: Scene, rng: np.random.Generator) -> OfStrength:
+def _stiffness_loss(scene: Scene, rng: np.random.Generator) -> OfStrength:
     length = _member(scene).length
     width = round(float(rng.uniform(0.05, 0.2)) * length, 4)
     at = round(float(rng.uniform(0.5 * width + 0.02 * length, 0.9 * length - 0.5 * width)), 4)
@@ -136,13 +136,13 @@ def _drag(scene: Scene, rng: np.random.Generator) -> OfStrength:
 def _damper(scene: Scene, rng: np.random.Generator) -> OfStrength:
     where, damping = scene.place(rng, between=True), _modal_damping(scene)
     shape = float(np.abs(scene.bench.rig.modes.phi_at(where)).max())
-    return lambda s: {**_told(where), "coefficient": s * damping / shape**2}
+    return lambda s: {**_place(where), "coefficient": s * damping / shape**2}
 
 
 def _mass(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     shape = float(np.abs(scene.bench.rig.modes.phi(at)[0]).max())
-    return lambda s: {**_told(at), "mass": 0.01 * s / shape**2}
+    return lambda s: {**_place(at), "mass": 0.01 * s / shape**2}
 
 
 def _drive(name: str, make: Callable[[Scene, np.random.Generator], Number], every: float = 0.6) -> Draw:
@@ -166,7 +166,7 @@ def _limit(scene: Scene, rng: np.random.Generator) -> Number:
     return lambda s: peak * float(np.exp(-0.5 * s))
 
 
-def _dead(scene: Scene, rng: np.random.Generator) -> Number:
+def _dead_zone(scene: Scene, rng: np.random.Generator) -> Number:
     return lambda s: 0.1 * s * _rms(scene.commands[0])
 
 
@@ -176,12 +176,12 @@ def _hysteresis(scene: Scene, rng: np.random.Generator) -> OfStrength:
     return lambda s: {"input": which, "share": float(-np.expm1(-0.3 * s)), "width": width}
 
 
-def _push(scene: Scene, rng: np.random.Generator) -> Number:
+def _bias_force(scene: Scene, rng: np.random.Generator) -> Number:
     sign = _sign(rng)
     return lambda s: sign * 0.1 * s * scene.bench.level
 
 
-def _rate(scene: Scene, rng: np.random.Generator) -> Number:
+def _rate_limit(scene: Scene, rng: np.random.Generator) -> Number:
     """No faster than twice the changes of the command: beyond, an accelerometer shows a delay and nothing else."""
     steps = np.abs(np.diff(scene.commands[0])) / scene.bench.sample_time
     return lambda s: float(np.quantile(steps, 0.9)) / max(s, 0.5)
@@ -201,7 +201,7 @@ def _swapped_outputs(scene: Scene, rng: np.random.Generator) -> Numbers:
     return {"output": pair[0], "with": pair[1]}
 
 
-def _crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
+def _sensor_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     row, source = rng.choice(len(scene.bench.rig.sensors), 2, replace=False)
     names, sign = [s.name for s in scene.bench.rig.sensors], _sign(rng)
     ratio = float(scene.outputs[row].std() / scene.outputs[source].std())
@@ -264,7 +264,7 @@ def _clip(scene: Scene, row: int, rng: np.random.Generator) -> Number:
     return lambda s: float(np.abs(scene.outputs[row]).max()) * float(np.exp(-0.4 * s))
 
 
-def _step(scene: Scene, rng: np.random.Generator) -> Numbers:
+def _quantisation(scene: Scene, rng: np.random.Generator) -> Numbers:
     row = int(rng.integers(len(scene.bench.rig.sensors)))
     sensor = scene.bench.rig.sensors[row]
     step = float(f"{min(rng.uniform(4.0, 12.0) * sensor.noise_std, 0.3 * scene.outputs[row].std()):.3g}")
@@ -278,15 +278,15 @@ def _sensor_lag(scene: Scene, rng: np.random.Generator) -> OfStrength:
     return lambda s: {"output": which, "time_constant": _late(scene, s)}
 
 
-def _tone(scene: Scene, rng: np.random.Generator) -> OfStrength:
+def _periodic_force(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at = scene.place(rng)
     frequency, phase = float(rng.uniform(0.1, 1.0)) * scene.bench.band_hz, float(rng.uniform(-np.pi, np.pi))
-    return lambda s: {**_told(at), "frequency": frequency, "amplitude": 0.05 * s * scene.bench.level, "phase": phase}
+    return lambda s: {**_place(at), "frequency": frequency, "amplitude": 0.05 * s * scene.bench.level, "phase": phase}
 
 
-def _noise(scene: Scene, rng: np.random.Generator) -> OfStrength:
+def _random_force(scene: Scene, rng: np.random.Generator) -> OfStrength:
     at, corner = scene.place(rng), float(rng.uniform(0.6, 2.0)) * scene.bench.band_hz
-    return lambda s: {**_told(at), "rms": 0.1 * s * scene.bench.level, "corner": corner}
+    return lambda s: {**_place(at), "rms": 0.1 * s * scene.bench.level, "corner": corner}
 
 
 def _drift(scene: Scene, rng: np.random.Generator) -> OfStrength:
@@ -294,7 +294,7 @@ def _drift(scene: Scene, rng: np.random.Generator) -> OfStrength:
     return lambda s: {"rate": sign * min(0.02 * s, 0.5) / duration}
 
 
-def _cross_talk(scene: Scene, rng: np.random.Generator) -> OfStrength:
+def _actuator_crosstalk(scene: Scene, rng: np.random.Generator) -> OfStrength:
     first, second = rng.choice(scene.acting, 2, replace=False)
     sign = _sign(rng)
     return lambda s: {"input": str(first), "from": str(second), "share": sign * 0.2 * s}
@@ -324,7 +324,7 @@ def _spikes(scene: Scene, rng: np.random.Generator) -> OfStrength:
 DRAWS: dict[str, Draw] = {
     "modulus_error": _factor("factor", 0.02),
     "point_mass": _mass,
-    "local_stiffness_loss": _loss,
+    "local_stiffness_loss": _stiffness_loss,
     "support_rotation": _support,
     "axial_load": _axial,
     "ground_spring": _at_point(lambda p, rng: lambda s: {"stiffness": 0.05 * s * p.stiffness}),
@@ -337,11 +337,11 @@ DRAWS: dict[str, Draw] = {
     "actuator_lag": _drive("time_constant", lambda c, r: lambda s: _late(c, s)),
     "actuator_delay": _drive("delay", lambda c, r: lambda s: _late(c, s)),
     "actuator_saturation": _drive("limit", _limit),
-    "actuator_dead_zone": _drive("width", _dead),
+    "actuator_dead_zone": _drive("width", _dead_zone),
     "actuator_misplacement": partial(_moved, "input"),
     "actuator_hysteresis": _hysteresis,
-    "actuator_bias": _drive("force", _push, every=0.0),
-    "actuator_rate_limit": _drive("rate", _rate),
+    "actuator_bias": _drive("force", _bias_force, every=0.0),
+    "actuator_rate_limit": _drive("rate", _rate_limit),
     "swapped_inputs": _swapped_inputs,
     "sensor_gain": _reading("gain", lambda c, row, r: (lambda sign: lambda s: float(np.exp(sign * 0.3 * s)))(_sign(r))),
     "sensor_bias": _reading("bias", _in_rms(0.3)),
@@ -349,14 +349,14 @@ DRAWS: dict[str, Draw] = {
     "sensor_lag": _sensor_lag,
     "sensor_misplacement": partial(_moved, "output"),
     "sensor_delay": _reading("delay", lambda c, row, r: lambda s: _late(c, s)),
-    "sensor_crosstalk": _crosstalk,
+    "sensor_crosstalk": _sensor_crosstalk,
     "swapped_outputs": _swapped_outputs,
     "sensor_clipping": _reading("limit", _clip),
-    "sensor_quantisation": _step,
-    "periodic_disturbance": _tone,
-    "random_disturbance": _noise,
+    "sensor_quantisation": _quantisation,
+    "periodic_disturbance": _periodic_force,
+    "random_disturbance": _random_force,
     "stiffness_drift": _drift,
-    "cross_talk": _cross_talk,
+    "cross_talk": _actuator_crosstalk,
     "bent_command": _bent_command,
     "bent_reading": _reading("curvature", _bent_reading),
     "hum": _hum,

@@ -63,7 +63,7 @@ def _swapped(side: str, key: str, plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, **{side: ports})
 
 
-def _crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
+def _sensor_crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
     names = [sensor.name for sensor in plant.sensors]
     row, source = names.index(e["output"]), names.index(e["from"])
 
@@ -75,7 +75,7 @@ def _crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
     return replace(plant, reading_laws=(*plant.reading_laws, read))
 
 
-def _cross_talk(plant: Plant, e: dict[str, Any]) -> Plant:
+def _actuator_crosstalk(plant: Plant, e: dict[str, Any]) -> Plant:
     names = [a.name for a in plant.actuators]
     mix = np.eye(len(names))
     mix[names.index(e["input"]), names.index(e["from"])] = e["share"]
@@ -138,7 +138,7 @@ HIDE: dict[str, Hide] = {
     "sensor_lag": _sensor(time_constant="time_constant"),
     "sensor_misplacement": partial(_moved, "sensors", "output"),
     "sensor_delay": _sensor(delay="delay"),
-    "sensor_crosstalk": _crosstalk,
+    "sensor_crosstalk": _sensor_crosstalk,
     "swapped_outputs": partial(_swapped, "sensors", "output"),
     "sensor_clipping": _sensor(limit="limit"),
     "sensor_quantisation": _sensor(step="step"),
@@ -152,7 +152,7 @@ HIDE: dict[str, Hide] = {
 # Kinds that no catalogue of the diagnosis holds: an honest verdict on them is "unknown".
 OUTSIDE: dict[str, Hide] = {
     **{name: partial(_law, law) for name, law in POINT_LAWS.items() if law.outside},
-    "cross_talk": _cross_talk,
+    "cross_talk": _actuator_crosstalk,
     "bent_command": _bent_command,
     "bent_reading": partial(_reading, _bent_reading),
     "hum": partial(_reading, _hum),

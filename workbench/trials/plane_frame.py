@@ -69,22 +69,11 @@ def beam_element(one: Floats, other: Floats, section: Section) -> tuple[Floats, 
     k, m = np.zeros((6, 6)), np.zeros((6, 6))
     axial, bent = np.ix_([0, 3], [0, 3]), np.ix_([1, 2, 4, 5], [1, 2, 4, 5])
     k[axial] = section.axial / n * np.array([[1, -1], [-1, 1]])
-    k[bent] = (
-        section.bending
-        / n**3
-        * np.array(
-            [[12, 6 * n, -12, 6 * n], [6 * n, 4 * n**2, -6 * n, 2 * n**2]]
-            + [[-12, -6 * n, 12, -6 * n], [6 * n, 2 * n**2, -6 * n, 4 * n**2]]
-        )
-    )
+    upper = [[12, 6 * n, -12, 6 * n], [6 * n, 4 * n**2, -6 * n, 2 * n**2]]
+    lower = [[-12, -6 * n, 12, -6 * n], [6 * n, 2 * n**2, -6 * n, 4 * n**2]]
+    k[bent] = section.bending / n**3 * np.array(upper + lower)
     m[axial] = section.mass * n / 6 * np.array([[2, 1], [1, 2]])
-    m[bent] = (
-        section.mass
-        * n
-        / 420
-        * np.array(
-            [[156, 22 * n, 54, -13 * n], [22 * n, 4 * n**2, 13 * n, -3 * n**2]]
-            + [[54, 13 * n, 156, -22 * n], [-13 * n, -3 * n**2, -22 * n, 4 * n**2]]
-        )
-    )
+    upper = [[156, 22 * n, 54, -13 * n], [22 * n, 4 * n**2, 13 * n, -3 * n**2]]
+    lower = [[54, 13 * n, 156, -22 * n], [-13 * n, -3 * n**2, -22 * n, 4 * n**2]]
+    m[bent] = section.mass * n / 420 * np.array(upper + lower)
     return turn.T @ m @ turn, turn.T @ k @ turn

@@ -190,11 +190,8 @@ def _frame(rng: np.random.Generator) -> tuple[Rig, FiniteElements]:
     strips: list[tuple[str, str, Section]] = []
     shown = []
     for k in range(1, storeys + 1):
-        chains = [
-            (side, f"{side}{k - 1}" if k == 1 else f"{side}{k - 1}.{PARTS}", x)
-            for side, x in (("L", 0.0), ("R", width))
-        ]
-        for side, foot, x in chains:
+        for side, x in (("L", 0.0), ("R", width)):
+            foot = f"{side}0" if k == 1 else f"{side}{k - 1}.{PARTS}"
             inner = [f"{side}{k}.{i}" for i in range(1, PARTS + 1)]
             nodes |= {node: (x, (k - 1 + (i + 1) / PARTS) * height) for i, node in enumerate(inner)}
             strips += [(*ends, column) for ends in pairwise([foot, *inner])]

@@ -151,15 +151,8 @@ class DigitalController:
         if self.relays is not None:
             raise ValueError(f"{self.name} switches, so it has no StateSpace; simulate it instead")
         a, b = self.a + self.e @ self.c, (self.b + self.e @ self.d) * self.scale
-        return control.ss(
-            a,
-            b,
-            self.c,
-            self.d * self.scale,
-            self.sample_time,
-            inputs=signal_names(self.sensors),
-            outputs=signal_names(self.actuators),
-        )
+        names = {"inputs": signal_names(self.sensors), "outputs": signal_names(self.actuators)}
+        return control.ss(a, b, self.c, self.d * self.scale, self.sample_time, **names)
 
 
 def modal_states(modes: Sequence[int]) -> tuple[str, ...]:

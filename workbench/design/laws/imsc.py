@@ -38,16 +38,13 @@ def riccati_gains(omega: ArrayLike, weight: ArrayLike, damping: ArrayLike = 0.0)
             f"the control weight R is one number, or one a mode: {np.size(omega)} modes need as many; got"
             f" {np.size(weight)}"
         )
-    omega, weight, c = np.broadcast_arrays(
-        np.asarray(omega, float), np.asarray(weight, float), np.asarray(damping, float)
-    )
+    omega, weight, c = np.broadcast_arrays(*(np.asarray(each, float) for each in (omega, weight, damping)))
     if not (np.isfinite(weight).all() and (weight > 0).all()):
         raise DesignError(f"the control weight R must be positive; got {weight.min() if weight.size else weight}")
     square, inverse = omega**2, 1.0 / weight
     # a rigid-body mode has no potential energy to weigh: the gain on its displacement is then zero
-    g1 = np.where(
-        square > 0, square * inverse / np.maximum(square + np.sqrt(square**2 + square * inverse), 1e-300), 0.0
-    )
+    sums = square + np.sqrt(square**2 + square * inverse)
+    g1 = np.where(square > 0, square * inverse / np.maximum(sums, 1e-300), 0.0)
     excess = inverse + 2.0 * g1
     g2 = excess / (c + np.sqrt(c**2 + excess))
     return g1, g2

@@ -90,11 +90,8 @@ class Explanation(Printed):
     destabilising: PoleShift | None
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
-        state = (
-            f"stable, margin {self.margin:.3g} 1/s"
-            if self.loop.stable
-            else f"unstable, grows by {-self.margin:.3g} 1/s"
-        )
+        grows = f"unstable, grows by {-self.margin:.3g} 1/s"
+        state = f"stable, margin {self.margin:.3g} 1/s" if self.loop.stable else grows
         rows = [
             (
                 str(each.mode + 1),
@@ -201,10 +198,8 @@ class _OneMode:
 
     def _terms(self, s: complex) -> Complexes:
         """Shares (n_actuators, n_channels) of the movement that s would be."""
-        answer: Complexes = self._rest.forces(self._r, s)
-        terms: Complexes = (
-            self._pushed[:, None] * answer * (self._seen @ np.array([1.0, s])) / (s - self.pole.conjugate())
-        )
+        forces, read = self._rest.forces(self._r, s), self._seen @ np.array([1.0, s])
+        terms: Complexes = self._pushed[:, None] * forces * read / (s - self.pole.conjugate())
         return terms
 
     def closed_pole(self) -> complex:

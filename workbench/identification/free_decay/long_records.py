@@ -240,9 +240,8 @@ class _Search:
         """Strengths and poles of one rate's local maxima that stand out of white noise."""
         step = 2.0 * np.pi / (self._size(rate)[1] * self.dt)
         omega = step * np.arange(strengths.size)
-        inside = (omega > max(rate / SELECTION.most_damped, 1.5 * self.bin_width)) & (
-            omega < np.pi / self.dt - self.bin_width
-        )
+        lowest = max(rate / SELECTION.most_damped, 1.5 * self.bin_width)
+        inside = (omega > lowest) & (omega < np.pi / self.dt - self.bin_width)
         highest = np.r_[False, (strengths[1:-1] > strengths[:-2]) & (strengths[1:-1] >= strengths[2:]), False]
         at = np.flatnonzero(inside & highest & (strengths > LONG.least_independent * self.enter))
         poles = -rate + 1j * omega[at]

@@ -176,7 +176,8 @@ class _FreeDecay:
         return model.poles.size
 
     def strongest(self, model: _Model, rejected: list[tuple[complex, float]]) -> complex | None:
-        if self._exact(model):
+        # of round-off every candidate would make something else
+        if (_squares(model.residuals) <= self.round_off).all():
             return None
         each = zip(self.grids, model.residuals, model.weights, strict=True)
         strengths = np.sum([grid.strengths(left, weights, model.poles) for grid, left, weights in each], axis=0)
@@ -314,10 +315,6 @@ class _FreeDecay:
         at = round((pole.imag - grid.lowest) / grid.bin_width)
         beside = left[max(at - SELECTION.noise_bins, 0) : at + SELECTION.noise_bins + 1]
         return max(1.0, float(np.median(beside)) / float(left.mean())) if beside.size else 1.0
-
-    def _exact(self, model: _Model) -> bool:
-        """Whether the residual is round-off, of which every candidate would make something else."""
-        return bool((_squares(model.residuals) <= self.round_off).all())
 
 
 class _Grid:

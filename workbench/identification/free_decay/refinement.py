@@ -67,12 +67,8 @@ def in_coloured_noise(
     records = [records] if isinstance(records, Record) else list(records)
     fits = fits or [project(record, refined.modes.poles, True) for record in records]
     poles = fits[0].poles
-    ratios = np.array(
-        [
-            noise_near(poles, fit.residual, noise, record.sample_time)
-            for record, fit, noise in zip(records, fits, refined.noise, strict=True)
-        ]
-    )
+    each = zip(records, fits, refined.noise, strict=True)
+    ratios = np.array([noise_near(poles, fit.residual, noise, record.sample_time) for record, fit, noise in each])
     if (ratios == 1.0).all():
         return refined
     found = records, poles, fits, refined.noise
@@ -382,6 +378,5 @@ def noise_level(records: Sequence[Record], fits: Sequence[Projection], weights: 
     squares = np.array([np.einsum("tj,tj->j", f.residual, f.residual) for f in fits])
     signal = _squares(records)
     floor = np.maximum(1e-32 * signal, 1e-32 * signal.max() + 1e-300)
-    return np.asarray(
-        np.sqrt(variances(np.maximum(squares, floor), np.maximum(free - lost / records[0].n_outputs, 1.0)))
-    )
+    free = np.maximum(free - lost / records[0].n_outputs, 1.0)
+    return np.asarray(np.sqrt(variances(np.maximum(squares, floor), free)))

@@ -81,10 +81,8 @@ def _burg(rows: Sequence[np.ndarray]) -> np.ndarray:
         ahead, back = [f[1:] for f in ahead], [b[:-1] for b in back]
         crossed = sum(float(f @ b) for f, b in zip(ahead, back, strict=True))
         k = -2.0 * crossed / sum(float(f @ f + b @ b) for f, b in zip(ahead, back, strict=True))
-        ahead, back = (
-            [f + k * b for f, b in zip(ahead, back, strict=True)],
-            [b + k * f for f, b in zip(ahead, back, strict=True)],
-        )
+        both = list(zip(ahead, back, strict=True))
+        ahead, back = [f + k * b for f, b in both], [b + k * f for f, b in both]
         found = np.r_[found, 0.0] + k * np.r_[0.0, found[::-1]]
         loss *= 1.0 - k**2
         if n * np.log(loss) + order * np.log(n) < least:

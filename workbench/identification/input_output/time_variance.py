@@ -80,11 +80,8 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
     change, deviation = inverse @ along, np.sqrt(np.diag(inverse))
     omega, span = np.abs(poles), 2.0 * np.pi / data.resolution
     moving, error = np.abs(change[n:]), deviation[n:]
-    sure = (
-        (moving > CHANGING.sure * error)
-        & (moving > CHANGING.matters * np.abs(poles.real))
-        & (-poles.real * span > CHANGING.faded)
-    )
+    sure = (moving > CHANGING.sure * error) & (moving > CHANGING.matters * np.abs(poles.real))
+    sure &= -poles.real * span > CHANGING.faded
     return Change(change[n:] / omega, error / omega, sure)
 
 

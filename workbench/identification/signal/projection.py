@@ -306,9 +306,8 @@ def noise_along(signals: np.ndarray, residual: np.ndarray, n_modes: int) -> np.n
         residual: (n_samples, n_outputs) of a fit, over its standard deviation.
         n_modes: taken out of it.
     """
-    power, weight = (
-        np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in (residual / np.sqrt(len(residual)), signals)
-    )
+    columns = residual / np.sqrt(len(residual)), signals
+    power, weight = (np.abs(np.fft.rfft(each, axis=0)[1:]) ** 2 for each in columns)
     whole = weight.sum(axis=0)
     along = (weight / np.where(whole > 0, whole, 1.0)).T @ power
     # A constant is disturbed by noise about zero frequency.
@@ -334,9 +333,8 @@ def white(power: np.ndarray, n_modes: int, *, among: int | None = None) -> np.nd
     summed = np.cumsum(power, axis=0) / np.where(whole > 0, whole, 1.0)
     apart = np.abs(summed - np.arange(1, bins + 1)[:, None] / bins).max(axis=0)
     # The bins that the modes took are not coloured noise.
-    return np.asarray(
-        apart < np.sqrt(0.5 * np.log(2.0 * (among or m) / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins
-    )
+    least = np.sqrt(0.5 * np.log(2.0 * (among or m) / PROJECTION.false_alarm) / bins) + (n_modes + 1) / bins
+    return np.asarray(apart < least)
 
 
 def variances(squares: np.ndarray, free: np.ndarray, apart: np.ndarray | None = None) -> np.ndarray:
@@ -359,9 +357,8 @@ def differ(squares: np.ndarray, free: np.ndarray) -> np.ndarray:
         return np.zeros(squares.shape[1], bool)
     whole = free.sum(axis=0)
     apart = whole * np.log(squares.sum(axis=0) / whole) - (free * np.log(squares / free)).sum(axis=0)
-    return np.asarray(
-        apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1))) > chi2.isf(PROJECTION.split, n - 1)
-    )
+    corrected = apart / (1.0 + ((1.0 / free).sum(axis=0) - 1.0 / whole) / (3.0 * (n - 1)))
+    return np.asarray(corrected > chi2.isf(PROJECTION.split, n - 1))
 
 
 def _each(free: np.ndarray, squares: np.ndarray) -> np.ndarray:

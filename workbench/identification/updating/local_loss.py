@@ -83,11 +83,8 @@ class LocatedDamage:
     def interval(self, level: float = 0.95) -> np.ndarray:
         """Confidence intervals of share, centre and width, (3, 2); what of a loss passes an end does not count."""
         likely, length = self.lossy.parameters[-3:], self.lossy.structure.length
-        share, centre, width = (
-            np.random.default_rng(0)
-            .multivariate_normal(likely, self.lossy.covariance[-3:, -3:], LOSS.draws, method="eigh")
-            .T
-        )
+        rng, covariance = np.random.default_rng(0), self.lossy.covariance[-3:, -3:]
+        share, centre, width = rng.multivariate_normal(likely, covariance, LOSS.draws, method="eigh").T
         begin, end = np.clip([centre - 0.5 * width, centre + 0.5 * width], 0.0, length)
         tail = 0.5 * (1.0 - level)
         return np.asarray(np.quantile([share, 0.5 * (begin + end), end - begin], [tail, 1.0 - tail], axis=1).T)
