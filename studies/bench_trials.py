@@ -5,24 +5,13 @@ what hides in a frame at a point acts between two points.
 """
 
 from pathlib import Path
-from time import process_time
-
-import numpy as np
 
 from workbench.draw.trials import plot_confusion
-from workbench.trials.hold import hold_trials
+from workbench.trials.hold import hold_one, processor_times
 from workbench.trials.make import OUTSIDE_KINDS, draw_kinds
 from workbench.trials.scoring import tally
 
 SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 971337  # of each structure
-
-
-def trial(structure, kinds, seed):
-    """One blind trial: the score of the diagnosis, its verdict, and the processor time of it all, s."""
-    begun = process_time()
-    held = hold_trials(1, seed, kinds=[kinds], structure=structure)
-    (score,), (verdict,) = held.scores.values(), held.verdicts.values()
-    return {"score": score, "sentence": verdict["sentence"], "processor": process_time() - begun}
 
 
 def cases_on(structure, seed):
@@ -36,7 +25,7 @@ def cases_on(structure, seed):
 
 def study(outcome, data: Path | None = None) -> None:
     cases = [*cases_on("plates", SEED), *cases_on("frames", SEED + 1000)]
-    found = outcome.run(cases, trial)
+    found = outcome.run(cases, hold_one)
     held = [result for result in found if result.error is None]
     for result in found:
         where = f"{result['structure']}, seed {result['seed']}"
@@ -50,9 +39,8 @@ def study(outcome, data: Path | None = None) -> None:
     whole = tally(r["score"] for r in held)
     outcome.table("shares", whole.shares)
     for family in whole.shares:
-        taken = [r["processor"] for r in held if r["score"]["family"] == family]
-        times = dict(zip(("median", "nine of ten", "longest"), np.quantile(taken, (0.5, 0.9, 1.0)), strict=True))
-        outcome.table(f"processor time of {family} cases, s", {name: round(float(t), 1) for name, t in times.items()})
+        times = processor_times(r for r in held if r["score"]["family"] == family)
+        outcome.table(f"processor time of {family} cases, s", times)
 
     outcome.check(f"trials of {len(cases)} that ended in an error", len(found) - len(held), 0)
     for family, limit in (("single", 0.95), ("pair", 0.85)):

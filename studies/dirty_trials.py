@@ -1,13 +1,10 @@
 """How often does the diagnosis name what hides beside the small errors of a real test, in blind trials?"""
 
 from pathlib import Path
-from time import process_time
-
-import numpy as np
 
 from workbench.draw.trials import plot_dirt, plot_reliability
 from workbench.trials.dirt import DIRT_CLASSES, SIZES
-from workbench.trials.hold import hold_trials
+from workbench.trials.hold import hold_one, processor_times
 from workbench.trials.make import draw_dirty_kinds
 from workbench.trials.scoring import NONE, reliability, tally_dirty
 
@@ -15,18 +12,10 @@ CASES, SEED = 60, 20299877
 FEW = 10  # claims: a share of fewer is chance
 
 
-def trial(dirt, size, kinds, seed):
-    """One blind trial: the score of the diagnosis, its sentence, and the processor time of it all, s."""
-    begun = process_time()
-    held = hold_trials(1, seed, kinds=[kinds], dirt=dirt, size=size)
-    (score,), (verdict,) = held.dirty_scores.values(), held.verdicts.values()
-    return {"score": score, "sentence": verdict["sentence"], "processor": process_time() - begun}
-
-
 def study(outcome, data: Path | None = None) -> None:
     drawn = draw_dirty_kinds(CASES, SEED)
     cases = [{**draw._asdict(), "kinds": list(draw.kinds), "seed": SEED + i} for i, draw in enumerate(drawn)]
-    found = outcome.run(cases, trial)
+    found = outcome.run(cases, hold_one)
     # a bench on which the effect would not show beside that dirt is no trial
     held = [result for result in found if result.error is None]
     unsuited = [result for result in found if result.error is not None and "no case with" in str(result.error)]
@@ -42,9 +31,7 @@ def study(outcome, data: Path | None = None) -> None:
     by_size = {size: tally_dirty(s for s in scores if s["size"] == size) for size in SIZES}
     outcome.table("by class", by_class)
     outcome.table("by size", by_size)
-    taken = [result["processor"] for result in held]
-    times = dict(zip(("median", "nine of ten", "longest"), np.quantile(taken, (0.5, 0.9, 1.0)), strict=True))
-    outcome.table("processor time, s", {name: round(float(t), 1) for name, t in times.items()})
+    outcome.table("processor time, s", processor_times(held))
 
     whole = tally_dirty(scores)
     quiet = sum(score["hidden"] == NONE for score in scores)

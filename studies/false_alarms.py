@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from joblib import Parallel, delayed
-
 from workbench.gap.diagnose import diagnose
 from workbench.trials.make import make_trial
 
@@ -18,9 +16,8 @@ def diagnosed(seed: int) -> list[str]:
 
 
 def study(outcome, data: Path | None = None) -> None:
-    seeds = range(SEED, SEED + CASES)
-    results = Parallel(n_jobs=2, return_as="generator")(delayed(diagnosed)(seed) for seed in seeds)
-    alarms = {seed: kinds for seed, kinds in zip(outcome.track(seeds, "cases"), results, strict=True) if kinds}
+    found = outcome.run([{"seed": SEED + i} for i in range(CASES)], diagnosed)
+    alarms = {result["seed"]: result["result"] for result in found if result["result"]}
     outcome.table("cases", CASES)
     outcome.table("alarms", alarms)
     outcome.check(f"false alarms in {CASES} cases", len(alarms), CASES // 100)

@@ -1,29 +1,18 @@
 """How often does the diagnosis name the hidden effect, in blind trials simulated by finite elements?"""
 
 from pathlib import Path
-from time import process_time
-
-import numpy as np
 
 from workbench.draw.trials import plot_confusion
-from workbench.trials.hold import hold_trials
+from workbench.trials.hold import hold_one, processor_times
 from workbench.trials.make import draw_kinds
 from workbench.trials.scoring import tally
 
 CASES, SEED = 200, 845211
 
 
-def trial(kinds, seed):
-    """One blind trial: the score of the diagnosis, its verdict, and the processor time of it all, s."""
-    begun = process_time()
-    held = hold_trials(1, seed, kinds=[kinds])
-    (score,), (verdict,) = held.scores.values(), held.verdicts.values()
-    return {"score": score, "sentence": verdict["sentence"], "processor": process_time() - begun}
-
-
 def study(outcome, data: Path | None = None) -> None:
     hidden = draw_kinds(CASES, SEED)
-    found = outcome.run([{"kinds": list(kinds), "seed": SEED + i} for i, kinds in enumerate(hidden)], trial)
+    found = outcome.run([{"kinds": list(kinds), "seed": SEED + i} for i, kinds in enumerate(hidden)], hold_one)
     scores = [result["score"] for result in found if result.error is None]
     held = tally(scores)
     for result in found:
@@ -35,9 +24,8 @@ def study(outcome, data: Path | None = None) -> None:
     outcome.table("scores", {result["seed"]: result["score"] for result in found if result.error is None})
     outcome.table("shares", held.shares)
     for family in held.shares:
-        taken = [result["processor"] for result in found if not result.error and result["score"]["family"] == family]
-        times = dict(zip(("median", "nine of ten", "longest"), np.quantile(taken, (0.5, 0.9, 1.0)), strict=True))
-        outcome.table(f"processor time of {family} cases, s", {name: round(float(t), 1) for name, t in times.items()})
+        of_family = [result for result in found if not result.error and result["score"]["family"] == family]
+        outcome.table(f"processor time of {family} cases, s", processor_times(of_family))
 
     outcome.check(f"trials of {CASES} that ended in an error", CASES - len(scores), 0)
     for family, limit in (("single", 0.95), ("pair", 0.85), ("unknown", 1.0)):

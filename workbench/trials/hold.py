@@ -1,11 +1,14 @@
 """Holding blind trials: make cases with sealed labels, diagnose them, score them."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from time import process_time
 from typing import Any
+
+import numpy as np
 
 from workbench.cases.case import read_case
 from workbench.gap.diagnose import SECONDS, diagnose
@@ -67,6 +70,20 @@ def hold_trials(
             if hidden.get("dirt") is not None:
                 dirty[folder.name] = score_dirty(verdict, label, domain=domain)
     return Trials(verdicts, labels, scores, dirty, tally(scores.values()))
+
+
+def hold_one(seed: int, kinds: Sequence[str], **hidden: Any) -> dict[str, Any]:
+    """One blind trial: {"score", "sentence" of its verdict, "processor": time that it took, s}."""
+    begun = process_time()
+    held = hold_trials(1, seed, kinds=[kinds], **hidden)
+    (found,), (verdict,) = (held.dirty_scores or held.scores).values(), held.verdicts.values()
+    return {"score": found, "sentence": verdict["sentence"], "processor": process_time() - begun}
+
+
+def processor_times(trials: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Median, ninth decile and longest of the processor times of `hold_one`, s."""
+    times = np.quantile([trial["processor"] for trial in trials], (0.5, 0.9, 1.0)).round(1).tolist()
+    return dict(zip(("median", "nine of ten", "longest"), times, strict=True))
 
 
 def verdict_on(folder: Path) -> dict[str, Any]:
