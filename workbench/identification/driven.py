@@ -424,7 +424,7 @@ def _check_inputs(records: Sequence[Record]) -> None:
     if abs(alike[i, k]) > 1.0 - 1e-9:
         raise ValueError(
             f"inputs {first.input_names[i]!r} and {first.input_names[k]!r} are the same signal but for its size, so"
-            " what each does cannot be selected; excite them one after the other, or by signals of their own"
+            " what each does cannot be distinguished; excite them one after the other, or by signals of their own"
         )
 
 
