@@ -15,7 +15,8 @@ from workbench.design.loop.closed_loop import close_loop, impulse_state, initial
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import place_actuators, placement_task
 from workbench.design.spillover.spillover import effort, finite_spillover, quadratic_cost
-from workbench.draw.beam import plot_identified, plot_motion, plot_ring_down, plot_two_works
+from workbench.draw.design import plot_motion, plot_two_works
+from workbench.draw.identification import plot_identified, plot_ring_down
 from workbench.draw.motion import response_motion
 from workbench.identification.free_decay.ibrahim import stacked_delays
 from workbench.identification.free_decay.refinement import refine

@@ -15,7 +15,7 @@ from workbench.design.laws.imsc import imsc
 from workbench.design.laws.law import Law
 from workbench.design.loop.closed_loop import close_loop, impulse_state, initial_response
 from workbench.design.spillover.spillover import spillover
-from workbench.draw.beam import plot_two_works
+from workbench.draw.design import plot_two_works
 from workbench.draw.surface import plot_surface_modes, plot_surface_motion
 from workbench.identification.driven import identify_driven
 from workbench.rig.actuators import Actuator

@@ -1,6 +1,6 @@
 """Figures of control design: motion, work by mode, placements."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.structure.printed import place_text
 
 SHOWN_SHARE = 1e-5
+MOST_INSTANTS = 700  # more than a picture has columns for
 
 
 def plot_displacements(
@@ -40,6 +41,37 @@ def plot_displacements(
                 ax.set_ylabel(f"t = {time:g} s")
         axes[0, column].set_title(f"actuators at {name}")
         axes[-1, column].set_xlabel("x [m]")
+    return figure
+
+
+def plot_motion(responses: Mapping[str, Response], x: np.ndarray) -> Figure:
+    """Displacement over place and time as colour, one panel a response, all on one scale."""
+    figure, axes = new_figure(len(responses), 1, width=9, height=2.1 * len(responses), sharex=True, squeeze=False)
+    steps = {name: -(-response.time.size // MOST_INSTANTS) for name, response in responses.items()}
+    fields = {name: response.displacement(x)[:, :: steps[name]] for name, response in responses.items()}
+    limit = max(np.abs(field).max() for field in fields.values())
+    for ax, (name, field) in zip(axes[:, 0], fields.items(), strict=True):
+        time = responses[name].time[:: steps[name]]
+        image = ax.pcolormesh(
+            time, x, field, cmap="RdBu_r", vmin=-limit, vmax=limit, shading="gouraud", rasterized=True
+        )
+        ax.set(ylabel="x", title=name)
+        ax.grid(False)
+    axes[-1, 0].set_xlabel("time [s]")
+    figure.colorbar(image, ax=axes[:, 0], label="displacement")
+    return figure
+
+
+def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
+    """Work put into each residual mode, a group of bars a mode; `first` is the zero-based index of the first one."""
+    figure, ax = new_figure(width=9, height=4)
+    width = 0.8 / len(works)
+    for i, (name, work) in enumerate(works.items()):
+        numbers = first + 1 + np.arange(work.size)
+        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.2e}")
+    ax.set(xticks=numbers, xlabel="residual mode", ylabel="spillover work in the mode, W_r")
+    ax.set_title("spillover work by residual mode")
+    ax.legend()
     return figure
 
 

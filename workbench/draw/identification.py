@@ -1,4 +1,4 @@
-"""Pictures of identification: eigenvalues, eigenfunctions, distributions, stabilisation, a measured structure."""
+"""Pictures of identification: records, eigenvalues, eigenfunctions, distributions, stabilisation, structures."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,11 +11,44 @@ from workbench.draw.style import COLOURS, GREY, new_figure
 from workbench.identification.free_decay.ibrahim import Stabilisation
 from workbench.identification.shapes.mode_pairing import ModePairing
 from workbench.identification.updating.local_loss import LocatedDamage
+from workbench.records.record import Record
 from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
 LABELS = ("printed in 1981", "two delays, as in 1981", "this project's default")
 Case = tuple[LocatedDamage, Callable[[np.ndarray], np.ndarray], np.ndarray]
+
+
+def plot_ring_down(record: Record, *, stretch: float) -> Figure:
+    """Every output over time, one above the other, each at its place; the first `stretch` seconds."""
+    shown = record.between(record.start_time, record.start_time + stretch)
+    figure, ax = new_figure(width=9, height=4.5)
+    size = 1.1 * np.abs(shown.outputs).max()
+    for j, channel in enumerate(shown.output_channels):
+        ax.axhline(j, color=GREY, linewidth=0.4)
+        ax.plot(shown.time, j + 0.5 * shown.outputs[j] / size, color=COLOURS[0], linewidth=0.9)
+        place = channel.name if channel.at is None else f"x = {channel.at:.3g}"
+        ax.text(shown.time[-1], j, f"  {place}", va="center")
+    ax.set(xlabel="time [s]", yticks=[], xlim=(shown.time[0], shown.time[-1]))
+    ax.set_title("measured ring-down, one line a sensor")
+    return figure
+
+
+def plot_identified(found: Modes, truth: Modes, positions: np.ndarray, *, count: int) -> Figure:
+    """Identified eigenfunctions over the true ones, with their values at the sensors."""
+    figure, axes = new_figure(-(-count // 3), 3, width=10, height=4.6, sharex=True, sharey=True, squeeze=False)
+    x = np.linspace(0.0, truth.length, 301)
+    for r, ax in zip(range(count), axes.flat, strict=False):
+        sign = np.sign(found.phi(x)[:, r] @ truth.phi(x)[:, r])
+        ax.plot(x, truth.phi(x)[:, r], color=GREY, linewidth=4, alpha=0.5, label="true")
+        ax.plot(x, sign * found.phi(x)[:, r], color=COLOURS[0], label="identified")
+        at_sensors = sign * found.phi(positions)[:, r]
+        ax.plot(positions, at_sensors, "o", color=COLOURS[1], markersize=4, label="at the sensors")
+        ax.set_title(f"mode {r + 1}: {found.frequencies_hz[r]:.4f} Hz, ζ = {100 * found.zeta[r]:.2f} %", fontsize=10)
+    for ax in axes[-1]:
+        ax.set_xlabel("x")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return figure
 
 
 def eigenvalue_errors(errors: Mapping[tuple[int, str], Any], sensors: Sequence[int]) -> Figure:

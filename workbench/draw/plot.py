@@ -14,8 +14,7 @@ from workbench.design.placement.task import Placement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
 from workbench.draw.accuracy import plot_bands
-from workbench.draw.beam import plot_motion
-from workbench.draw.design import plot_how_many, plot_spillover_paths, plot_work
+from workbench.draw.design import plot_how_many, plot_motion, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
 from workbench.draw.spectra import plot_distortion

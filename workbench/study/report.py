@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from workbench.cases.case import read_case
-from workbench.draw.beam import plot_two_works
+from workbench.draw.design import plot_two_works
 from workbench.draw.gap import plot_gaps, plot_responses
 from workbench.draw.identification import stabilisation_diagram
 from workbench.draw.motion import mode_motion

@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from workbench.cases.case import read_rig
-from workbench.draw.design import plot_work
 {imports}
 from workbench.study.trying import Design, try_out
 
@@ -41,7 +40,7 @@ def study(outcome, data=None):
 TABLE = re.compile(r"^points *= *.*$", re.MULTILINE)
 # what shows the motion: of a member, a plate, and a frame
 MEMBER = (
-    """from workbench.draw.beam import plot_motion
+    """from workbench.draw.design import plot_motion, plot_work
 from workbench.draw.motion import response_motion""",
     """    motion = response_motion({"controlled": tried.response}, actuators=tried.law.actuators)
     outcome.motion(motion, "The structure after the impulse, controlled; triangles are actuators.")
@@ -50,7 +49,8 @@ from workbench.draw.motion import response_motion""",
 """,
 )
 PLATE = (
-    "from workbench.draw.surface import plot_surface_motion",
+    """from workbench.draw.design import plot_work
+from workbench.draw.surface import plot_surface_motion""",
     """    figure = plot_surface_motion(
         {"controlled": tried.response},
         DESIGN.final_time * np.array([0.0, 0.1, 0.25, 0.5, 1.0]),
@@ -61,7 +61,8 @@ PLATE = (
 """,
 )
 FRAME = (
-    "from workbench.draw.motion import mode_motion",
+    """from workbench.draw.design import plot_work
+from workbench.draw.motion import mode_motion""",
     """    motion = mode_motion({"structure": rig.modes}, actuators=tried.law.actuators)
     outcome.motion(motion, "Mode shapes; triangles are actuators.")
 """,
