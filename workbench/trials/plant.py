@@ -73,9 +73,8 @@ class Plant:
 
     def solved(self) -> "SolvedPlant":
         """The plant with its modes solved."""
-        gauss, weights = np.polynomial.legendre.leggauss(DRAG_POINTS)
-        length = self.nominal.modes.length if self.drag else 0.0
-        field_places = 0.5 * length * (gauss + 1.0) if self.drag else np.zeros(0)
+        domain = self.nominal.modes.domain
+        field_places, weights = domain.quadrature(DRAG_POINTS) if self.drag else (np.zeros(0), np.zeros(0))
         groups: list[list[Any] | np.ndarray] = [
             [a.at for a in self.actuators],
             [s.at for s in self.sensors],
@@ -88,7 +87,7 @@ class Plant:
         modes = self._modes(places)
         shapes = np.split(modes.shapes, np.cumsum([len(g) for g in groups])[:-1])
         inputs, sensors, laws, tones, noises, field = shapes
-        drag = np.c_[field, 0.5 * length * weights[: len(field_places)]]
+        drag = np.c_[field, weights]
         return SolvedPlant(self, modes, inputs, sensors, laws, tones, noises, drag)
 
     def _modes(self, places: list[Any]) -> ElementModes:

@@ -12,10 +12,10 @@ from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import BSpline, RBFInterpolator, make_interp_spline
+from scipy.interpolate import CubicHermiteSpline, RBFInterpolator, make_interp_spline
 
 from workbench.arrays import Floats
-from workbench.structure.domain import NamedPoints, Place, Rectangle, same_place
+from workbench.structure.domain import NamedPoints, Place, Rectangle, gauss_between, same_place
 from workbench.structure.member import Structure
 from workbench.structure.modes import Modes, freeze
 from workbench.structure.plate import Membrane, Plate
@@ -95,21 +95,10 @@ def hermite_filter(modes: Modes, positions: ArrayLike, mass_per_length: ProfileL
         ValueError: fewer than two sensors, or positions that do not increase.
     """
     x = _checked(positions, 2)
-    mass = as_profile(mass_per_length)
-    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
-    displacement = np.zeros((modes.n_modes, x.size))
-    slope = np.zeros_like(displacement)
-    for i in range(x.size - 1):
-        h = x[i + 1] - x[i]
-        s = 0.5 * (points + 1.0)
-        at = x[i] + h * s
-        density = modes.phi(at) * (mass(at) * weights * 0.5 * h)[:, None]
-        cubics = np.array([1 - 3 * s**2 + 2 * s**3, h * (s - 2 * s**2 + s**3), 3 * s**2 - 2 * s**3, h * (s**3 - s**2)])
-        left, left_slope, right, right_slope = cubics @ density
-        displacement[:, i] += left
-        displacement[:, i + 1] += right
-        slope[:, i] += left_slope
-        slope[:, i + 1] += right_slope
+    at, density = _integrand(modes, as_profile(mass_per_length), x)
+    one, none = np.eye(x.size), np.zeros((x.size, x.size))
+    displacement = density.T @ CubicHermiteSpline(x, one, none)(at)
+    slope = density.T @ CubicHermiteSpline(x, none, one)(at)
     again = partial(anew, hermite_filter, positions=x, mass_per_length=mass_per_length)
     return ModalFilter(x, displacement, slope, again)
 
@@ -135,7 +124,8 @@ def displacement_filter(
     degree = min(degree, nodes.size - 1)
     degree -= 1 - degree % 2
     splines = make_interp_spline(nodes, np.eye(nodes.size), k=degree)
-    weights = _spline_weights(modes, splines, as_profile(mass_per_length))
+    at, density = _integrand(modes, as_profile(mass_per_length), np.unique(np.r_[0.0, splines.t, modes.length]))
+    weights = density.T @ splines(at)
     again = partial(anew, displacement_filter, positions=x, mass_per_length=mass_per_length, degree=degree)
     return ModalFilter(x, weights[:, np.isin(nodes, x)], np.zeros((modes.n_modes, 0)), again)
 
@@ -186,16 +176,10 @@ def anew(design: Callable[..., ModalFilter], modes: Modes, filtered: Sequence[in
     return design(modes.select(list(filtered)), **settings)
 
 
-def _spline_weights(modes: Modes, splines: BSpline, mass: Profile) -> Floats:
-    points, weights = np.polynomial.legendre.leggauss(GAUSS_POINTS)
-    breaks = np.unique(np.r_[0.0, splines.t, modes.length])
-    breaks = breaks[(breaks >= 0) & (breaks <= modes.length)]
-    total = np.zeros((modes.n_modes, splines.c.shape[1]))
-    for a, b in zip(breaks[:-1], breaks[1:], strict=True):
-        at = a + 0.5 * (b - a) * (points + 1.0)
-        density = modes.phi(at) * (mass(at) * weights * 0.5 * (b - a))[:, None]
-        total = total + density.T @ splines(at)
-    return total
+def _integrand(modes: Modes, mass: Profile, nodes: np.ndarray) -> tuple[Floats, Floats]:
+    """Points of integration between nodes, and what w is multiplied by there, (n_points, n_modes): m φ_r dx."""
+    at, weights = gauss_between(nodes, GAUSS_POINTS)
+    return at, modes.phi(at) * (mass(at) * weights)[:, None]
 
 
 def _checked(positions: ArrayLike, least: int) -> np.ndarray:
