@@ -10,9 +10,9 @@ Flags = NDArray[np.bool_]
 
 
 def symmetric_root(matrix: np.ndarray) -> Floats:
-    """R with R Rᵀ = matrix, a covariance say, which rounding or close modes may have made singular."""
+    """R with R Rᵀ = matrix (..., n, n), a covariance say, which rounding or close modes may have made singular."""
     values, vectors = np.linalg.eigh(matrix)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
 def scaled_inverse(matrix: np.ndarray, rcond: float = 1e-15) -> Floats:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arrays import symmetric_root
 from workbench.identification.driven import Driven
 from workbench.identification.transfer import TransferModes
 from workbench.records.record import Channel
@@ -191,8 +192,7 @@ def _spread(identified: Driven | TransferModes, figures: Callable[[np.ndarray], 
     """
     modes, errors = identified.modes, identified.vector_covariance
     m, q = modes.shapes.shape[0], identified.participation.shape[1]
-    values, vectors = np.linalg.eigh(errors)
-    steps = STEP * vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
+    steps = STEP * symmetric_root(errors)
     largest = modes.shapes[np.abs(modes.shapes).argmax(axis=0), np.arange(modes.n_modes)]
     middle = figures(_residues(modes, modes.shapes, identified.participation))
     slopes = []

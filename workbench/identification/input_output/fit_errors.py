@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from workbench.arrays import scaled_inverse
+from workbench.arrays import scaled_inverse, symmetric_root
 from workbench.identification.input_output.modal_fit import Fit, Part, free_parameters, moves, normal
 from workbench.identification.signal.modal_estimates import by_poles
 
@@ -130,5 +130,4 @@ def _by_column(part: Part, rows: np.ndarray) -> np.ndarray:
 def _root(matrix: np.ndarray) -> np.ndarray:
     """R with R R^T = matrix, which close modes may have made singular."""
     size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    values, vectors = np.linalg.eigh(matrix / np.outer(size, size))
-    return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    return size[:, None] * symmetric_root(matrix / np.outer(size, size))

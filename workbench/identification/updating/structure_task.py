@@ -53,8 +53,7 @@ class GaussianPrior:
         x = (np.arange(200) + 0.5) / 200 * length
         onto = np.linalg.pinv(basis.functions(x))
         kernel = self.std**2 * np.exp(-0.5 * ((x[:, None] - x) / self.correlation) ** 2)
-        values, vectors = np.linalg.eigh(onto @ kernel @ onto.T)
-        return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-8 * values.max()))).T)
+        return _unit(onto @ kernel @ onto.T, 1e-8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,10 +146,10 @@ def _paired(measured: Refined, nominal: Bar | Beam) -> np.ndarray:
     return np.asarray(which)
 
 
-def _unit(covariance: np.ndarray) -> np.ndarray:
-    """W with W^T W the inverse of a covariance."""
+def _unit(covariance: np.ndarray, least: float = 1e-12) -> np.ndarray:
+    """W with W^T W the inverse of a covariance, no eigenvalue of which counts as less than a share of the largest."""
     values, vectors = np.linalg.eigh(covariance)
-    return np.asarray((vectors / np.sqrt(np.maximum(values, 1e-12 * values.max()))).T)
+    return np.asarray((vectors / np.sqrt(np.maximum(values, least * values.max()))).T)
 
 
 @dataclass(frozen=True, eq=False)
