@@ -153,7 +153,7 @@ def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
     with np.errstate(over="ignore", invalid="ignore"):  # of a motion that runs away
         by_channel = np.array([((r / whole.noise[:, None]) ** 2).mean(axis=1) for r in residuals])
         credible = np.inf if is_noise_alone(residuals, whole.counted) else JOINT.credible
-    sensor_noise = np.minimum(noise_found(residuals) / whole.noise, credible) ** 2
+        sensor_noise = np.minimum(noise_found(residuals) / whole.noise, credible) ** 2
     step = replace(found, cost=float(by_channel.mean()), cost_by_channel=by_channel)
     per_unit = search.logging_noise
     logged = logging_noise(by_channel, sensor_noise, per_unit)
