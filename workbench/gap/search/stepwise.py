@@ -126,15 +126,21 @@ class Stepwise:
         if self.is_run:
             return
         self.is_run = True
+        first = self.last
+        if first.effects:  # where two hide, the errors may stand for one
+            self.plain = self._without_errors(first)
+            if self.plain is not None:
+                return
         self._add(most)
         if self.calibrate():
             self._add(most)
         limit = self._in_limit(self.last)
         if limit is not self.last:
             self.steps.append(replace(limit, others=self.last.others))
-        self.plain = self._without_errors(self.last)
-        if self.plain is not None:
-            return
+        if self.last is not first or not first.effects:
+            self.plain = self._without_errors(self.last)
+            if self.plain is not None:
+                return
         self.steps.append(self._promoted(self.last))
         if self.last.effects:
             self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
