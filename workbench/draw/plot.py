@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from workbench.design.estimation.modal_filter import ModalFilter
 from workbench.design.loop.closed_loop import Response
 from workbench.design.placement.how_many import HowMany
+from workbench.design.placement.sensor_placement import SensorPlacement
 from workbench.design.placement.task import Placement
 from workbench.design.spillover.explain import Explanation
 from workbench.design.spillover.spillover import Spillover
@@ -17,6 +18,7 @@ from workbench.draw.accuracy import plot_bands
 from workbench.draw.design import plot_how_many, plot_motion, plot_spillover_paths, plot_work
 from workbench.draw.gap import plot_where
 from workbench.draw.robust import plot_prediction, plot_redesign
+from workbench.draw.sensors import plot_sensor_placement
 from workbench.draw.spectra import plot_distortion
 from workbench.draw.style import COLOURS, GREY, envelope, in_units, new_figure
 from workbench.draw.surface import (
@@ -44,8 +46,8 @@ MOST_INSTANTS = 5
 @singledispatch
 def plot(result: object) -> Figure:
     """A figure of a result: `Record`, `Modes`, `SampledModes`, estimates of modes, `Refined`, `Bands`, `Response`,
-    `Spillover`, `Explanation`, `HowMany`, `Placement`, `ModalFilter`, `Distortion`, `Verdict`, `Redesign` or
-    `Prediction`.
+    `Spillover`, `Explanation`, `HowMany`, `Placement`, `SensorPlacement`, `ModalFilter`, `Distortion`, `Verdict`,
+    `Redesign` or `Prediction`.
 
     Raises:
         TypeError: a type that has no figure.
@@ -119,6 +121,7 @@ plot.register(Explanation, plot_spillover_paths)
 plot.register(Verdict, plot_where)
 plot.register(Redesign, plot_redesign)
 plot.register(Prediction, plot_prediction)
+plot.register(SensorPlacement, plot_sensor_placement)
 plot.register(ModalEstimates, lambda result: plot(result.modes))
 plot.register(Bands, lambda result: plot_surface_bands(result) if result.x.ndim == 2 else plot_bands(result))
 plot.register(Spillover, lambda result: plot_work({"this design": result}))

@@ -162,10 +162,8 @@ def plot_surface_placement(
     """
     n, modes = task.n_controlled, task.modes
     assert isinstance(modes.domain, Rectangle)
-    x, y, fields = _over(modes, np.eye(modes.n_modes)[:, n : n + 1])
     figure, (left, right) = new_figure(1, 2, width=11, height=4.2)
-    left.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
-    _nodal_lines(left, x, y, fields[0], 1.4)
+    draw_nodal_lines(left, modes, n)
     for i, ((x0, y0), (x1, y1)) in enumerate(limits.forbidden if limits is not None else ()):  # type: ignore[misc, str-unpack]
         left.fill([x0, x1, x1, x0], [y0, y0, y1, y1], facecolor="white", edgecolor=GREY, hatch="////", zorder=2,
                   label="forbidden" if i == 0 else None)  # fmt: skip
@@ -181,7 +179,6 @@ def plot_surface_placement(
         right.bar(numbers + width * (i - 0.5 * (len(placements) - 1)), placement.by_mode, width, color=COLOURS[i])
     if struck is not None:
         left.plot(*struck, "*", color=COLOURS[4], markeredgecolor="black", markersize=14, label="impulse", zorder=3)
-    _bare(left, modes)
     first = f"mode {n + 1}, {modes.frequencies_hz[n]:.3g} Hz, the first left alone"
     left.set_title(f"{modes.domain}, with the nodal lines of {first}", fontsize=10)
     left.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), fontsize=9, ncols=2)
@@ -215,24 +212,38 @@ def plot_scattered_modes(modes: SampledModes, *, count: int) -> Figure:
 
 
 def _net_panels(net: Net, modes: Modes | SampledModes, count: int) -> Figure:
-    moves, size = net.moves(modes).real, np.ptp(net.rest, axis=0).max()
+    moves = net.moves(modes).real
     columns = min(COLUMNS, count)
     rows = -(-count // columns)
     figure, grid = new_figure(rows, columns, width=2.8 * columns, height=0.4 + 2.8 * rows, squeeze=False)
     for r, ax in enumerate(grid.flat[:count]):
-        largest = np.abs(moves[:, :, r]).max() or 1.0
-        for at, colour in ((net.rest, GREY), (net.rest + SWAY * size / largest * moves[:, :, r], COLOURS[0])):
-            for ends in net.lines:
-                ax.plot(*at[ends].T, color=colour, linewidth=1.6)
-            ax.plot(*at.T, "o", color=colour, markersize=3)
+        draw_moved(ax, net, moves[:, :, r])
         ax.set_title(f"mode {r + 1}: {modes.frequencies_hz[r]:.4g} Hz", fontsize=10)
-    for ax in grid.flat:
-        ax.set_aspect("equal")
+    for ax in grid.flat[count:]:
         ax.axis("off")
     states = ((GREY, "at rest"), (COLOURS[0], "moved"))
     handles = [Line2D([], [], color=colour, marker="o", label=state) for colour, state in states]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
     return figure
+
+
+def draw_nodal_lines(ax: Axes, modes: Modes, mode: int) -> None:
+    """A plate seen from above, in the grey of one mode's shape (an index), its nodal lines black."""
+    x, y, fields = _over(modes, np.eye(modes.n_modes)[:, mode : mode + 1])
+    ax.contourf(x, y, fields[0].T, levels=2 * LEVELS, cmap="Greys", alpha=0.35)
+    _nodal_lines(ax, x, y, fields[0], 1.4)
+    _bare(ax, modes)
+
+
+def draw_moved(ax: Axes, net: Net, moves: np.ndarray) -> None:
+    """A net at rest, grey, and moved by (n_spots, 2), blue, in a size that is seen."""
+    far = SWAY * np.ptp(net.rest, axis=0).max() / (np.abs(moves).max() or 1.0)
+    for at, colour in ((net.rest, GREY), (net.rest + far * moves, COLOURS[0])):
+        for ends in net.lines:
+            ax.plot(*at[ends].T, color=colour, linewidth=1.6)
+        ax.plot(*at.T, "o", color=colour, markersize=3)
+    ax.set_aspect("equal")
+    ax.axis("off")
 
 
 def _nodal_lines(ax: Axes, x: np.ndarray, y: np.ndarray, field: np.ndarray, width: float) -> None:

@@ -38,15 +38,22 @@ class SensorPlacement(Printed):
         even_error: the same of evenly spaced sensors; on a surface and at named points, of every so many candidates.
             Infinite where these make no filter.
         exhaustive: whether every choice of the candidates was tried; else the best is local, from several starts.
+        modes: of the structure.
+        controlled: indices of those that the filter is for.
+        by_mode: (n_modes,) shares Σ_i (T_ir - δ_ir)² e_r / Σ e of the squared error.
     """
 
     positions: np.ndarray
     error: float
     even_error: float
     exhaustive: bool
+    modes: Modes
+    controlled: tuple[int, ...]
+    by_mode: np.ndarray
 
     def __post_init__(self) -> None:
         freeze(self, "positions", dtype=None)
+        freeze(self, "by_mode")
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         line = f"{counted(len(self.positions), 'sensor')} placed: error of the filter {self.error:.3g}"
@@ -64,10 +71,17 @@ def filter_error(
     modes: Modes, controlled: Sequence[int], positions: ArrayLike, mass: Mass, mean_squares: ArrayLike
 ) -> float:
     """Relative error of a displacement filter's modal coordinates, modes moving with given mean squares (n_modes,)."""
+    return float(np.sqrt(_error_by_mode(modes, controlled, positions, mass, mean_squares).sum()))
+
+
+def _error_by_mode(
+    modes: Modes, controlled: Sequence[int], positions: ArrayLike, mass: Mass, mean_squares: ArrayLike
+) -> np.ndarray:
+    """(n_modes,) what each mode has of the squared relative error."""
     index, e = list(controlled), np.asarray(mean_squares, float)
     seen = filter_of_mass(mass, modes, index, positions).seen(modes)
     seen[np.arange(len(index)), index] -= 1.0
-    return float(np.sqrt((seen**2 @ e).sum() / e[index].sum()))
+    return np.asarray((seen**2).sum(axis=0) * e / e[index].sum())
 
 
 @one_blas_thread
@@ -141,8 +155,13 @@ def place_sensors(
         best = min((_exchanged(choice, len(grid), error) for choice in choices), key=error)
     if np.isinf(error(best)):
         raise DesignError(f"no choice of {count} candidate places makes a filter: {refused[-1]}")
+
+    def placed(at: np.ndarray) -> SensorPlacement:
+        by_mode = _error_by_mode(modes, index, at, mass, e)
+        return SensorPlacement(at, float(np.sqrt(by_mode.sum())), even, exhaustive, modes, tuple(index), by_mode)
+
     if exhaustive or candidates is not None or not along:
-        return SensorPlacement(grid[list(best)], error(best), even, exhaustive)
+        return placed(grid[list(best)])
 
     def anywhere(x: np.ndarray) -> float:
         inside = 0 < x.min() and x.max() < along and (np.diff(x) > 1e-3 * along).all()
@@ -151,8 +170,7 @@ def place_sensors(
     # between the candidates: from the best of them and from even places
     starts_at = grid[list(best)], evenly
     found = [minimize(anywhere, x, method="Nelder-Mead", options={"maxfev": 60 * count}) for x in starts_at]
-    polished = min(found, key=lambda result: result.fun)
-    return SensorPlacement(polished.x, float(polished.fun), even, False)
+    return placed(min(found, key=lambda result: result.fun).x)
 
 
 def _candidates(modes: Modes, given: ArrayLike | None) -> np.ndarray:

@@ -65,7 +65,10 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, re
     Returns:
         (n_first, n_second), between 0 and 1.
     """
-    cluster = repeated_modes(omega, repeated)
+    return _cluster_mac(first, second, repeated_modes(omega, repeated))
+
+
+def _cluster_mac(first: np.ndarray, second: np.ndarray, cluster: np.ndarray) -> np.ndarray:
     agreement = mac(first, second)
     for each in np.unique(cluster):
         members = np.flatnonzero(cluster == each)
@@ -77,17 +80,18 @@ def subspace_mac(first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, re
 
 
 def assigned(
-    first: np.ndarray, second: np.ndarray, omega: np.ndarray, *, repeated: float = 1e-3, least: float = 0.0
+    first: np.ndarray, second: np.ndarray, cluster: np.ndarray, *, least: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which shape of the second set each of the first is: rows, columns, and the agreement by `subspace_mac`.
 
     Of repeated modes, which agree alike as a subspace, each goes to the one that is most like it by itself.
 
     Args:
-        first, second, omega, repeated: as `subspace_mac` takes them.
+        first, second: as `subspace_mac` takes them.
+        cluster: (n_second,) number of the cluster that each of the second belongs to.
         least: agreement below it counts as none.
     """
-    agreement = subspace_mac(first, second, omega, repeated=repeated)
+    agreement = _cluster_mac(first, second, cluster)
     alike = np.where(agreement >= least, agreement + ITSELF * mac(first, second), 0.0)
     return *linear_sum_assignment(-alike), agreement
 
@@ -110,7 +114,8 @@ def pair_modes(measured: SampledModes, model: Modes, *, shape: float = 0.9, freq
     """
     check_placed(measured)
     check_finite(measured.shapes)
-    rows, columns, agreement = assigned(measured.shapes, model.phi(measured.positions), model.omega, least=shape)
+    own, cluster = model.phi(measured.positions), repeated_modes(model.omega)
+    rows, columns, agreement = assigned(measured.shapes, own, cluster, least=shape)
     good = agreement[rows, columns] >= shape
     rows, columns = rows[good], columns[good]
     ratio = measured.omega[rows] / model.omega[columns]

@@ -6,7 +6,7 @@ them. A function of white energy of strength τ² has about it the mean square e
 kernel (Wendland, Scattered Data Approximation, 2005, chapter 11); τ² is the upper limit of what the values say of it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import factorial
@@ -162,11 +162,16 @@ class SurfaceSpline:
         scale = self.domain.size ** -sum(derivative)
         return np.asarray(scale * (rows @ self._system)[:, : len(self.places)])
 
-    def error(self, at: np.ndarray) -> np.ndarray:
-        """Covariance (n_at, n_at) of what the spline misses between the sensors, for τ² = 1."""
-        rows = np.hstack([self._covariance(at, (0, 0)), self._cubic(at, (0, 0))])
-        own = _kernel((at[:, None] - at) / self.domain.size, (0, 0))
-        return np.asarray(own - rows @ self._system @ rows.T)
+    def error(self, at: np.ndarray, derivatives: Sequence[tuple[int, int]] = ((0, 0),)) -> np.ndarray:
+        """Covariance of what the spline misses between the sensors, for τ² = 1, of one derivative after another at
+        places (n_at, 2): (n_derivatives n_at, n_derivatives n_at)."""
+        offset = (at[:, None] - at) / self.domain.size
+        own = np.block(
+            [[(-1.0) ** (k + m) * _kernel(offset, (i + k, j + m)) for k, m in derivatives] for i, j in derivatives]
+        )
+        rows = np.vstack([np.hstack([self._covariance(at, d), self._cubic(at, d)]) for d in derivatives])
+        scale = np.repeat([self.domain.size ** -sum(d) for d in derivatives], len(at))
+        return np.asarray((own - rows @ self._system @ rows.T) * np.outer(scale, scale))
 
     def roughness(self, values: np.ndarray, covariance: np.ndarray) -> float:
         """τ² of values (n_places,) of known covariance: the upper end of its interval; 0 where they may be noise.
@@ -227,6 +232,53 @@ def surface_eigenfunctions(
         shapes=lambda at, derivative: spline.matrix(at, derivative) @ values,
         domain=spline.domain,
         covariance=covariance,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceErrors:
+    """Errors of frequencies, and of the shapes that `surface_eigenfunctions` draws: noise, and what the spline misses.
+
+    Attributes:
+        spline: through the sensors.
+        values: (n_places, n_modes) of the shapes at the sensors, largest 1.
+        value_covariance: (n_modes, n_places, n_places) of these, each mode by itself.
+        roughness: (n_modes,) τ².
+        omega_covariance: (n_modes, n_modes) of the frequencies, (rad/s)².
+    """
+
+    spline: SurfaceSpline
+    values: np.ndarray
+    value_covariance: np.ndarray
+    roughness: np.ndarray
+    omega_covariance: np.ndarray
+
+    def select(self, modes: Sequence[int]) -> "SurfaceErrors":
+        """Those of some modes, by zero-based index."""
+        index = list(modes)
+        covariances = self.value_covariance[index], self.roughness[index], self.omega_covariance[np.ix_(index, index)]
+        return SurfaceErrors(self.spline, self.values[:, index], *covariances)
+
+
+@one_blas_thread
+def surface_errors(
+    found: ShapeEstimates, *, length: tuple[float, float], edges: str | Mapping[str, str] | None = None
+) -> SurfaceErrors:
+    """What the eigenfunctions that `surface_eigenfunctions` draws through identified shapes may be off by.
+
+    Args:
+        found: modes and the covariances of frequencies and shapes, at sensors with places (x, y).
+        length, edges: as `surface_eigenfunctions` takes them.
+
+    Raises:
+        ValueError: as `surface_eigenfunctions`.
+    """
+    spline, _ = _scaled(found.modes, length, None, edges)
+    values = normalised_shapes(found.modes.shapes).real
+    roughness = [spline.roughness(v, noise) for v, noise in zip(values.T, found.shape_covariance, strict=True)]
+    n = found.modes.n_modes
+    return SurfaceErrors(
+        spline, frozen(values), frozen(found.shape_covariance), frozen(roughness), frozen(found.covariance[:n, :n])
     )
 
 

@@ -22,11 +22,14 @@ class ShapeEstimates(Protocol):
     `identify_transfer`.
 
     `shape_covariance` is (n_modes, n_outputs, n_outputs) of the real parts of the shapes, over the largest entry of
-    each.
+    each; `covariance` is (2 n_modes, 2 n_modes) of (ω, ζ).
     """
 
     @property
     def modes(self) -> SampledModes: ...
+
+    @property
+    def covariance(self) -> np.ndarray: ...
 
     @property
     def shape_covariance(self) -> np.ndarray: ...

@@ -2,7 +2,8 @@
 
 Friswell & Mottershead, Finite Element Model Updating in Structural Dynamics (1995), chapter 8: weighted least squares
 on frequencies, modes paired by their shapes at every step. Repeated modes have no derivatives one by one: a measured
-shape is compared with the span of them, and its frequency with Rayleigh's quotient of its projection there.
+shape is compared with the span of them, and its frequency with Rayleigh's quotient of its projection there. Modes that
+were measured as repeated stay so where the model takes them apart: their shapes say nothing of how they are turned.
 """
 
 from collections.abc import Callable, Sequence
@@ -123,14 +124,14 @@ def update_model(
         if not isinstance(modes, Modes):
             raise ValueError(f"build must return modes, as model.modes(8) does; got {type(modes).__name__}")
         own = modes.phi(places)
-        rows, columns, agreement = assigned(measured, own, modes.omega, repeated=UPDATING.repeated)
+        cluster = _joined(repeated_modes(modes.omega, UPDATING.repeated), own, measured, target)
+        rows, columns, agreement = assigned(measured, own, cluster)
         if rows.size < target.size or agreement[rows, columns].min() < UPDATING.least_mac:
             lost = int(np.argmin(agreement.max(axis=1)))
             raise ValueError(
                 f"measured mode {lost + 1}, {target[lost] / (2 * np.pi):.4g} Hz, resembles no mode of the model: the"
                 f" best MAC is {agreement[lost].max():.2f}; let the model give more modes, or leave this one out"
             )
-        cluster = repeated_modes(modes.omega, UPDATING.repeated)
         quotients = modes.omega[columns]
         for r, s in enumerate(columns):
             alike = cluster == cluster[s]
@@ -152,7 +153,8 @@ def update_model(
     singular = np.linalg.svd(found.jac, compute_uv=False)
     if singular[-1] <= UPDATING.indistinct * singular[0]:
         raise ValueError(
-            "the measured frequencies cannot distinguish the parameters: some change them alike; choose fewer"
+            "the measured frequencies cannot distinguish the parameters: some change them alike, as stiffnesses in two"
+            " directions do where repeated modes are turned half-way between; choose fewer"
         )
     modes = build(parameters)
     columns, agreement, _ = paired(modes)
@@ -160,3 +162,20 @@ def update_model(
     return UpdatedModel(
         parameters, covariance, modes, columns, agreement, found.fun, bool(found.success), str(found.message)
     )
+
+
+def _joined(cluster: np.ndarray, own: np.ndarray, measured: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Clusters of the model's modes (n_modes,), those joined that modes measured as repeated are most like together.
+
+    Without this a model whose parameters part two modes by a little more would no longer have the measured shapes, and
+    the search end at that edge.
+    """
+    cluster, order = cluster.copy(), np.argsort(omega)
+    repeated = np.empty(omega.size, int)
+    repeated[order] = repeated_modes(omega[order], UPDATING.repeated)
+    for each in np.unique(repeated):
+        basis = np.linalg.qr(measured[:, repeated == each])[0]
+        share = (np.abs(basis.conj().T @ own) ** 2).sum(axis=0) / (np.abs(own) ** 2).sum(axis=0)
+        likest = np.argsort(-share, kind="stable")[: basis.shape[1]]
+        cluster[np.isin(cluster, cluster[likest])] = cluster[likest].min()
+    return cluster
