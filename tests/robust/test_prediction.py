@@ -185,5 +185,15 @@ def test_what_cannot_be_predicted_or_checked_is_named(plain):
         check_prediction(told, measured(plain, 1.0, rng, n=200))
     with pytest.raises(ValueError, match="has no output 'd2'"):
         check_prediction(told, replace(new, outputs=new.outputs[:1], output_channels=new.output_channels[:1]))
+    for given, options, match in (
+        ("friday.csv", {}, r"got 'friday.csv': read a file by wb.read_record"),
+        (new.inputs, {"sample_time": "0.01"}, "sample_time is a number in s; got '0.01'"),
+        (new, {"draws": "60"}, "is a whole number, 1 or more; got '60'"),
+        (new, {"seed": None}, "seed is a whole number, 0 or more; got None"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            predict(one, given, **options)
+    with pytest.raises(TypeError, match="a sampled controller; got str"):
+        predict_loop(one, "controller", LoopTest(50, 0.01, 0.3))
     unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
     assert "leaves the gap unexplained: 20 %" in str(unknown)

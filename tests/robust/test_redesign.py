@@ -366,6 +366,15 @@ def test_what_cannot_be_redesigned_is_named(rig, controller):
         redesign(rig, controller, sample_time=DT)
     with pytest.raises(TypeError, match="a law, a controller or a placement task; got str"):
         redesign(plain, "imsc", sample_time=DT)
+    for given, match in (
+        ({"test": "impulse"}, "a loop is put through a test; got str"),
+        ({"sample_time": "0.01"}, "sample_time is a number in s; got '0.01'"),
+        ({"more_cost": None}, "more_cost is a number; got None"),
+        ({"draws": "2"}, "is a whole number, 1 or more; got '2'"),
+        ({"seed": None}, "seed is a whole number, 0 or more; got None"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            redesign(plain, controller, **{"sample_time": DT, **given})
     with pytest.raises(DesignError, match="where the rig has no actuator"):
         redesign(possible(replace(rig, actuators=rig.actuators[:1])), controller, sample_time=DT)
     with pytest.raises(ValueError, match="2 samples or more"):

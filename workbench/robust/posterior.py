@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arguments import whole
 from workbench.arrays import Floats
 from workbench.gap.effects.beyond import BEYOND
 from workbench.gap.effects.catalogue import CATALOGUE
@@ -25,6 +26,7 @@ WIDEST, WIDEST_PLACE = 1.0, 10.0
 LIKELY = 0.01  # probability from which on a rival set is drawn too
 MOST_TRIES = 20  # draws for each rig that can be
 SAYABLE = ("none", "explained")
+WHAT_DRAWS = "draws, by which the uncertainty is sampled,"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +106,7 @@ class UncertainRig:
             seed: of the draws, or a generator.
 
         Raises:
+            TypeError: no number of them.
             ValueError: fewer than one, no whole number of them, or hardly any draw is a rig that can be.
         """
         return tuple(rig for rig, _ in self.draws_with_effects(n, seed))
@@ -113,13 +116,12 @@ class UncertainRig:
         self, n: int, seed: int | np.random.Generator = 0
     ) -> tuple[tuple[Rig, tuple[Effect, ...]], ...]:
         """The same, each with the effects that make it."""
-        if n != int(n) or n < 1:
-            raise ValueError(f"the uncertainty is sampled by a whole number of draws, 1 or more; got {n}")
+        n = whole(n, WHAT_DRAWS, least=1)
         rng = np.random.default_rng(seed)
         sets = [self, *(rival for rival, _ in self.rivals)]
         shares = np.array([p for _, p in self.rivals])
         shares = np.r_[max(1.0 - shares.sum(), 0.0), shares]
-        chosen = rng.choice(len(sets), int(n), p=shares / shares.sum())
+        chosen = rng.choice(len(sets), n, p=shares / shares.sum())
         return tuple(sets[i]._drawn(rng) for i in chosen)
 
     def _drawn(self, rng: np.random.Generator) -> tuple[Rig, tuple[Effect, ...]]:

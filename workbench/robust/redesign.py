@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arguments import number, whole
 from workbench.design.estimation.digital import DigitalController, sampled
 from workbench.design.export.export import write_controller
 from workbench.design.export.source import command_words, reading_words
@@ -20,8 +21,8 @@ from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
 from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
-from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Verification, drawn_with_errors, interval, settling, verify
+from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
+from workbench.robust.proof import Verification, check_test, drawn_with_errors, interval, settling, verify
 from workbench.robust.relocation import Relocation, relocated
 from workbench.robust.small_motion import loop_poles, modes_in_motion
 from workbench.structure.domain import Where
@@ -411,18 +412,24 @@ def redesign(
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
+        TypeError: no verdict, no design, no test, or no number where one is asked for.
         ValueError: an impulse outside the structure, no draws, an unknown aim, or a share below zero.
     """
     if aim not in (None, *AIMS):
         raise ValueError(f"a controller is judged by {' or '.join(AIMS)}; got {aim!r}")
     for name, share in (("more_cost", more_cost), ("more_work", more_work)):
-        if not share >= 0:
+        if not number(share, name) >= 0:
             raise ValueError(f"{name} is a share of that of the present controller, 0 or more; got {share:g}")
+    draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
+    if test is not None:
+        check_test(test)
     possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
     nominal, corrected = possible.nominal, possible.rig
     if test is not None:
         sample_time = test.sample_time if sample_time is None else sample_time
-    if sample_time is None:
+    if sample_time is not None:
+        sample_time = number(sample_time, "sample_time", "s")
+    else:
         if isinstance(verdict, UncertainRig):
             raise DesignError("how often does the controller run? give sample_time, in s")
         sample_time = verdict.attribution.search.data.records[0].sample_time
