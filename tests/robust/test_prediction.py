@@ -112,6 +112,11 @@ def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
     # at 30 Hz the noise is 0.28 of white noise: 27 % of its amplitudes, Rayleigh's, fall below the 2.5 % of white noise
     assert abs(bad.overall - 0.95) < 0.02
     assert good.band_coverage[:, -1].min() > 0.9 > 0.85 > bad.band_coverage[:, -1].max()
+    # over time nothing is amiss, so no sensor is named but in the band
+    j = int(bad.band_coverage[:, 0].argmin())
+    share, edges = 100 * bad.band_coverage[j, 0], "{:.4g} to {:.4g} Hz".format(*bad.bands_hz[0])
+    said = f"worst is the band from {edges}, where {share:.3g} % of the amplitudes of {bad.sensors[j]} lie inside."
+    assert bad.sentence.endswith(said)
 
 
 def test_clipping_and_rounding_bound_the_bands(plain):
