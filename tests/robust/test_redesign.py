@@ -235,6 +235,22 @@ def test_a_gain_of_nothing_is_no_reason_to_change_the_controller(rig, controller
     assert [one.advice.split(":")[0] for one in found] == ["Either controller does", "Use the redesigned controller"]
 
 
+def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
+    """A name alone is no match: gains and estimator are of the places that they were designed for."""
+    moved = [replace(rig.actuators[0], at=0.8), rig.actuators[1]]
+    law = imsc(rig.modes, 2, moved, weight=0.02)
+    with pytest.raises(DesignError, match=r"drives F1 \(force\) at x = 0.8, .*: it has F1 \(force\) at x = 0.45"):
+        redesign(possible(rig), law, sample_time=DT)
+    sensors = [replace(rig.sensors[0], at=0.5), *rig.sensors[1:4]]
+    estimator = kalman(rig.modes, controller.law, sensors, disturbance=1.0, noise=1e-6)
+    with pytest.raises(DesignError, match=r"at x = 0.5, .*: it has d1 \(displacement at x = 0.3\)"):
+        redesign(possible(rig), estimator, sample_time=DT)
+    exchanged = [replace(a, name=b.name) for a, b in zip(rig.actuators, rig.actuators[::-1], strict=True)]
+    turned = imsc(rig.modes, 2, exchanged, weight=0.02)
+    loop = fitted(rig, turned, LoopTest(100, DT, 0.8))
+    assert [a.at for a in loop.law.actuators] == [a.at for a in rig.actuators], "the place decides"
+
+
 def test_the_ends_of_an_interval_are_told_apart(rig, controller):
     sure = redesign(possible(rig), controller, sample_time=DT, impulse_at=0.8, draws=3, placement=False)
     near, far = (

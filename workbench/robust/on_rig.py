@@ -13,7 +13,7 @@ from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc, pole_gains
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, separation
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopTest, named
 from workbench.design.placement.task import PlacementTask
@@ -31,6 +31,7 @@ Design = Law | OnOffLaw | Controller | PlacementTask
 PERIODS = 25  # of the lowest controlled mode: the length of a test
 MOST_SAMPLES = 6000
 UNMOVED, GRID = 1e-9, 33  # of the largest displacement of a mode: what does not move; points where it is looked for
+SAME_PLACE = 0.01  # of the size of the structure: farther apart, two places are not the same
 SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over what is stated
 ENOUGH, BETTER = 0.8, 1.02  # of the damping designed for; a faster filter must give so much more
 
@@ -126,7 +127,7 @@ def _struck_at(rig: Rig, controlled: Sequence[int], given: Where | None) -> Wher
 
 
 def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
-    """A design on the sensors and actuators of a rig, by their names; a law alone reads a Kalman filter.
+    """A design on the sensors and actuators of a rig, by their places and names; a law alone reads a Kalman filter.
 
     Raises:
         DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
@@ -206,13 +207,15 @@ def _design_damping(modes: Modes, law: Law) -> np.ndarray:
 
 
 def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
-    for a in rig.actuators:
-        if a.name == wanted.name or (a.at == wanted.at and a.kind == wanted.kind and not a.direct):
-            return replace(a)
-    names = ", ".join(f"{a.name} at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    there = [a for a in rig.actuators if a.kind == wanted.kind and separation(rig.modes, a, wanted) < SAME_PLACE]
+    # the name alone says nothing where the place is another: gains for one place mean another law at the other
+    found = next((a for a in there if a.name == wanted.name), next((a for a in there if not a.direct), None))
+    if found is not None:
+        return replace(found)
+    names = ", ".join(f"{a.name} ({a.kind}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
     raise DesignError(
-        f"the law drives {wanted.name} at {rig.modes.domain.text(wanted.at)}, where the rig has no actuator: it has"
-        f" {names}; design the law for these"
+        f"the law drives {wanted.name} ({wanted.kind}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
+        f" actuator: it has {names}; design the law for these"
     )
 
 
@@ -222,15 +225,15 @@ def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
         alike = [
             s
             for s in rig.sensors
-            if s.quantity == one.quantity and (s.name == one.name or rig.modes.domain.separation(s.at, one.at) < 1e-9)
+            if s.quantity == one.quantity and rig.modes.domain.separation(s.at, one.at) < SAME_PLACE
         ]
         if not alike:
-            names = ", ".join(f"{s.name} ({s.quantity})" for s in rig.sensors)
+            names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
             raise DesignError(
                 f"the controller reads {one.quantity} at {rig.modes.domain.text(one.at)}, where the rig has no such"
                 f" sensor: it has {names}; design the estimator for these"
             )
-        found.append(alike[0])
+        found.append(next((s for s in alike if s.name == one.name), alike[0]))
     return tuple(found)
 
 
