@@ -235,6 +235,16 @@ def test_a_gain_of_nothing_is_no_reason_to_change_the_controller(rig, controller
     assert [one.advice.split(":")[0] for one in found] == ["Either controller does", "Use the redesigned controller"]
 
 
+def test_poles_ask_for_damping_and_not_for_the_frequency_of_another_rig(rig):
+    """On a heavier structure they are those of the same damping ratio, as a law designed for it has them."""
+    heavier = possible(rig, effect("point_mass", at=0.8, mass=0.2))
+    assert heavier.rig.modes.omega[0] < 0.96 * rig.modes.omega[0]
+    found = redesign(heavier, plain_law("poles", rig, 2, damping=0.05), sample_time=DT, impulse_at=0.8, draws=2)
+    own = plain_law("poles", heavier.rig, 2, damping=0.05)
+    np.testing.assert_allclose(found.loop.law.gain, own.gain, rtol=1e-9, atol=1e-9 * np.abs(own.gain).max())
+    assert np.median(found.proof.effort) < 1.2 * np.median(found.present_proof.effort)
+
+
 def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
     """A name alone is no match: gains and estimator are of the places that they were designed for."""
     moved = [replace(rig.actuators[0], at=0.8), rig.actuators[1]]

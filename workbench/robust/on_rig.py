@@ -240,6 +240,9 @@ def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
 def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
     """The same law and estimator, designed with their settings for the modes of another rig.
 
+    Poles of a law move with the natural frequencies, p ω / ω_old: they ask for damping, and holding a mode at the
+    frequency that another rig had would take far more force than damping it.
+
     Args:
         loop: as it is.
         rig: whose actuators and sensors are taken, by name.
@@ -254,7 +257,7 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
     assert loop.law.designed_by is not None and loop.controller.designed_by is not None
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
-    law = loop.law.designed_by(modes, controlled=controlled, actuators=actuators)  # type: ignore[call-arg]
+    law = _moved_along(loop, modes, controlled)(modes, controlled=controlled, actuators=actuators)
     linear = law if isinstance(law, Law) else _without_gain(law)
     sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
     controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
@@ -289,6 +292,17 @@ def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> L
             return None
         parts[name] = replace(part, designed_by=partial(part.designed_by.func, **{**keywords, **changed}))
     return designed_anew(loop._replace(**parts), rig, loop.modes)
+
+
+def _moved_along(loop: Loop, modes: Modes, controlled: Sequence[int]) -> Any:
+    """The design of the loop's law, its poles, where it has some, over the natural frequencies of other modes."""
+    design: Any = loop.law.designed_by
+    poles = getattr(design, "keywords", {}).get("poles")
+    if poles is None:
+        return design
+    old, new = loop.modes.omega[list(loop.law.controlled)], modes.omega[list(controlled)]
+    scale = np.where((old > 0) & (new > 0), new / np.where(old > 0, old, 1.0), 1.0)
+    return partial(design.func, **{**design.keywords, "poles": scale * np.asarray(poles)})
 
 
 def _moved(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:
