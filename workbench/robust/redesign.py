@@ -31,6 +31,7 @@ from workbench.threads import one_blas_thread
 Report = Callable[[str, float], None]
 
 AWAY = 1e3  # a loss from which on the motion is said to diverge
+LEAST_TOLD = 1e-4  # a loss below which its size says nothing
 PAYS = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
@@ -77,6 +78,8 @@ class Step:
     @property
     def lost(self) -> str:
         """The loss in words."""
+        if 0.0 < self.loss < LEAST_TOLD:
+            return f"below {100.0 * LEAST_TOLD:g} %"
         return "diverges" if self.diverges else f"{100.0 * self.loss:.3g} %"
 
 
@@ -339,9 +342,9 @@ class Redesign:
         if np.isnan(margin):
             return f"No promise: {error}, and on-off control has no linear bound."
         bears = f"the loop bears {_percent(min(margin, 9.99))} of any phase"
-        return (
-            f"No effect explains the gap: {error}; {bears}, so stability is {'sure' if margin > share else 'not sure'}."
-        )
+        # the share is a mean over frequencies, and the bound is of each of them
+        sure = "sure unless some frequency is off by more" if margin > share else "not sure"
+        return f"No effect explains the gap: {error} in the mean; {bears}, so stability is {sure}."
 
     def __repr__(self) -> str:
         return f"<Redesign: {self.sentence}>"
