@@ -259,6 +259,13 @@ def test_a_controller_for_other_places_does_not_fit_the_rig(rig, controller):
     estimator = kalman(rig.modes, controller.law, sensors, disturbance=1.0, noise=1e-6)
     with pytest.raises(DesignError, match=r"at x = 0.5, .*: it has d1 \(displacement at x = 0.3\)"):
         redesign(possible(rig), estimator, sample_time=DT)
+    between = wb.Between(0.3, 0.7)
+    stretched = replace(rig, sensors=[*rig.sensors, Sensor("d9", between)])
+    reads = kalman(
+        rig.modes, controller.law, stretched.sensors[:2] + stretched.sensors[-1:], disturbance=1.0, noise=1e-6
+    )
+    loop = fitted(stretched, reads, LoopTest(100, DT, 0.8))
+    assert [s.name for s in loop.controller.sensors] == ["d1", "d2", "d9"]
     exchanged = [replace(a, name=b.name) for a, b in zip(rig.actuators, rig.actuators[::-1], strict=True)]
     turned = imsc(rig.modes, 2, exchanged, weight=0.02)
     loop = fitted(rig, turned, LoopTest(100, DT, 0.8))

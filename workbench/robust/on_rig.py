@@ -222,11 +222,7 @@ def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
 def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
     found = []
     for one in wanted:
-        alike = [
-            s
-            for s in rig.sensors
-            if s.quantity == one.quantity and rig.modes.domain.separation(s.at, one.at) < SAME_PLACE
-        ]
+        alike = [s for s in rig.sensors if s.quantity == one.quantity and separation(rig.modes, s, one) < SAME_PLACE]
         if not alike:
             names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
             raise DesignError(
