@@ -8,6 +8,7 @@ import workbench
 
 ROOT = Path(workbench.__file__).parent
 FLOORS = {
+    "arguments": -1,
     "arrays": -1,
     "deadline": -1,
     "threads": -1,

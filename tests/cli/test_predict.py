@@ -73,6 +73,7 @@ def test_tests_are_checked_and_logged_beside_the_case(run, case):
         (("check", "late", "low"), "was fitted, so it is no test"),
         (("predict", "late", "nothing.csv"), "neither a file nor a record of the case, which are low"),
         (("check", "late", "friday.csv", "--log", "friday.csv"), "friday.csv is no log of tests"),
+        (("check", "late", "friday.csv", "--log", "no/tests.csv"), "there is no folder no; make it first"),
         (("predict", "late", "friday.csv", "--draws", "3"), "need 40 draws or more"),
     ],
 )

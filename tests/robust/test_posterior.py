@@ -89,6 +89,25 @@ def test_errors_of_the_nominal_model_and_places_go_through_json(told):
     assert np.ptp([r.modes.omega[0] for r in again.draws(20)]) > 0
 
 
+@pytest.mark.parametrize(
+    ("changed", "match"),
+    [
+        (lambda rig: {"sensors": [replace(s, quantity="velocity") for s in rig.sensors]}, "quantities of outputs"),
+        (lambda rig: {"sensors": [replace(s, at=0.9 * s.at) for s in rig.sensors]}, "places of outputs"),
+        (lambda rig: {"actuators": [replace(a, at=0.9 * a.at) for a in rig.actuators]}, "places of inputs"),
+        (lambda rig: {"modes": replace(rig.modes, damping=2.0 * rig.modes.damping)}, "damping rates"),
+    ],
+)
+def test_a_verdict_of_a_rig_that_has_changed_since_is_refused(told, changed, match):
+    rig = told[0]
+    written = json.loads(json.dumps(UncertainRig(rig, (), np.zeros((0, 0))).to_json()))
+    other = replace(rig, **changed(rig))
+    with pytest.raises(ValueError, match=f"of another rig: its {match} are .*; diagnose this case again"):
+        UncertainRig.from_json(other, written)
+    early = {key: written["nominal"][key] for key in ("inputs", "outputs", "frequencies_hz")}
+    assert UncertainRig.from_json(other, {**written, "nominal": early}).rig is other
+
+
 def identified_rig(covariance=None):
     """Two modes as they were identified at a driving point and another sensor."""
     points, shapes = NamedPoints(("F", "y")), PointShapes(np.array([[0.7, 0.5], [0.6, -0.4]]))

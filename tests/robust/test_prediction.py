@@ -112,6 +112,11 @@ def test_coloured_noise_of_the_same_size_is_seen_in_the_spectrum_alone(plain):
     # at 30 Hz the noise is 0.28 of white noise: 27 % of its amplitudes, Rayleigh's, fall below the 2.5 % of white noise
     assert abs(bad.overall - 0.95) < 0.02
     assert good.band_coverage[:, -1].min() > 0.9 > 0.85 > bad.band_coverage[:, -1].max()
+    # over time nothing is amiss, so no sensor is named but in the band
+    j = int(bad.band_coverage[:, 0].argmin())
+    share, edges = 100 * bad.band_coverage[j, 0], "{:.4g} to {:.4g} Hz".format(*bad.bands_hz[0])
+    said = f"worst is the band from {edges}, where {share:.3g} % of the amplitudes of {bad.sensors[j]} lie inside."
+    assert bad.sentence.endswith(said)
 
 
 def test_clipping_and_rounding_bound_the_bands(plain):
@@ -185,5 +190,15 @@ def test_what_cannot_be_predicted_or_checked_is_named(plain):
         check_prediction(told, measured(plain, 1.0, rng, n=200))
     with pytest.raises(ValueError, match="has no output 'd2'"):
         check_prediction(told, replace(new, outputs=new.outputs[:1], output_channels=new.output_channels[:1]))
+    for given, options, match in (
+        ("friday.csv", {}, r"got 'friday.csv': read a file by wb.read_record"),
+        (new.inputs, {"sample_time": "0.01"}, "sample_time is a number in s; got '0.01'"),
+        (new, {"draws": "60"}, "is a whole number, 1 or more; got '60'"),
+        (new, {"seed": None}, "seed is a whole number, 0 or more; got None"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            predict(one, given, **options)
+    with pytest.raises(TypeError, match="a sampled controller; got str"):
+        predict_loop(one, "controller", LoopTest(50, 0.01, 0.3))
     unknown = predict(replace(one, outcome="unknown", unexplained=0.2), new, draws=60)
     assert "leaves the gap unexplained: 20 %" in str(unknown)

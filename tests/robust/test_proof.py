@@ -19,11 +19,33 @@ def test_what_no_loop_can_be_made_of_is_refused(rig):
         ((rig, controller, test), "on an UncertainRig, or on rigs drawn from it; got Rig"),
         (((), controller, test), "on an UncertainRig"),
         ((certain, law, test), "sampled controller; got Law"),
-        ((certain, controller, None), "the test that each loop is put through; got NoneType"),
+        ((certain, controller, None), "a loop is put through a test; got NoneType: make one by LoopTest"),
     ):
         with pytest.raises(TypeError, match=match):
             verify(*wrong)
-    for draws in (2.5, 0):
-        with pytest.raises(ValueError, match="whole number of draws"):
+    for draws in (2.5, 0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="draws, by which the uncertainty is sampled, is a whole"):
             verify(certain, controller, test, draws=draws)
     assert verify(certain, controller, test, draws=2.0).n_draws == 2
+    for given, match in (
+        ({"draws": "2"}, "1 or more; got '2'"),
+        ({"draws": None}, "1 or more; got None"),
+        ({"draws": True}, "1 or more; got True"),
+        ({"seed": "x"}, "seed is a whole number, 0 or more; got 'x'"),
+        ({"controlled": 2}, r"controlled is a sequence of modes, counted from zero, such as \(0, 1\); got 2"),
+        ({"controlled": ("a",)}, "a mode counted from zero, is a whole number"),
+        ({"centre": controller}, "centre is the rig whose margin is stated; got DigitalController"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            verify(certain, controller, test, **given)
+    for given, match in (
+        ({"seed": -1}, "seed is a whole number, 0 or more; got -1"),
+        ({"controlled": (-1,)}, "a mode counted from zero, is a whole number, 0 or more; got -1"),
+        ({"controlled": (0, 9)}, "controlled are modes 0 to 5 of the rigs, counted from zero; got 9"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            verify(certain, controller, test, **given)
+    with pytest.raises(ValueError, match=r"LoopTest.n_samples is a whole number, 0 or more; got 50.5"):
+        LoopTest(50.5, 0.01)
+    with pytest.raises(TypeError, match=r"LoopTest.sample_time is a number in s; got '0.01'"):
+        LoopTest(50, "0.01")

@@ -35,7 +35,7 @@ def check(
     from workbench.robust.check import check_length, check_prediction, log_test, read_log
     from workbench.study.pages.prediction_page import prediction_page
 
-    check_target(json_path)
+    check_target(json_path, log)
     log = case / LOG if log is None else log
     read_log(log)  # a file that is no log is refused before the work
     found = read_case(case)

@@ -59,13 +59,18 @@ class PredictionCheck(Printed):
     @property
     def probability(self) -> float:
         """Share of tests of a true model whose worst sensor, over time or in a band, comes out no better."""
+        return min(self._probabilities)
+
+    @property
+    def _probabilities(self) -> tuple[float, float]:
+        """The same over time alone, and in the bands alone."""
         found = np.column_stack([self.coverage, self.band_coverage])
         over_time = np.mean(self.expected[:, :, 0].min(axis=1) <= found[:, 0].min())
         if found.shape[1] == 1:
-            return float(over_time)
+            return float(over_time), 1.0
         # bands hold few frequencies: the mean over sensors of each tells more than the least of all
         in_bands = np.mean(self.expected[:, :, 1:].mean(axis=1).min(axis=1) <= found[:, 1:].mean(axis=0).min())
-        return float(min(over_time, in_bands))
+        return float(over_time), float(in_bands)
 
     @property
     def holds(self) -> bool:
@@ -81,12 +86,25 @@ class PredictionCheck(Printed):
         )
         if self.holds:
             return f"The model holds: {text}."
-        j = int(np.argmin(self.coverage))
-        text += f"; worst is sensor {self.sensors[j]} with {100 * self.coverage[j]:.3g} %"
-        if self.bands_hz.size:
-            low, high = self.bands_hz[int(np.argmin(self.band_coverage.mean(axis=0)))]
-            text += f", and the band from {low:.4g} to {high:.4g} Hz"
-        return f"The model does not hold: {text}."
+        return f"The model does not hold: {text}; worst is {' and '.join(self._worst)}."
+
+    @property
+    def _worst(self) -> list[str]:
+        """What comes out worse than a true model gives, in words: a sensor over time, a frequency band, or both."""
+        over_time, in_bands = self._probabilities
+        words = []
+        if over_time <= UNLIKELY:
+            j = int(np.argmin(self.coverage))
+            words.append(f"sensor {self.sensors[j]} with {100 * self.coverage[j]:.3g} %")
+        if in_bands <= UNLIKELY:
+            k = int(np.argmin(self.band_coverage.mean(axis=0)))
+            j = int(np.argmin(self.band_coverage[:, k]))
+            (low, high), share = self.bands_hz[k], 100 * self.band_coverage[j, k]
+            words.append(
+                f"the band from {low:.4g} to {high:.4g} Hz, where {share:.3g} % of the amplitudes of {self.sensors[j]}"
+                " lie inside"
+            )
+        return words
 
     def _printed(self) -> tuple[str, Sequence[str], Sequence[Sequence[str]], Sequence[str]]:
         bands = [f"{low:.3g} to {high:.3g} Hz [%]" for low, high in self.bands_hz]

@@ -13,7 +13,7 @@ from workbench.design.estimation.digital import sampled
 from workbench.design.estimation.observers import kalman
 from workbench.design.laws.coupled import controlled_plant
 from workbench.design.laws.imsc import imsc, pole_gains
-from workbench.design.laws.law import DesignError, Law
+from workbench.design.laws.law import DesignError, Law, separation
 from workbench.design.laws.on_off import OnOffLaw
 from workbench.design.loop.rig_loop import LoopTest, named
 from workbench.design.placement.task import PlacementTask
@@ -31,6 +31,7 @@ Design = Law | OnOffLaw | Controller | PlacementTask
 PERIODS = 25  # of the lowest controlled mode: the length of a test
 MOST_SAMPLES = 6000
 UNMOVED, GRID = 1e-9, 33  # of the largest displacement of a mode: what does not move; points where it is looked for
+SAME_PLACE = 0.01  # of the size of the structure: farther apart, two places are not the same
 SPEEDS = tuple(10.0**k for k in np.arange(8.0, -2.1, -0.5))  # of the default Kalman filter: noise over what is stated
 ENOUGH, BETTER = 0.8, 1.02  # of the damping designed for; a faster filter must give so much more
 
@@ -126,7 +127,7 @@ def _struck_at(rig: Rig, controlled: Sequence[int], given: Where | None) -> Wher
 
 
 def fitted(rig: Rig, design: Design, test: LoopTest) -> Loop:
-    """A design on the sensors and actuators of a rig, by their names; a law alone reads a Kalman filter.
+    """A design on the sensors and actuators of a rig, by their places and names; a law alone reads a Kalman filter.
 
     Raises:
         DesignError: a sensor or an actuator that the rig does not have, or a gain given by hand.
@@ -206,36 +207,37 @@ def _design_damping(modes: Modes, law: Law) -> np.ndarray:
 
 
 def _same_actuator(rig: Rig, wanted: Actuator) -> Actuator:
-    for a in rig.actuators:
-        if a.name == wanted.name or (a.at == wanted.at and a.kind == wanted.kind and not a.direct):
-            return replace(a)
-    names = ", ".join(f"{a.name} at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
+    there = [a for a in rig.actuators if a.kind == wanted.kind and separation(rig.modes, a, wanted) < SAME_PLACE]
+    # the name alone says nothing where the place is another: gains for one place mean another law at the other
+    found = next((a for a in there if a.name == wanted.name), next((a for a in there if not a.direct), None))
+    if found is not None:
+        return replace(found)
+    names = ", ".join(f"{a.name} ({a.kind}) at {rig.modes.domain.text(a.at)}" for a in rig.actuators)
     raise DesignError(
-        f"the law drives {wanted.name} at {rig.modes.domain.text(wanted.at)}, where the rig has no actuator: it has"
-        f" {names}; design the law for these"
+        f"the law drives {wanted.name} ({wanted.kind}) at {rig.modes.domain.text(wanted.at)}, where the rig has no"
+        f" actuator: it has {names}; design the law for these"
     )
 
 
 def _same_sensors(rig: Rig, wanted: Sequence[Sensor]) -> tuple[Sensor, ...]:
     found = []
     for one in wanted:
-        alike = [
-            s
-            for s in rig.sensors
-            if s.quantity == one.quantity and (s.name == one.name or rig.modes.domain.separation(s.at, one.at) < 1e-9)
-        ]
+        alike = [s for s in rig.sensors if s.quantity == one.quantity and separation(rig.modes, s, one) < SAME_PLACE]
         if not alike:
-            names = ", ".join(f"{s.name} ({s.quantity})" for s in rig.sensors)
+            names = ", ".join(f"{s.name} ({s.quantity} at {rig.modes.domain.text(s.at)})" for s in rig.sensors)
             raise DesignError(
                 f"the controller reads {one.quantity} at {rig.modes.domain.text(one.at)}, where the rig has no such"
                 f" sensor: it has {names}; design the estimator for these"
             )
-        found.append(alike[0])
+        found.append(next((s for s in alike if s.name == one.name), alike[0]))
     return tuple(found)
 
 
 def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = ()) -> Loop:
     """The same law and estimator, designed with their settings for the modes of another rig.
+
+    Poles of a law move with the natural frequencies, p ω / ω_old: they ask for damping, and holding a mode at the
+    frequency that another rig had would take far more force than damping it.
 
     Args:
         loop: as it is.
@@ -251,7 +253,7 @@ def designed_anew(loop: Loop, rig: Rig, modes: Modes, removed: Sequence[str] = (
     assert loop.law.designed_by is not None and loop.controller.designed_by is not None
     if isinstance(loop.law, OnOffLaw):
         modes = replace(modes, damping=np.diag(np.diag(modes.damping)))
-    law = loop.law.designed_by(modes, controlled=controlled, actuators=actuators)  # type: ignore[call-arg]
+    law = _moved_along(loop, modes, controlled)(modes, controlled=controlled, actuators=actuators)
     linear = law if isinstance(law, Law) else _without_gain(law)
     sensors = [named(rig.sensors, old.name) for old in loop.controller.sensors]
     controller = _estimated(loop.controller, modes, linear, without(sensors), removed)
@@ -286,6 +288,17 @@ def tuned(loop: Loop, rig: Rig, *, weight: float = 1.0, noise: float = 1.0) -> L
             return None
         parts[name] = replace(part, designed_by=partial(part.designed_by.func, **{**keywords, **changed}))
     return designed_anew(loop._replace(**parts), rig, loop.modes)
+
+
+def _moved_along(loop: Loop, modes: Modes, controlled: Sequence[int]) -> Any:
+    """The design of the loop's law, its poles, where it has some, over the natural frequencies of other modes."""
+    design: Any = loop.law.designed_by
+    poles = getattr(design, "keywords", {}).get("poles")
+    if poles is None:
+        return design
+    old, new = loop.modes.omega[list(loop.law.controlled)], modes.omega[list(controlled)]
+    scale = np.where((old > 0) & (new > 0), new / np.where(old > 0, old, 1.0), 1.0)
+    return partial(design.func, **{**design.keywords, "poles": scale * np.asarray(poles)})
 
 
 def _moved(poles: np.ndarray, loop: Loop, gain: float) -> np.ndarray:

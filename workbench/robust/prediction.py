@@ -2,9 +2,11 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from workbench.arguments import number, whole
 from workbench.arrays import Floats
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, named, run_loops
@@ -14,8 +16,8 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.elements import RandomForce
 from workbench.rig.rig import Rig
 from workbench.rig.simulate import Motion, read, simulate
-from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import drawn_with_errors
+from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
+from workbench.robust.proof import check_loop_kinds, drawn_with_errors
 from workbench.structure.modes import Modes, frozen
 from workbench.structure.printed import Printed, counted
 from workbench.threads import one_blas_thread
@@ -124,8 +126,10 @@ def predict(
         report: called with what is done and the share done.
 
     Raises:
+        TypeError: no verdict, inputs that are neither numbers nor a record, or no number where one is asked for.
         ValueError: inputs that do not fit the rig, too few draws, or hardly any draw with a bounded motion.
     """
+    seed = whole(seed, "seed")
     found, spread = _found(rig, noise_std)
     sent, period, hold, start = _inputs(found.nominal, inputs, sample_time)
     n_outputs, n_samples = spread.size, sent.shape[1]
@@ -183,9 +187,12 @@ def predict_loop(
         seed: of the draws and of the noise.
 
     Raises:
+        TypeError: no verdict, no sampled controller, no test, or no number where one is asked for.
         ValueError: a controller or a test that does not fit the rig, too few draws, or hardly any with a bounded
             motion.
     """
+    check_loop_kinds(controller, test)
+    seed = whole(seed, "seed")
     found, noise = _found(rig, noise_std)
     n_outputs, n_samples = len(controller.sensors), test.n_samples
     rigs = [_with_noise(drawn, noise) for drawn in drawn_with_errors(found, _draws(draws, n_outputs, n_samples), seed)]
@@ -215,9 +222,10 @@ def check_draws(wanted: int) -> None:
     """Refuse too few draws for the ends of a band.
 
     Raises:
+        TypeError: no number.
         ValueError: saying how many it takes.
     """
-    if wanted < LEAST_DRAWS:
+    if whole(wanted, WHAT_DRAWS, least=1) < LEAST_DRAWS:
         raise ValueError(f"bands of {100 * LEVEL:g} % need {LEAST_DRAWS} draws or more; got {wanted}")
 
 
@@ -334,7 +342,12 @@ def _inputs(rig: Rig, inputs: Record | Floats, sample_time: float | None) -> tup
             np.array([there[name] for name in names]), inputs.sample_time, inputs.input_hold, inputs.start_time,
         )  # fmt: skip
     else:
-        if sample_time is None or not (np.isfinite(sample_time) and sample_time > 0):
+        if inputs is None or isinstance(inputs, str | Path):
+            raise TypeError(
+                f"inputs are a record or an array of commands; got {inputs!r}: read a file by wb.read_record(path,"
+                " inputs=...)"
+            )
+        if sample_time is None or not (np.isfinite(number(sample_time, "sample_time", "s")) and sample_time > 0):
             raise ValueError(f"inputs as an array need a positive sample_time; got {sample_time}")
         sent, period, hold, start = np.atleast_2d(np.asarray(inputs, float)), sample_time, "zero", 0.0
     if sent.shape[0] != len(names) or sent.shape[1] < 2 or not np.isfinite(sent).all():

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from workbench.arguments import whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.rig_loop import LoopRun, LoopTest, of_loops, run_loop
 from workbench.rig.rig import Rig
-from workbench.robust.posterior import UncertainRig
+from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
 from workbench.robust.small_motion import loop_poles, modes_in_motion, small_gain_margin
 from workbench.structure.modes import frozen
 from workbench.threads import one_blas_thread
@@ -147,17 +148,22 @@ def verify(
         centre: the rig whose margin is stated; the first where rigs are given.
 
     Raises:
-        TypeError: no uncertain rig, no sampled controller or no test.
-        ValueError: a controller or a test that does not fit the rig, draws that are no whole number above zero.
+        TypeError: no uncertain rig, no sampled controller or no test, or no number where one is asked for.
+        ValueError: a controller or a test that does not fit the rig, draws that are no whole number above zero, or a
+            controlled mode that the rigs do not have.
     """
-    _check_kinds(possible, controller, test)
+    _check_kinds(possible, controller, test, centre)
+    draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
     if isinstance(possible, UncertainRig):
         rigs: Sequence[Rig] = drawn_with_errors(possible, draws, seed)
         centre = centre or possible.rig
     else:
         rigs, centre = possible, centre or possible[0]
-    index = list(controlled)
+    index = _indices(controlled)
     n_modes = min(rig.modes.n_modes for rig in rigs)
+    strange = [r for r in index if not 0 <= r < n_modes]
+    if strange:
+        raise ValueError(f"controlled are modes 0 to {n_modes - 1} of the rigs, counted from zero; got {strange[0]}")
 
     def told(rig: Rig, run: LoopRun) -> _Draw:
         poles, energy = loop_poles(rig, controller, modes_in_motion(rig, run)), run.response.energy
@@ -187,7 +193,7 @@ def verify(
             peak_force=_finite(found.peak_force),
             stroke=_finite(found.stroke),
             work=_finite(found.work),
-            controlled=tuple(controlled),
+            controlled=tuple(index),
             effort=_finite(found.effort),
             vibration=_finite([energy.sum() * dt for energy in found.energy]),
             settling=_settlings(found.energy, found.stable, dt),
@@ -198,7 +204,14 @@ def verify(
         )
 
 
-def _check_kinds(possible: object, controller: object, test: object) -> None:
+def _indices(controlled: Sequence[int]) -> list[int]:
+    """Zero-based modes, each a whole number."""
+    if isinstance(controlled, str) or not isinstance(controlled, Sequence | np.ndarray):
+        raise TypeError(f"controlled is a sequence of modes, counted from zero, such as (0, 1); got {controlled!r}")
+    return [whole(r, "each of controlled, a mode counted from zero,") for r in controlled]
+
+
+def _check_kinds(possible: object, controller: object, test: object, centre: object) -> None:
     """Refuse what no loop can be made of."""
     drawn = isinstance(possible, Sequence) and len(possible) > 0 and all(isinstance(rig, Rig) for rig in possible)
     if not (isinstance(possible, UncertainRig) or drawn):
@@ -206,15 +219,35 @@ def _check_kinds(possible: object, controller: object, test: object) -> None:
             f"a controller is verified on an UncertainRig, or on rigs drawn from it; got {type(possible).__name__}:"
             " UncertainRig.of(verdict) is what a diagnosis leaves"
         )
+    check_loop_kinds(controller, test)
+    if not isinstance(centre, Rig | None):
+        raise TypeError(f"centre is the rig whose margin is stated; got {type(centre).__name__}")
+
+
+def check_loop_kinds(controller: object, test: object) -> None:
+    """Refuse what is no sampled controller, or no test of one.
+
+    Raises:
+        TypeError: saying what makes one.
+    """
     if not isinstance(controller, DigitalController):
         raise TypeError(
-            f"what is verified is a sampled controller; got {type(controller).__name__}: make one of a law and an"
+            f"what runs in the loop is a sampled controller; got {type(controller).__name__}: make one of a law and an"
             " estimator by sampled(kalman(...), sample_time)"
         )
+    check_test(test)
+
+
+def check_test(test: object) -> None:
+    """Refuse what is no test.
+
+    Raises:
+        TypeError: saying what makes one.
+    """
     if not isinstance(test, LoopTest):
         raise TypeError(
-            f"the third argument is the test that each loop is put through; got {type(test).__name__}: make one by"
-            " LoopTest(n_samples, sample_time, impulse_at=...), from workbench.design.loop.rig_loop"
+            f"a loop is put through a test; got {type(test).__name__}: make one by LoopTest(n_samples, sample_time,"
+            " impulse_at=...), from workbench.design.loop.rig_loop"
         )
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from workbench.arguments import number, whole
 from workbench.design.estimation.digital import DigitalController, sampled
 from workbench.design.export.export import write_controller
 from workbench.design.export.source import command_words, reading_words
@@ -20,8 +21,8 @@ from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.robust.compensation import STEPS, Loop, check_rate, compensated, without
 from workbench.robust.on_rig import Design, controlled_by, designed_anew, fitted, impulse_test, tuned
-from workbench.robust.posterior import UncertainRig
-from workbench.robust.proof import Verification, drawn_with_errors, interval, settling, verify
+from workbench.robust.posterior import WHAT_DRAWS, UncertainRig
+from workbench.robust.proof import Verification, check_test, drawn_with_errors, interval, settling, verify
 from workbench.robust.relocation import Relocation, relocated
 from workbench.robust.small_motion import loop_poles, modes_in_motion
 from workbench.structure.domain import Where
@@ -30,6 +31,7 @@ from workbench.threads import one_blas_thread
 Report = Callable[[str, float], None]
 
 AWAY = 1e3  # a loss from which on the motion is said to diverge
+LEAST_TOLD = 1e-4  # a loss below which its size says nothing
 PAYS = 0.005  # of the loss: what a step must take away; of the cost: less is no reason to change the controller
 WEIGHTS = (0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25)  # of the forces of a law whose actuators saturate, over its own
 SLOWER = (1.0, 2.0, 5.0, 10.0)  # of the readings of its Kalman filter: noise over its own
@@ -76,6 +78,8 @@ class Step:
     @property
     def lost(self) -> str:
         """The loss in words."""
+        if 0.0 < self.loss < LEAST_TOLD:
+            return f"below {100.0 * LEAST_TOLD:g} %"
         return "diverges" if self.diverges else f"{100.0 * self.loss:.3g} %"
 
 
@@ -148,6 +152,14 @@ class Redesign:
     def _sooner(self) -> bool:
         return interval(self._settling(self.proof))[0] < interval(self._settling(self.present_proof))[0]
 
+    @property
+    def _sooner_by(self) -> float:
+        """Share of the settling time that the redesigned controller saves, in the median of the draws."""
+        new, old = (interval(self._settling(proof))[0] for proof in (self.proof, self.present_proof))
+        if not np.isfinite(old):
+            return float(np.isfinite(new))
+        return 1.0 - new / old if old else 0.0
+
     def _settling(self, proof: Verification) -> np.ndarray:
         """Settling time of each draw (n_draws,), s: of the controlled modes where the law is for it."""
         return proof.settling if self.aim == "cost" else proof.controlled_settling
@@ -155,10 +167,11 @@ class Redesign:
     @property
     def _more(self) -> str:
         """What it takes more than is allowed, in words; empty for nothing."""
-        said = f"{'vibration' if self.aim == 'cost' else 'time'} and effort", "work"
+        together = f"costs {{}} more, {'vibration' if self.aim == 'cost' else 'time'} and effort taken together"
+        said = together, "takes {} more work"
         over = zip(said, np.array(self._over) - 1.0, ("cost", "work"), (self.more_cost, self.more_work))
         return ", and ".join(
-            f"takes {_percent(more)} more {what}: more_{name} = {np.ceil(100.0 * more) / 100.0:g} allows it"
+            f"{what.format(_percent(more))}: more_{name} = {np.ceil(100.0 * more) / 100.0:g} allows it"
             for what, more, name, allowed in over
             if more > allowed
         )
@@ -257,7 +270,8 @@ class Redesign:
             middle, low, high = interval(self._settling(proof))
             if not np.isfinite(high):
                 return self._settles(proof)
-            return f"{'settles in ' * named}{middle:.3g} s ({lead}{low:.3g} to {high:.3g})"
+            ends = "draws alike" if f"{low:.3g}" == f"{high:.3g}" else f"{lead}{low:.3g} to {high:.3g}"
+            return f"{'settles in ' * named}{middle:.3g} s ({ends})"
         ratios = _ratios(proof.damping[:, self.mode], lead)
         return f"keeps mode {self.mode + 1} at {ratios} damping" if named else ratios
 
@@ -269,7 +283,7 @@ class Redesign:
         difference = self._difference
         if self.present_proof.stable.sum() != self.proof.stable.sum():
             return f"Use the redesigned controller: it {difference}."
-        if 1.0 - self._over[0] < PAYS and self._settles(self.proof) == self._settles(self.present_proof):
+        if max(1.0 - self._over[0], self._sooner_by) < PAYS:
             return f"Either controller does: the redesigned {difference} (medians of the draws)."
         forces = [interval(proof.peak_force)[0] for proof in (self.proof, self.present_proof)]
         after, before = (f"{force:.3g} N" for force in forces)
@@ -288,9 +302,9 @@ class Redesign:
             settles, effort = self._settles(new, " the controlled modes"), f"{_times(new.effort, old.effort)} effort"
             settles += f" where the present one {self._settles(old, ' them')}"
             return f"{settles}, for {effort}" if self._sooner else f"takes {effort} and {settles}"
-        if self._sooner and self._settles(new) != self._settles(old):
-            return f"{self._settles(new)} where the present one {self._settles(old)}"
         less = 1.0 - self._over[0]
+        if self._sooner and self._sooner_by >= less:  # of the two gains the larger one is the reason
+            return f"{self._settles(new)} where the present one {self._settles(old)}"
         return f"takes {_percent(abs(less))} {'less' if less > 0 else 'more'} vibration and effort than the present one"
 
     def _settles(self, proof: Verification, what: str = "") -> str:
@@ -328,9 +342,9 @@ class Redesign:
         if np.isnan(margin):
             return f"No promise: {error}, and on-off control has no linear bound."
         bears = f"the loop bears {_percent(min(margin, 9.99))} of any phase"
-        return (
-            f"No effect explains the gap: {error}; {bears}, so stability is {'sure' if margin > share else 'not sure'}."
-        )
+        # the share is a mean over frequencies, and the bound is of each of them
+        sure = "sure unless some frequency is off by more" if margin > share else "not sure"
+        return f"No effect explains the gap: {error} in the mean; {bears}, so stability is {sure}."
 
     def __repr__(self) -> str:
         return f"<Redesign: {self.sentence}>"
@@ -411,18 +425,24 @@ def redesign(
     Raises:
         DesignError: a controller that does not fit the rig, a rate too slow for the modes, an impulse that moves none
             of them, or modes that cannot be controlled on the corrected rig.
+        TypeError: no verdict, no design, no test, or no number where one is asked for.
         ValueError: an impulse outside the structure, no draws, an unknown aim, or a share below zero.
     """
     if aim not in (None, *AIMS):
         raise ValueError(f"a controller is judged by {' or '.join(AIMS)}; got {aim!r}")
     for name, share in (("more_cost", more_cost), ("more_work", more_work)):
-        if not share >= 0:
+        if not number(share, name) >= 0:
             raise ValueError(f"{name} is a share of that of the present controller, 0 or more; got {share:g}")
+    draws, seed = whole(draws, WHAT_DRAWS, least=1), whole(seed, "seed")
+    if test is not None:
+        check_test(test)
     possible = verdict if isinstance(verdict, UncertainRig) else UncertainRig.of(verdict)
     nominal, corrected = possible.nominal, possible.rig
     if test is not None:
         sample_time = test.sample_time if sample_time is None else sample_time
-    if sample_time is None:
+    if sample_time is not None:
+        sample_time = number(sample_time, "sample_time", "s")
+    else:
         if isinstance(verdict, UncertainRig):
             raise DesignError("how often does the controller run? give sample_time, in s")
         sample_time = verdict.attribution.search.data.records[0].sample_time
@@ -687,7 +707,7 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
     if step == "sensors":
         for s in (named(rig.sensors, one.name) for one in loop.controller.sensors):
             faults = [
-                *([f"gain {s.gain:.3g}"] if s.gain != 1 else []),
+                *([_gain(s.gain)] if s.gain != 1 else []),
                 *([f"offset {s.bias:.3g}"] if s.bias else []),
                 *([f"late by {1e3 * (s.delay + s.time_constant):.3g} ms"] if s.delay > 0 or s.time_constant else []),
                 *(["cross-talk"] if s.crosstalk else []),
@@ -699,6 +719,11 @@ def _losses(rig: Rig, loop: Loop, step: str) -> str:
             f"{e.force:.3g} N at {rig.modes.domain.text(e.at)}" for e in rig.elements if isinstance(e, CoulombFriction)
         ]
     return "; ".join(words)
+
+
+def _gain(gain: float) -> str:
+    """A gain in words, one near 1 by what it is off."""
+    return f"gain {gain:.3g}" if abs(gain - 1.0) >= 0.005 else f"gain off by {_percent(abs(gain - 1.0))}"
 
 
 def _notes(possible: UncertainRig, rig: Rig, aimed: bool) -> tuple[str, ...]:

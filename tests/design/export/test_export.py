@@ -13,7 +13,7 @@ from scipy.io import loadmat
 from scipy.signal import cont2discrete
 
 from workbench.design.estimation.controller import Controller
-from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays
+from workbench.design.estimation.digital import DigitalController, FrictionForward, Relays, sampled
 from workbench.design.estimation.observers import luenberger
 from workbench.design.export.export import export, write_controller
 from workbench.design.export.sampled_loop import sampled_loop
@@ -238,6 +238,20 @@ def test_what_cannot_be_handed_over_is_refused_with_the_remedy(modes, observer, 
         export(modes, observer, tmp_path / "arm.cpp", sample_rate_hz=RATE)
     with pytest.raises(ValueError, match="cannot name a function"):
         export(modes, observer, tmp_path / "2arm.c", sample_rate_hz=RATE)
+    for wrong, match in (
+        ({"sample_rate_hz": "100"}, "sample_rate_hz is a number in Hz; got '100'"),
+        ({"sample_rate_hz": RATE, "computing_delay": None}, "computing_delay is a number in s; got None"),
+    ):
+        with pytest.raises(TypeError, match=match):
+            export(modes, observer, **wrong)
+    with pytest.raises(TypeError, match=r"got DigitalController: .* sampled already, write_controller writes it"):
+        export(modes, sampled(observer, 0.01), sample_rate_hz=RATE)
+    with pytest.raises(TypeError, match="a design is of modes; got str"):
+        export("modes", observer, sample_rate_hz=RATE)
+    with pytest.raises(TypeError, match="what runs once a sample is a law on an estimator; got Law"):
+        sampled(observer.law, 0.01)
+    with pytest.raises(ValueError, match=r"above 0; got -0\.01"):
+        sampled(observer, -0.01)
     fierce = imsc(modes, 2, ACTUATORS, weight=1e-4)
     unstable = luenberger(modes, fierce, SENSORS, poles=20 * modes.omega[:2] * (-0.3 + 1j))
     with pytest.raises(DesignError, match="unstable before any sampling"):

@@ -16,6 +16,7 @@ import control
 import numpy as np
 from scipy.linalg import expm
 
+from workbench.arguments import number
 from workbench.design.estimation.controller import Controller
 from workbench.rig.statespace import signal_names
 from workbench.structure.modes import freeze, frozen
@@ -167,8 +168,20 @@ def sampled(controller: Controller, sample_time: float) -> DigitalController:
     z' = A_z z + B_z y becomes z ← e^{A_z T} z + ∫ e^{A_z t} dt B_z y.
 
     Args:
+        controller: a law through a modal filter, or on an observer.
         sample_time: T, s.
+
+    Raises:
+        TypeError: no controller, or a sample time that is no number.
+        ValueError: a sample time that is not above zero.
     """
+    if not isinstance(controller, Controller):
+        raise TypeError(
+            f"what runs once a sample is a law on an estimator; got {type(controller).__name__}: make one by kalman,"
+            " luenberger or filtered"
+        )
+    if not 0 < number(sample_time, "sample_time", "s") < np.inf:
+        raise ValueError(f"a controller runs once every sample_time seconds, above 0; got {sample_time:g}")
     n, n_sensors = controller.state.shape[0], len(controller.sensors)
     moving = np.zeros((n + n_sensors, n + n_sensors))
     moving[:n] = np.hstack([controller.state, controller.reads])

@@ -6,6 +6,7 @@ from warnings import warn
 
 import numpy as np
 
+from workbench.arguments import number
 from workbench.design.estimation.controller import Controller
 from workbench.design.estimation.digital import DigitalController, sampled
 from workbench.design.export.sampled_loop import MOST_PAST, sampled_loop
@@ -123,15 +124,24 @@ def sample_design(
         computing_delay: τ from a reading to the first effect of its command, beside the actuators' own delays, s.
 
     Raises:
+        TypeError: no modes, no controller, or a rate or a delay that is no number.
         DesignError: a law that reads no sensors, a loop that is unstable before any sampling, a rate too slow for the
             modes, or a delay under which no rate is stable.
     """
+    if not isinstance(modes, Modes):
+        raise TypeError(f"a design is of modes; got {type(modes).__name__}: hand the modes of a structure or of a rig")
+    if not isinstance(controller, Controller | Law | OnOffLaw):
+        raise TypeError(
+            f"what is sampled is a law on an estimator; got {type(controller).__name__}: make one by kalman, luenberger"
+            " or filtered; a DigitalController is sampled already, write_controller writes it"
+        )
     if not isinstance(controller, Controller):
         raise DesignError(
             f"{controller.name} acts on modal coordinates, which no sensor reads; put it on an observer (luenberger,"
             " kalman) or through a modal filter first"
         )
-    if not (np.isfinite(sample_rate_hz) and sample_rate_hz > 0):
+    number(computing_delay, "computing_delay", "s")
+    if not (np.isfinite(number(sample_rate_hz, "sample_rate_hz", "Hz")) and sample_rate_hz > 0):
         raise DesignError(f"the sampling rate must be positive; got {sample_rate_hz:g} Hz")
     before = close_with(modes, controller)
     if not before.stable:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from workbench.rig.actuators import Actuator
+from workbench.rig.sensors import Sensor
 from workbench.rig.statespace import input_matrix
 from workbench.structure.domain import Between, NamedPoints, Patch, Rectangle, reach
 from workbench.structure.modes import Modes, freeze
@@ -117,7 +118,7 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     for i, first in enumerate(actuators):
         for second in actuators[i + 1 :]:
             alike = (first.kind, first.direction) == (second.kind, second.direction)
-            if alike and _separation(modes, first, second) <= 1e-6:
+            if alike and separation(modes, first, second) <= 1e-6:
                 raise DesignError(
                     f"actuators {first.name} and {second.name} both stand at {text(first.at)}, so B is singular;"
                     " move one by more than 1e-6 of the length"
@@ -131,8 +132,8 @@ def participation(modes: Modes, controlled: Sequence[int], actuators: Sequence[A
     return b
 
 
-def _separation(modes: Modes, first: Actuator, second: Actuator) -> float:
-    """Distance between two actuators over the size of the structure."""
+def separation(modes: Modes, first: Actuator | Sensor, second: Actuator | Sensor) -> float:
+    """Distance between two actuators or two sensors over the size of the structure."""
     ends = [a.at if isinstance(a.at, Between) else (a.at,) for a in (first, second)]
     if len(ends[0]) != len(ends[1]):
         return 1.0

@@ -8,6 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from workbench.arguments import number, whole
 from workbench.design.estimation.digital import DigitalController
 from workbench.design.loop.closed_loop import Response
 from workbench.design.loop.loop_steps import ControllerArrays, loop_record
@@ -48,7 +49,8 @@ class LoopTest:
     seed: int | None = None
 
     def __post_init__(self) -> None:
-        if self.n_samples < 2 or not self.sample_time > 0:
+        object.__setattr__(self, "n_samples", whole(self.n_samples, "LoopTest.n_samples"))
+        if self.n_samples < 2 or not number(self.sample_time, "LoopTest.sample_time", "s") > 0:
             raise ValueError(
                 f"a test needs 2 samples or more, a positive time apart; got {self.n_samples}, {self.sample_time:g} s"
             )
