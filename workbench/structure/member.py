@@ -190,11 +190,13 @@ class _Member(Printed):
                 elif spring:
                     springs.append((spring, segments.evaluation(at, derivative)))
         for part in self.attachments:
+            if isinstance(part, PointDamper):
+                continue
             for derivative, value in enumerate(part.pair):
                 row = self._seen_at(segments, position(part.at), derivative)
                 if isinstance(part, PointMass):
                     mass += value * row.T @ row
-                elif isinstance(part, PointSpring):
+                else:
                     springs.append((value, row))
         for spring, row in springs:
             rigidity += spring * row.T @ row
