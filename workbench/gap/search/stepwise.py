@@ -129,18 +129,18 @@ class Stepwise:
         first = self.last
         if first.effects:  # where two hide, the errors may stand for one
             self.plain = self._without_errors(first)
-            if self.plain is not None:
-                return
+        if self.plain is not None:
+            return
         self._add(most)
         if self.calibrate():
             self._add(most)
         limit = self._in_limit(self.last)
         if limit is not self.last:
             self.steps.append(replace(limit, others=self.last.others))
-        if self.last is not first or not first.effects:
+        if not (first.effects and self.last is first):  # asked above
             self.plain = self._without_errors(self.last)
-            if self.plain is not None:
-                return
+        if self.plain is not None:
+            return
         self.steps.append(self._promoted(self.last))
         if self.last.effects:
             self.steps.append(fit_jointly(self.search, self.last.effects, self.last.errors, rounds=3, to_the_end=True))
@@ -629,9 +629,8 @@ class Stepwise:
         effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
         found = self.afresh((*step.effects, effect))  # others have bent to it
         off = abs(float(np.log(found.effects[-1].values["gain"])))
-        if off < max(PLAIN.most_gain, PLAIN.outlying * found.size("gain")) or not self._matter(
-            found.effects, found.fit.effects
-        ):
+        is_wrong = off >= max(PLAIN.most_gain, PLAIN.outlying * found.size("gain"))
+        if not (is_wrong and self._matter(found.effects, found.fit.effects)):
             return step
         return self._with_wrong_gains(found, most - 1)
 
