@@ -167,9 +167,13 @@ def _faulty(effects: Sequence[Effect]) -> set[str]:
 def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: float) -> Attribution:
     """What was found, without effects that act on records held out and take nothing away there.
 
-    A trifle that is left of a measured gap bends to any law, on the records that were fitted.
+    A trifle that is left of a measured gap bends to any law, on the records that were fitted; and a nearest set that
+    makes the gap of others larger corrects nothing.
     """
     effects = found.best.effects
+    if found.outcome in ("part", "unknown") and not _remainders(found):
+        is_worse = _left_of(rig, effects, unseen, settle) > _left_of(rig, found.seen, unseen, settle)
+        return found.without(*(e for e in effects if e not in found.seen)) if is_worse else found
     named = [e for e in effects if not e.kind.first and e not in found.seen]
     if found.outcome != "explained" or len(named) < 2 or _remainders(found):
         return found

@@ -1,14 +1,16 @@
 """Dirt: the small errors of a real test that no effect of the catalogue names, in classes and sizes."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
+from workbench.structure.domain import NamedPoints, centred_at, middle, reach
 from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
 
 CLEAN, TRIPLE = "clean", "triple"
-DIRT_CLASSES = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "gain", "mixed", TRIPLE)
+DIRT_CLASSES = (CLEAN, "shape", "offset", "noise", "coloured", "input", "late", "gain", "place", "mixed", TRIPLE)
 SIZES = (0.5, 1.0, 2.0)
 MIXED = ("shape", "offset", "noise", "input", "late")  # each at half the size
 
@@ -22,6 +24,7 @@ NOISE_MEMORY = 0.9  # correlation of coloured noise over one sample, to the powe
 LOGGING_NOISE = 0.01  # of an input's rms
 LATE = 0.3  # of a sample: the latest sensor, at most
 CALIBRATION = 0.01  # standard deviation of the gain of each actuator and each sensor
+PLACED = 0.002  # standard deviation of the place of each, in each coordinate, over the extent: 4 mm of 2 m
 
 # What a class of dirt does itself, and no verdict could tell from it.
 MIMICS: dict[str, frozenset[str]] = {
@@ -33,6 +36,7 @@ MIMICS: dict[str, frozenset[str]] = {
     "input": frozenset({"random_disturbance"}),
     "late": frozenset({"actuator_delay", "actuator_lag", "sensor_lag", "sensor_delay"}),
     "gain": frozenset({"actuator_gain", "sensor_gain"}),
+    "place": frozenset({"actuator_misplacement", "sensor_misplacement"}),
     TRIPLE: frozenset(),
 }
 MIMICS["mixed"] = frozenset().union(*(MIMICS[name] for name in MIXED))
@@ -51,6 +55,7 @@ class Dirt:
         logging_noise: of each logged input, as a share of its rms.
         delays: of each sensor, in samples.
         gains: of each actuator, then of each sensor, over those stated.
+        moved: of each actuator, then of each sensor, (n_coordinates,) m from the place stated.
     """
 
     stiffness_waves: tuple[float, ...] = ()
@@ -63,18 +68,30 @@ class Dirt:
     logging_noise: float = 0.0
     delays: tuple[float, ...] = ()
     gains: tuple[float, ...] = ()
+    moved: tuple[tuple[float, ...], ...] = ()
 
     def on(self, plant: Plant, sample_time: float) -> Plant:
         """The plant with this dirt, before any effect is hidden in it."""
         n = len(plant.actuators)
         delays = self.delays or (0.0,) * len(plant.sensors)
         gains = self.gains or (1.0,) * (n + len(plant.sensors))
-        actuators = tuple(replace(a, gain=a.gain * gain) for a, gain in zip(plant.actuators, gains[:n], strict=True))
+        ports = (*plant.actuators, *plant.sensors)
+        at = (
+            [_moved(p.at, by) for p, by in zip(ports, self.moved, strict=True)] if self.moved else [p.at for p in ports]
+        )
+        actuators = tuple(
+            replace(a, gain=a.gain * gain, at=here)
+            for a, gain, here in zip(plant.actuators, gains[:n], at[:n], strict=True)
+        )
         sensors = tuple(
             replace(
-                s, noise_std=s.noise_std * self.noise_ratio, delay=s.delay + delay * sample_time, gain=s.gain * gain
+                s,
+                noise_std=s.noise_std * self.noise_ratio,
+                delay=s.delay + delay * sample_time,
+                gain=s.gain * gain,
+                at=here,
             )
-            for s, delay, gain in zip(plant.sensors, delays, gains[n:], strict=True)
+            for s, delay, gain, here in zip(plant.sensors, delays, gains[n:], at[n:], strict=True)
         )
         altered = replace(
             plant.altered,
@@ -135,7 +152,25 @@ def _with_part(dirt: Dirt, name: str, size: float, bench: Bench, rng: np.random.
     if name == "gain":
         ports = len(bench.rig.actuators) + len(bench.rig.sensors)
         return replace(dirt, gains=tuple(map(float, np.exp(CALIBRATION * size * rng.standard_normal(ports)))))
+    if name == "place":
+        return replace(dirt, moved=_off_places(bench, PLACED * size, rng))
     return dirt
+
+
+def _moved(where: Any, by: tuple[float, ...]) -> Any:
+    """A place, or a patch or a stretch, moved by (n_coordinates,) m; one that is a name stays."""
+    at = np.atleast_1d(np.asarray(middle(where), float)) + by if by else where
+    return centred_at(where, tuple(at.tolist()) if len(by) > 1 else float(at[0])) if by else where
+
+
+def _off_places(bench: Bench, size: float, rng: np.random.Generator) -> tuple[tuple[float, ...], ...]:
+    """What each actuator and each sensor of a bench stands off its place by, on the structure still, m."""
+    domain, ports = bench.rig.modes.domain, (*bench.rig.actuators, *bench.rig.sensors)
+    if isinstance(domain, NamedPoints):
+        return ()
+    drawn = size * domain.size * rng.standard_normal((len(ports), len(domain.coordinates)))
+    room = [np.array(reach(domain, port.at)) - np.asarray(middle(port.at), float) for port in ports]
+    return tuple(tuple(np.clip(by, *ends).tolist()) for by, ends in zip(drawn, room, strict=True))
 
 
 def _waves(size: float, rng: np.random.Generator) -> tuple[float, ...]:

@@ -15,7 +15,7 @@ from workbench.rig.actuators import Actuator
 from workbench.rig.rig import Rig, derivative_of, shape_of
 from workbench.rig.sensors import Sensor
 from workbench.structure.damping import ModalDamping
-from workbench.structure.domain import NamedPoints
+from workbench.structure.domain import NamedPoints, centred_at, middle, reach
 from workbench.structure.member import Structure
 from workbench.structure.modes import PointShapes, Shapes
 from workbench.structure.profile import Profile
@@ -23,6 +23,7 @@ from workbench.structure.profile import Profile
 FEW = 9  # cosines that may be as large as one another; of more, those beyond SMOOTH half waves fall off by the square,
 SMOOTH = 3  # as those of any function do that has a slope at its ends
 PROFILE_UNIT, RATIO_UNIT, DELAY_UNIT = 0.01, 0.1, 0.1  # of free coordinates: relative, of a logarithm, of a sample
+PLACE_UNIT = 0.001  # likewise, of the extent
 MOST_AHEAD = 0.9  # of a sample: the timing of a sensor is off by no more
 JUST_LATE = 1e-3  # of a sample: later, an accelerometer reads what was before a jump
 SURE = 1e-9  # of the largest variance of errors, each in units of its own: less is no doubt
@@ -39,6 +40,7 @@ class NominalPrior:
         damping: of the logarithm of each damping ratio.
         delay: of each sensor, in samples.
         gain: relative, of each actuator and each sensor, as far as they were calibrated.
+        place: of each actuator and each sensor, in each coordinate, as a share of the structure's extent.
         shape: of each mode at each actuator and each sensor, over the rms of that mode at all of them.
         record: of a figure that differs from record to record, about a common value; see `record_to_record`.
         sample_time: s.
@@ -55,6 +57,7 @@ class NominalPrior:
     damping: float = 0.0
     delay: float = 0.0
     gain: float = 0.0
+    place: float = 0.0
     shape: float = 0.0
     record: float = 0.0
     sample_time: float = 1.0
@@ -71,8 +74,8 @@ class NominalPrior:
         return tuple(name for name in GROUPS if getattr(self, name) > 0)
 
 
-GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "gain", "shape", "record")
-OUTSIDE = ("delay", "gain", "shape", "record")  # groups that leave the modes as they are
+GROUPS = ("stiffness", "mass", "frequency", "damping", "delay", "gain", "place", "shape", "record")
+OUTSIDE = ("delay", "gain", "place", "shape", "record")  # groups that leave the modes as they are
 
 
 def group_of(parameter: str) -> str:
@@ -160,8 +163,13 @@ def _each(rig: Rig, prior: NominalPrior) -> Iterator[Parameter]:
     if prior.gain:
         yield from (believed(_gain(actuator), prior.gain, PROFILE_UNIT) for actuator in rig.actuators)
         yield from (believed(_gain(sensor), prior.gain, PROFILE_UNIT, sensor=sensor.name) for sensor in rig.sensors)
+    ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
+    if prior.place:
+        for port in ports:
+            own = port.name if isinstance(port, Sensor) else ""
+            for name, low, high in zip(_places(rig, port), *_room(rig, port), strict=True):
+                yield believed(name, prior.place, PLACE_UNIT, float(low), float(high), own)
     if prior.shape:
-        ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
         for port in ports:
             own = port.name if isinstance(port, Sensor) else ""
             yield from (believed(n, prior.shape, PROFILE_UNIT, sensor=own) for n in _shapes(port, rig.modes.n_modes))
@@ -242,7 +250,10 @@ def _off(rig: Rig, prior: NominalPrior | IdentifiedPrior, values: dict[str, floa
     rig = differing(rig, prior.figure, deviations_of(values))
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
     units = _shape_units(rig) if prior.shape else np.zeros((len(ports), 0))
-    off = [_off_port(port, unit, prior, values) for port, unit in zip(ports, units, strict=True)]
+    off = [
+        _off_port(_off_place(rig, port, values) if prior.place else port, unit, prior, values)
+        for port, unit in zip(ports, units, strict=True)
+    ]
     if all(one is other for one, other in zip(ports, off, strict=True)):
         return rig
     n = len(rig.actuators)
@@ -262,6 +273,23 @@ def _off_port(port: Any, units: Floats, prior: NominalPrior, values: dict[str, f
     return replace(port, **changes) if changes else port
 
 
+def _off_place(rig: Rig, port: Any, values: dict[str, float]) -> Any:
+    """An actuator or a sensor where it stands, off its place by a share of the extent in each coordinate."""
+    errors = np.array([values.get(name, 0.0) for name in _places(rig, port)])
+    if not errors.any():
+        return port
+    at = np.atleast_1d(np.asarray(middle(port.at), float)) + errors * rig.modes.domain.size
+    return replace(port, at=centred_at(port.at, tuple(at.tolist()) if at.size > 1 else float(at[0])))
+
+
+def _room(rig: Rig, port: Actuator | Sensor) -> Floats:
+    """What a port can be off its place by at most, down and up: (2, n_coordinates), shares of the extent."""
+    domain = rig.modes.domain
+    assert not isinstance(domain, NamedPoints)
+    room: Floats = (np.array(reach(domain, port.at)) - np.asarray(middle(port.at), float)) / domain.size
+    return room
+
+
 def _shape_units(rig: Rig) -> Floats:
     """Rms of each mode, its displacement or its slope, at all ports of that kind: (n_ports, n_modes)."""
     ports: tuple[Actuator | Sensor, ...] = (*rig.actuators, *rig.sensors)
@@ -273,6 +301,13 @@ def _shape_units(rig: Rig) -> Floats:
 def _gain(port: Actuator | Sensor) -> str:
     """Name of the error of its gain: an actuator and a sensor may have one name."""
     return f"gain_{_side(port)}_{port.name}"
+
+
+def _places(rig: Rig, port: Actuator | Sensor) -> list[str]:
+    """Names of the errors of its place, one a coordinate; none at named points."""
+    domain = rig.modes.domain
+    coordinates = () if isinstance(domain, NamedPoints) else domain.coordinates
+    return [f"place_{_side(port)}_{port.name}_{name}" for name in coordinates]
 
 
 def _shapes(port: Actuator | Sensor, n_modes: int) -> list[str]:

@@ -81,10 +81,10 @@ class Attribution:
         """Noise found over noise stated, the median of all sensors."""
         return float(np.median(self.noise / self.search.data.noise))
 
-    def without(self, effect: Effect) -> "Attribution":
-        """The same without an effect: the others are fitted anew, with intervals of their own."""
+    def without(self, *effects: Effect) -> "Attribution":
+        """The same without some effects: the others are fitted anew, with intervals of their own."""
         search = self.search
-        others = [e for e in self.best.effects if e is not effect and e not in self.seen]
+        others = [e for e in self.best.effects if e not in effects and e not in self.seen]
         best = _anew(search, others, self.weighed)
         best = with_intervals(search.rig, best, self.weighed, search.workers, logged=self.logged)
         best = replace(best, effects=(*self.seen, *best.effects))

@@ -19,7 +19,13 @@ from workbench.gap.search.settings import JOINT, SELECTION
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
     """Whether a careful laboratory could have a nominal model with these errors; those of damping where they count."""
     widest = ((group, size) for group, size in _widest(errors.target) if damping or group != "damping")
-    return all(getattr(errors.target, group) < JOINT.plausible * size for group, size in widest)
+    return all(size_of(errors, group) < JOINT.plausible * size for group, size in widest)
+
+
+def size_of(errors: Effect, group: str) -> float:
+    """Rms of a group of errors, as large as they are, not as is believed of a careful model."""
+    values, spread = _drawn(errors, group)
+    return float(np.sqrt(np.mean(values**2 + spread**2))) if values.size else 0.0
 
 
 def _widest(prior: NominalPrior) -> list[tuple[str, float]]:
@@ -67,13 +73,8 @@ class Step:
             left = JOINT.decisive * np.log1p(self.excess(noise_power) / float(noise_power.mean()))
         for group, small in JOINT.small:
             count = sum(group_of(name) == group for name in self.errors.values)
-            left += count * np.log(max(self.size(group), small) / small)
+            left += count * np.log(max(size_of(self.errors, group), small) / small)
         return float(left)
-
-    def size(self, group: str) -> float:
-        """Rms of a group of errors, as large as they are, not as is believed of a careful model."""
-        values, spread = _drawn(self.errors, group)
-        return float(np.sqrt(np.mean(values**2 + spread**2))) if values.size else 0.0
 
     def excess(self, noise_power: np.ndarray) -> float:
         """Mean square left above that noise, in units of the stated one."""

@@ -21,7 +21,7 @@ from workbench.gap.prediction.workers import Workers
 from workbench.gap.search.fit import HOPELESS, Fit, cost_of, sensitivity
 from workbench.gap.search.settings import SEARCH
 from workbench.rig.rig import Rig
-from workbench.structure.domain import Domain
+from workbench.structure.domain import Domain, NamedPoints
 from workbench.structure.member import Structure
 
 
@@ -169,6 +169,7 @@ class Search:
             damping=0.2,
             delay=0.1,
             gain=0.01 if len(self.rig.actuators) + len(self.rig.sensors) > 2 else 0.0,  # of one each: the mass says it
+            place=0.0 if isinstance(self.rig.modes.domain, NamedPoints) else 0.001,
             shape=0.01 if by_mode else 0.0,
             record=0.005 if self.differs else 0.0,
             sample_time=self.data.records[0].sample_time,

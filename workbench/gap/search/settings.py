@@ -157,7 +157,7 @@ class JointSettings:
     """Constants of fits beside errors of the nominal model."""
 
     # largest standard deviation that is believed of each group of nominal errors; relative, but for damping (of its
-    # logarithm) and delay (of a sample). Laboratories keep within them; larger ones are effects
+    # logarithm), delay (of a sample) and place (of the extent). Laboratories keep within them; larger ones are effects
     widest: tuple[tuple[str, float], ...] = (
         ("stiffness", 0.015),
         ("mass", 0.015),
@@ -165,6 +165,7 @@ class JointSettings:
         ("damping", 0.25),
         ("delay", 0.5),
         ("gain", 0.02),
+        ("place", 0.004),
         ("shape", 0.05),
         ("record", 0.02),
     )
@@ -180,6 +181,7 @@ class JointSettings:
         ("damping", 0.1),
         ("delay", 0.1),
         ("gain", 0.002),
+        ("place", 0.0004),
         ("shape", 0.002),
         ("record", 0.001),
     )

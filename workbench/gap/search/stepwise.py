@@ -22,7 +22,7 @@ from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
-from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened
+from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
 from workbench.gap.search.plain import COMMON, in_place_of_errors, one_late
 from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
 from workbench.gap.search.selection import fitted_ahead, one_more
@@ -517,6 +517,8 @@ class Stepwise:
         ]
         quickly = self._fitted(fresh, best, self._slopes(best) if fresh else np.zeros((0, 0)))
         sets = [*tried, *self._on_all(quickly, best), *self._simpler_singles(best)]
+        # large errors do what the effect did that is left out
+        sets = [s for s in sets if s.is_plausible or not best.is_plausible]
         # a form of as many numbers may be the better one: friction, of a hysteretic spring that always slides
         best = min((best, *(s for s in sets if self._size(s) == self._size(best))), key=lambda s: s.fit.cost)
         enough = (1.0 + STEPWISE.simpler) * max(best.excess(best.sensor_noise), STEPWISE.simpler)
@@ -629,7 +631,7 @@ class Stepwise:
         effect = Effect(kind, port, {"gain": float(np.exp(gains[name]))})
         found = self.afresh((*step.effects, effect))  # others have bent to it
         off = abs(float(np.log(found.effects[-1].values["gain"])))
-        is_wrong = off >= max(PLAIN.most_gain, PLAIN.outlying * found.size("gain"))
+        is_wrong = off >= max(PLAIN.most_gain, PLAIN.outlying * size_of(found.errors, "gain"))
         if not (is_wrong and self._matter(found.effects, found.fit.effects)):
             return step
         return self._with_wrong_gains(found, most - 1)
