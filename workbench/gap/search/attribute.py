@@ -26,12 +26,12 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.intervals import with_intervals
 from workbench.gap.search.one_law import compared_with, one_law, unless_another
 from workbench.gap.search.pairs import Pairs
-from workbench.gap.search.plain import are_common, common_as_errors
+from workbench.gap.search.plain import are_common, common_as_errors, may_be_error
 from workbench.gap.search.record_to_record import beside_records
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Decision, Search, most_informative, promise, spread_over_kinds
 from workbench.gap.search.selection import on_whole_records, one_more
-from workbench.gap.search.settings import ATTRIBUTION, RANDOM, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import ATTRIBUTION, PAIRS, RANDOM, SEARCH, SELECTION, STEPWISE
 from workbench.gap.search.stepwise import Stepwise
 from workbench.records.record import Record
 from workbench.rig.rig import Rig
@@ -419,6 +419,9 @@ def _with_a_second(
     tolerance: float,
 ) -> Decision:
     """What small errors of the nominal model explain, a second effect, a law beyond the catalogue, or all of them."""
+    pair = _clean_pair(search, start, singles[:1], screened)
+    if pair is not None:
+        return pair
     beside = Stepwise(search, tolerance, ahead)
     alone = _by_noise_found(search, start, singles, beside)
     if alone is not None:
@@ -461,6 +464,20 @@ def _with_a_second(
         return decision
     random = random_beside(search, pairs.found[:1])
     return random or random_beside_errors(search, beside.steps[0], surely=False) or decision
+
+
+def _clean_pair(search: Search, start: Fit, singles: Sequence[Fit], screened: Screening) -> Decision | None:
+    """Two effects that leave only the stated noise of the sensors, neither of which a model may be off by; None else.
+
+    Errors of the model come to that only where the model has them, and cost more to ask for.
+    """
+    pairs = Pairs(search)
+    near = [effect for f in singles if search.near(f, PAIRS.most) for effect in f.effects]
+    if not (pairs.at_once(screened) or pairs.beside_any(near)):
+        return None
+    decision = pairs.decision(start)
+    effects = decision.best.effects
+    return None if are_common(effects) or any(may_be_error(effect, search) for effect in effects) else decision
 
 
 def _by_noise_found(search: Search, start: Fit, singles: Sequence[Fit], beside: Stepwise) -> Decision | None:

@@ -82,7 +82,7 @@ class Pairs:
             if not self.ahead:
                 return False
             best = self.ahead[0]
-            if self._beside_any(_weightiest_first(self.search, best)):
+            if self.beside_any(_weightiest_first(self.search, best)):
                 return True
             if self.ahead[0].cost > PAIRS.nearer * best.cost:
                 break
@@ -131,9 +131,9 @@ class Pairs:
     def _by_halves(self) -> bool:
         """Whether a pair with either half of the best on whole records explains them."""
         self.missed.append(self.found[0])
-        return self._beside_any(self.found[0].effects[::-1])
+        return self.beside_any(self.found[0].effects[::-1])
 
-    def _beside_any(self, halves: Sequence[Effect]) -> bool:
+    def beside_any(self, halves: Sequence[Effect]) -> bool:
         """Whether a pair with one of these effects explains the records; those given before are not tried again."""
         return any(self.beside(h) for h in halves if not any(_unmoved(h, other) for other in self.given))
 

@@ -1,6 +1,6 @@
 """Few effects that say the same as many small errors of the nominal model."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +16,12 @@ from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.structure.domain import middle
 from workbench.structure.member import Structure
 
 COMMON = (MODULUS_ERROR, MODAL_DAMPING)  # errors of all along, or of all modes: the nominal errors hold them too
+OF_PORTS = ("delay", "gain", "place")  # groups of errors that are no mode's and no wave's
 
 
 def are_common(effects: Sequence[Effect]) -> bool:
@@ -27,6 +29,20 @@ def are_common(effects: Sequence[Effect]) -> bool:
     return {effect.kind for effect in effects} == set(COMMON) and all(
         abs(np.log(effect.values["factor"])) < dict(PLAIN.most_common)[effect.kind.name] for effect in effects
     )
+
+
+def may_be_error(effect: Effect, search: Search) -> bool:
+    """Whether a careful model may be off by as much as an effect at a port says: in timing, a gain or a place."""
+    widest, values = dict(JOINT.widest), effect.values
+    late = next((values[name] for name in ("delay", "time_constant") if name in values), np.inf)
+    if late < widest["delay"] * search.data.records[0].sample_time:
+        return True
+    if "gain" in values:
+        return bool(abs(np.log(abs(values["gain"]))) < PLAIN.most_gain)
+    ports = {port.name: port for port in (*search.rig.actuators, *search.rig.sensors)}
+    if effect.at is None or effect.target not in ports:
+        return False
+    return search.rig.modes.domain.separation(effect.at, middle(ports[effect.target].at)) < PLAIN.most_moved
 
 
 def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
@@ -48,7 +64,9 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
         or any(abs(size) >= most[name] for name, size in common.items())
     ):
         return found
-    if not isinstance(search.rig.structure, Structure) or (late is not None and set(late.target.groups) != {"delay"}):
+    if not isinstance(search.rig.structure, Structure) or (
+        late is not None and not set(late.target.groups) <= set(OF_PORTS)
+    ):
         return found
     stiffness, damping = (common.get(kind.name, 0.0) for kind in COMMON)
     prior = NominalPrior(sample_time=search.data.records[0].sample_time) if late is None else late.target
@@ -60,56 +78,64 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
 
 
 def in_place_of_errors(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
-    """The effects, or one more, that leave only noise with no errors of the nominal model but common and late ones.
+    """The effects, or one more, that leave only noise with errors of the nominal model in common alone, or at its ports.
 
     They say the same with fewer numbers than errors of their own for every mode and wave, and no worse: where the
     records surely prefer errors that a careful model has, these stay.
 
     Args:
         search: with the noise found beside the errors.
-        step: effects and the errors beside which they were found; sensors stay as late as these make them.
+        step: effects and the errors beside which they were found; sensors stay as late as these make them, and read and
+            stand as they do where the others do not do without.
         rivals: other sets that explain the records beside errors, which make up for the wrong place or law.
     """
-    effects, errors = step.effects, step.errors
-    if errors.target.record:  # no effect differs from record to record
+    if step.errors.target.record:  # no effect differs from record to record
         return None
+    each = (_in_place(search, step, rivals, kept) for kept in _at_ports(step.errors))
+    return next((found for found in each if found is not None), None)
+
+
+def _in_place(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]], kept: tuple[Effect, ...]) -> Fit | None:
+    """The same beside those errors at the ports."""
+    effects = step.effects
     named = {effect.kind for effect in effects}
     common = tuple(Effect(kind, None, {"factor": 1.0}) for kind in COMMON if kind not in named)
-    late = _late(search, errors)
     if not effects:
-        both = _explaining(search, [(*common, *late)], step)
+        both = _explaining(search, [(*common, *kept)], step)
         if both is not None and SENSOR_DELAY in {effect.kind for effect in both.effects}:
             return both  # one sensor late alone is an effect beside common errors
         # beside noise of the inputs that an effect made seem louder, common errors may explain what they do not cause
-        more = _one_more(search, (*common, *late), (), step) if both is None or search.logged else None
-        return _one_common(search, common, late, both, step) if more is None and both is not None else more
+        more = _one_more(search, (*common, *kept), (), step) if both is None or search.logged else None
+        return _one_common(search, common, kept, both, step) if more is None and both is not None else more
     sets = [s for given in (effects, *rivals) for s in (given, *((*given, e) for e in common), (*given, *common))]
     if len(effects) > 1:  # what stood in for errors, or bent to them, may be needless or simpler without
         fewer = list(each_left_out(effects))
         sets += [*fewer, *(s for given in (effects, *fewer) for s in simpler_sets(given, search.rig))]
-    found = _explaining(search, [(*s, *late) for s in sets], step)
-    return found or _one_more(search, (*effects, *late), common, step)
+    found = _explaining(search, [(*s, *kept) for s in sets], step)
+    return found or _one_more(search, (*effects, *kept), common, step)
 
 
 def _one_common(
-    search: Search, common: tuple[Effect, ...], late: tuple[Effect, ...], both: Fit, step: Step
+    search: Search, common: tuple[Effect, ...], kept: tuple[Effect, ...], both: Fit, step: Step
 ) -> Fit | None:
     """One error common to all as the one effect, where the records do without the other; None where they show both.
 
     A model that is a little off is so in both.
     """
     most = both.cost + PLAIN.needless / search.data.n_values
-    alone = [found for one in common if (found := _explaining(search, [(one, *late)], step)) and found.cost < most]
+    alone = [found for one in common if (found := _explaining(search, [(one, *kept)], step)) and found.cost < most]
     return min(alone, key=lambda f: f.cost, default=None)
 
 
-def _late(search: Search, errors: Effect) -> tuple[Effect, ...]:
-    """What the errors say of the timing of the sensors, where they say anything of it."""
+def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
+    """What the errors say of the timing of the sensors, then of gains and places too, where they say anything of it."""
     prior = errors.target
-    if prior.delay <= PLAIN.punctual:
-        return ()
-    timing = NominalPrior(delay=prior.delay, sample_time=prior.sample_time, late=prior.late, early=prior.early)
-    return (nominal_errors(search.rig, timing, errors.values),)
+    timing = NominalPrior(sample_time=prior.sample_time, late=prior.late, early=prior.early, waves=prior.waves)
+    if prior.delay > PLAIN.punctual:
+        timing = replace(timing, delay=prior.delay)
+    for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
+        values = {name: value for name, value in errors.values.items() if group_of(name) in kept.groups}
+        yield (replace(errors, target=kept, values=values),) if values else ()
 
 
 def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) -> Fit | None:
@@ -156,7 +182,7 @@ def _on_their_sides(search: Search, effects: tuple[Effect, ...]) -> tuple[Effect
 def _with_one_late(search: Search, found: Fit) -> Fit:
     """The fit with a delay as the effect that it is where one of several sensors is late alone."""
     late = next((e for e in found.effects if e.kind is NOMINAL_ERRORS), None)
-    delay = None if late is None else one_late(late)
+    delay = None if late is None or late.target.groups != ("delay",) else one_late(late)
     if delay is None:
         return found
     alone = fit(search.rig, (*(e for e in found.effects if e is not late), delay), search.data.finely(SELECTION.fine))

@@ -148,6 +148,7 @@ class PlainSettings:
     # ten gains calibrated to 2 %, one is so by chance in 1.7 % of draws, and beyond 5 % alone in 12 %; to 1 %, in none
     most_gain: float = 0.05
     outlying: float = 4.0
+    most_moved: float = 0.01  # of the extent: an actuator or a sensor that stands farther off is an effect of its own
     suspect: float = 0.4  # share of most_gain from which on a gain is asked: a wrong one gives some of itself to others
     wrong_gains: int = 2  # how many are asked
 
