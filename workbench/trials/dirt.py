@@ -1,11 +1,10 @@
 """Dirt: the small errors of a real test that no effect of the catalogue names, in classes and sizes."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from workbench.structure.domain import NamedPoints, centred_at, middle, reach
+from workbench.structure.domain import NamedPoints, Where, centred_at, middle, reach
 from workbench.trials.benches import Bench
 from workbench.trials.plant import Plant
 
@@ -75,13 +74,10 @@ class Dirt:
         n = len(plant.actuators)
         delays = self.delays or (0.0,) * len(plant.sensors)
         gains = self.gains or (1.0,) * (n + len(plant.sensors))
-        ports = (*plant.actuators, *plant.sensors)
-        at = (
-            [_moved(p.at, by) for p, by in zip(ports, self.moved, strict=True)] if self.moved else [p.at for p in ports]
-        )
+        moved = self.moved or ((),) * (n + len(plant.sensors))
         actuators = tuple(
-            replace(a, gain=a.gain * gain, at=here)
-            for a, gain, here in zip(plant.actuators, gains[:n], at[:n], strict=True)
+            replace(a, gain=a.gain * gain, at=_moved(a.at, by))
+            for a, gain, by in zip(plant.actuators, gains[:n], moved[:n], strict=True)
         )
         sensors = tuple(
             replace(
@@ -89,9 +85,9 @@ class Dirt:
                 noise_std=s.noise_std * self.noise_ratio,
                 delay=s.delay + delay * sample_time,
                 gain=s.gain * gain,
-                at=here,
+                at=middle(_moved(s.at, by)),
             )
-            for s, delay, gain, here in zip(plant.sensors, delays, gains[n:], at[n:], strict=True)
+            for s, delay, gain, by in zip(plant.sensors, delays, gains[n:], moved[n:], strict=True)
         )
         altered = replace(
             plant.altered,
@@ -157,19 +153,22 @@ def _with_part(dirt: Dirt, name: str, size: float, bench: Bench, rng: np.random.
     return dirt
 
 
-def _moved(where: Any, by: tuple[float, ...]) -> Any:
-    """A place, or a patch or a stretch, moved by (n_coordinates,) m; one that is a name stays."""
-    at = np.atleast_1d(np.asarray(middle(where), float)) + by if by else where
-    return centred_at(where, tuple(at.tolist()) if len(by) > 1 else float(at[0])) if by else where
+def _moved(where: Where, by: tuple[float, ...]) -> Where:
+    """A place, or a patch or a stretch, moved by (n_coordinates,) m; by none, it stays."""
+    if not by:
+        return where
+    at = np.atleast_1d(np.asarray(middle(where), float)) + by
+    return centred_at(where, (float(at[0]), float(at[1])) if len(by) > 1 else float(at[0]))
 
 
 def _off_places(bench: Bench, size: float, rng: np.random.Generator) -> tuple[tuple[float, ...], ...]:
     """What each actuator and each sensor of a bench stands off its place by, on the structure still, m."""
-    domain, ports = bench.rig.modes.domain, (*bench.rig.actuators, *bench.rig.sensors)
+    domain, rig = bench.rig.modes.domain, bench.rig
+    stated: list[Where] = [*(a.at for a in rig.actuators), *(s.at for s in rig.sensors)]
     if isinstance(domain, NamedPoints):
         return ()
-    drawn = size * domain.size * rng.standard_normal((len(ports), len(domain.coordinates)))
-    room = [np.array(reach(domain, port.at)) - np.asarray(middle(port.at), float) for port in ports]
+    drawn = size * domain.size * rng.standard_normal((len(stated), len(domain.coordinates)))
+    room = [np.array(reach(domain, where)) - np.asarray(middle(where), float) for where in stated]
     return tuple(tuple(np.clip(by, *ends).tolist()) for by, ends in zip(drawn, room, strict=True))
 
 

@@ -18,8 +18,15 @@ from workbench.structure.domain import Domain
 
 REMARKED = 1.3  # factor between stated and found noise from which on it is remarked
 # per cent, root mean square: a quarter to a half more than the worst models of trials have; in false valleys it is more
-MOST = (("stiffness", 5.0), ("mass", 5.0), ("frequency", 2.5), ("damping", 90.0), ("gain", 5.0))
-MOST = (*MOST, ("place", 1.0), ("shape", 10.0))
+MOST = (
+    ("stiffness", 5.0),
+    ("mass", 5.0),
+    ("frequency", 2.5),
+    ("damping", 90.0),
+    ("gain", 5.0),
+    ("place", 1.0),
+    ("shape", 10.0),
+)
 RUNAWAY = 1e30  # mean square of a motion that knows no bounds, in units of the signal's
 COMMON = 2.0  # times the scatter of delays: the mean from which on they are told as one delay of all
 DRAWS = 400  # of blocks, for the interval of what is closed

@@ -39,10 +39,11 @@ def may_be_error(effect: Effect, search: Search) -> bool:
         return True
     if "gain" in values:
         return bool(abs(np.log(abs(values["gain"]))) < PLAIN.most_gain)
-    ports = {port.name: port for port in (*search.rig.actuators, *search.rig.sensors)}
-    if effect.at is None or effect.target not in ports:
+    standing = [a.at for a in search.rig.actuators if a.name == effect.target]
+    standing += [s.at for s in search.rig.sensors if s.name == effect.target]
+    if effect.at is None or not standing:
         return False
-    return search.rig.modes.domain.separation(effect.at, middle(ports[effect.target].at)) < PLAIN.most_moved
+    return search.rig.modes.domain.separation(effect.at, middle(standing[0])) < PLAIN.most_moved
 
 
 def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
@@ -78,7 +79,7 @@ def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:
 
 
 def in_place_of_errors(search: Search, step: Step, rivals: Sequence[tuple[Effect, ...]] = ()) -> Fit | None:
-    """The effects, or one more, that leave only noise with errors of the nominal model in common alone, or at its ports.
+    """The effects, or one more, that leave only noise with no errors of the nominal model but common ones and at ports.
 
     They say the same with fewer numbers than errors of their own for every mode and wave, and no worse: where the
     records surely prefer errors that a careful model has, these stay.
