@@ -110,3 +110,13 @@ def test_errors_of_a_frequency_stay_where_an_effect_solves_the_structure_anew(ri
     np.testing.assert_allclose(again.omega / rig.modes.omega, [1.0, np.exp(0.01), 1.0], rtol=1e-9)
     np.testing.assert_allclose(made.modes.omega, again.omega, rtol=1e-9)
     np.testing.assert_allclose(again.zeta / rig.modes.zeta, [np.exp(0.3), 1.0, 1.0], rtol=1e-9)
+
+
+def test_errors_of_places_move_actuators_and_sensors_and_leave_none_beside_the_structure(rig):
+    free = replace(rig, sensors=(*rig.sensors, replace(rig.sensors[0], name="end", at=rig.modes.length)))
+    first, length = rig.sensors[0], rig.modes.length
+    off = {f"place_at_{first.name}_at": 0.004, f"place_of_{rig.actuators[0].name}_at": -0.002, "place_at_end_at": 0.01}
+    made = nominal_errors(free, NominalPrior(place=0.002), off).apply(free)
+    assert made.sensors[0].at == pytest.approx(first.at + 0.004 * length)
+    assert made.actuators[0].at == pytest.approx(rig.actuators[0].at - 0.002 * length)
+    assert made.sensors[-1].at == length and made.sensors[1].at == rig.sensors[1].at

@@ -13,7 +13,7 @@ from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import fit
 from workbench.gap.search.jointly import fit_jointly
-from workbench.gap.search.plain import common_as_errors, in_place_of_errors, one_late
+from workbench.gap.search.plain import common_as_errors, in_place_of_errors, may_be_error, one_late
 from workbench.gap.search.search import Search
 from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_dirty
@@ -54,6 +54,38 @@ def test_a_damper_stands_in_place_of_the_damping_of_every_mode(search):
     assert damper.values["coefficient"] == pytest.approx(0.06, rel=0.05)
     assert errors.values["stiffness_0"] == pytest.approx(np.log(1.008), rel=0.02)
     assert errors.values["damping_1"] == pytest.approx(np.log(1.12), rel=0.1)
+
+
+def test_a_damper_is_found_beside_sensors_that_stand_and_read_a_little_otherwise(search):
+    """Which no damper does, so they stay; a damper and places alone say what damping of every mode would say."""
+    off = {"place_at_d1_at": 0.002, "place_at_d2_at": -0.003, "place_of_F_at": 0.001, "gain_at_d3": 0.01}
+    moved = nominal_errors(search(()).rig, NominalPrior(gain=0.01, place=0.002), off)
+    one = search((moved, DAMPER))
+    damper, errors = in_place_of_errors(one, beside_errors(one)).effects[-2:]
+    damper, errors = (damper, errors) if damper.kind is DAMPER.kind else (errors, damper)
+    assert errors.target.groups == ("gain", "place")
+    assert damper.values["at"] == pytest.approx(1.2, abs=0.02)
+    assert damper.values["coefficient"] == pytest.approx(0.06, rel=0.02)
+    for name, value in off.items():
+        assert errors.values[name] == pytest.approx(value, abs=0.003 if "gain" in name else 5e-4)
+
+
+@pytest.mark.parametrize(
+    ("effect", "may"),
+    [
+        (Effect(kind_named("sensor_gain"), "d1", {"gain": 1.03}), True),
+        (Effect(kind_named("sensor_gain"), "d1", {"gain": -1.0}), True),
+        (Effect(kind_named("sensor_gain"), "d1", {"gain": 1.3}), False),
+        (Effect(kind_named("sensor_delay"), "d1", {"delay": 0.003}), True),
+        (Effect(kind_named("sensor_delay"), "d1", {"delay": 0.02}), False),
+        (Effect(kind_named("sensor_misplacement"), "d1", {"at": 0.31}), True),
+        (Effect(kind_named("sensor_misplacement"), "d1", {"at": 0.4}), False),
+        (DAMPER, False),
+        (MODULUS, False),
+    ],
+)
+def test_what_a_careful_model_may_be_off_by_at_a_port(search, effect, may):
+    assert may_be_error(effect, search(())) == may
 
 
 def test_stiffness_and_damping_that_are_a_little_off_are_no_effect(search):

@@ -86,7 +86,7 @@ def random_beside_errors(search: Search, step: Step, *, surely: bool = True) -> 
     """A random disturbance beside errors of the nominal model, and effects; None where none holds.
 
     The errors are fitted to what the filter of the force leaves, and that to what they do, in turns. What is left may
-    be more than noise, by a trifle of the gap: no model is exact.
+    be more than noise, by a trifle of the gap: no model is exact, and a trifle without the force is none of it.
 
     Args:
         step: effects and errors to start from, which were fitted without it.
@@ -108,7 +108,9 @@ def random_beside_errors(search: Search, step: Step, *, surely: bool = True) -> 
             break
     whole = cost_of(search.rig, step.fit.effects, search.data)
     closed = random.left - 1.0 < STEPWISE.explained * whole
-    return Decision("explained", found, random) if closed and random.is_steady and looks_random(evidence) else None
+    counts = whole - 1.0 > STEPWISE.least * float(search.nominal.mean())
+    holds = closed and counts and random.is_steady and looks_random(evidence)
+    return Decision("explained", found, random) if holds else None
 
 
 def _beside(search: Search, given: Fit) -> Evidence:
