@@ -18,7 +18,7 @@ from workbench.structure.modes import Modes, SampledModes
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
 LABELS = ("printed in 1981", "two delays, as in 1981", "this project's default")
 # the complex to real: seen on white and on black alike
-REAL = LinearSegmentedColormap.from_list("real", ["#b8bec6", COLOURS[0]])
+REAL = LinearSegmentedColormap.from_list("real", ["#8f979f", COLOURS[0]])
 Case = tuple[LocatedDamage, Callable[[np.ndarray], np.ndarray], np.ndarray]
 
 
