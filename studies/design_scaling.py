@@ -155,7 +155,7 @@ def study(outcome, data=None):
         f" {loop_seconds / writing:.1f} times what it takes to fill the 1.6 GB of its numbers with ones"
     )
     outcome.say(
-        f"the same through 11 sensors, which couple all modes: {dense_seconds:.2g} s,"
+        f"the same through 11 sensors, which couple all modes: {dense_seconds:,.0f} s,"
         f" {dense_seconds / products:.1f} times the products of matrices alone that stepping 2,000 coupled states costs"
     )
     outcome.say(
@@ -170,7 +170,7 @@ def study(outcome, data=None):
     outcome.say(
         f"coupled LQR stops at {largest} modes, where one design takes {times['coupled LQR'][largest]:.0f} s"
         f" (patience {PATIENCE:g} s); a hundred thousand would take"
-        f" {times['coupled LQR'][largest] * (1e5 / largest) ** slopes['coupled LQR'] / 3.15e7:.0e} years"
+        f" {times['coupled LQR'][largest] * (1e5 / largest) ** slopes['coupled LQR'] / 3.15e7:,.0f} years"
     )
     outcome.check(
         "placement of 8 actuators: W_R over the least that differential evolution finds",

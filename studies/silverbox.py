@@ -91,5 +91,6 @@ def study(outcome, data: Path) -> None:
     outcome.table("rmse", errors)
     outcome.check("held-out multisines: RMSE after, V", errors["multisines"]["after"], 0.5e-3)
     outcome.check("arrow: RMSE after, V", errors["arrow"]["after"], 0.8e-3)
-    outcome.figure("force", plot_unmodelled_force(verdict), "Force beyond the linear model, against the motion.")
+    force = plot_unmodelled_force(verdict, length="V", force="V")
+    outcome.figure("force", force, "Force beyond the linear model, against the motion.")
     outcome.figure("budget", plot_budget(verdict.budget), "What causes the gap of the linear model, held out.")

@@ -37,6 +37,30 @@ def test_the_page_shows_shapes_mac_stabilisation_and_spectra(run, decay, tmp_pat
         assert abs(value - exact) < 5.0 * error and len(row[2].lstrip("0.")) == 2
 
 
+def test_the_page_says_how_it_was_made_in_the_words_of_the_command(run, decay, tmp_path, monkeypatch):
+    page = tmp_path / "modes.html"
+    options = ["--outputs", "a,b", "--seconds", "0.001", "--page", str(page)]
+    monkeypatch.setattr("sys.argv", ["workbench", "identify", str(decay), *options])
+    assert run("identify", decay, *options).exit_code == 0
+    content = json.loads(page.with_suffix(".page.json").read_text())
+    assert content["made_by"] == f"workbench identify {decay} {' '.join(options)}"
+    assert any("allow more time by --seconds" in line for line in content["lines"])
+    assert content["blocks"][0]["motion"]["label"] == "sensor"
+
+
+def test_the_page_of_transfer_functions_shows_the_band_that_was_fitted(run, tmp_path):
+    from scipy.io import savemat
+
+    lines, page = np.linspace(0.0, 100.0, 2001), tmp_path / "p.html"
+    omega, modes = 2.0 * np.pi * lines[:, None], 2.0 * np.pi * HERTZ
+    response = 1.0 / (modes**2 - omega**2 + 2j * ZETA * modes * omega)
+    savemat(tmp_path / "frf.mat", {"frf": response @ np.array([[1.0, 0.6], [0.5, -0.8]]), "frequency_hz": lines})
+    found = run("identify", tmp_path / "frf.mat", "--band-hz", 5, 60, "--page", page)
+    assert found.exit_code == 0, found.output
+    panels = json.loads(page.with_suffix(".page.json").read_text())["blocks"][-1]["figure"]["panels"]
+    assert panels and all(5 <= min(m["x"]) and max(m["x"]) <= 60 for p in panels for m in p["marks"])
+
+
 @pytest.mark.parametrize("places", [[(0.2, 0.1), (0.5, 0.3)], ["P1", "P2"]], ids=["plate", "named points"])
 def test_places_on_a_plate_and_names_of_points_are_written_and_reported(run, places, tmp_path):
     time, rng = np.arange(N) / RATE, np.random.default_rng(0)

@@ -43,12 +43,14 @@ def test_a_ring_down_that_is_far_from_over_is_one(run, tmp_path):
     assert "--ambient" not in run("look", path, "--page", tmp_path / "p.html").output
 
 
-def test_an_input_is_known_by_its_name_and_steady_motion_is_ambient(run, tmp_path):
+def test_an_input_is_known_by_its_name_or_unit_and_steady_motion_is_ambient(run, tmp_path):
     rng = np.random.default_rng(1)
     force, moves = rng.standard_normal((2, N))
     time = np.arange(N) / RATE
     driven = write(tmp_path / "driven.csv", ["t", "shaker force", "a1"], [time, force, moves])
     assert "--inputs 'shaker force'" in run("look", driven, "--page", tmp_path / "p.html").output
+    kraft = write(tmp_path / "kraft.csv", ["t", "Kraft [N]", "Weg [m]"], [time, force, moves])
+    assert "--inputs Kraft" in run("look", kraft, "--page", tmp_path / "p.html").output
     ambient = write(tmp_path / "ambient.csv", ["t", "a1", "a2"], [time, moves, force])
     assert "--ambient" in run("look", ambient, "--page", tmp_path / "p.html").output
 

@@ -76,4 +76,7 @@ def test_a_hardening_spring_is_named_at_the_input_where_it_stands(case):
     assert " at F " in verdict.sentence and "x =" not in verdict.sentence
     labels = [text.get_text() for text in plot_where(verdict).axes[5].get_xticklabels()]
     assert labels == ["F", "w"]
-    assert "at F" in plot_unmodelled_force(verdict).axes[0].get_xlabel()
+    left, right = plot_unmodelled_force(verdict, length="V", force="V").axes
+    assert "at F" in left.get_xlabel()
+    assert left.get_xlabel().startswith("displacement [V]") and right.get_xlabel().startswith("velocity [V/s]")
+    assert left.get_ylabel() == "unmodelled force [V]"

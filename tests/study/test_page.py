@@ -126,6 +126,57 @@ def test_a_figure_is_read_zoomed_and_shown_whole_again(page, look, drawn):
     assert browser.get_log("browser") == []
 
 
+@pytest.fixture(scope="module")
+def stacked(tmp_path_factory):
+    """Two panels that share x, of numbers that are wide and narrow, with a tick at their right edge."""
+    figure, axes = new_figure(2, 1, sharex=True)
+    axes[0].plot([0.0, 100.0], [0.0, 10000.0], color="#8a8a8a", label="grey")
+    axes[1].plot([0.0, 100.0], [0.0, 4e-7])
+    axes[1].set(xlabel="share [%]", xlim=(0.0, 100.0))
+    axes[0].legend()
+    content = PageContent(title="Stacked", blocks=[block(figure, "stacked")])
+    return write_page(tmp_path_factory.mktemp("page") / "s.html", content)
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_panels_that_share_x_stand_in_line_and_cut_no_number(stacked, look, drawn, width):
+    browser = look(stacked.as_uri(), width)
+    above, below = drawn(browser, 2)
+    frames = [panel.find_element("css selector", ".frame").get_attribute("d") for panel in (above, below)]
+    assert len({frame.split(",")[0] for frame in frames}) == 1
+    for panel in (above, below):
+        assert panel.find_elements("css selector", "text[text-anchor=middle]")[-1].text and "100" in ticks(panel)
+        edge = panel.rect["x"] + panel.rect["width"]
+        assert all(t.rect["x"] + t.rect["width"] <= edge + 0.5 for t in panel.find_elements("css selector", "text"))
+    assert "4·10⁻⁷" in [t.text for t in below.find_elements("css selector", "text[text-anchor=end]")]
+
+
+def test_a_legend_has_the_colours_of_its_lines_in_the_dark(stacked, look, drawn):
+    browser = look(stacked.as_uri(), 1200, scheme="dark")
+    drawn(browser, 2)
+    brightened = [browser.find_element("css selector", at) for at in (".legend i", ".marks path")]
+    assert {one.value_of_css_property("filter") for one in brightened} == {"brightness(1.3)"}
+
+
+def test_a_figure_is_zoomed_by_keyboard(stacked, look, drawn):
+    from selenium.webdriver import ActionChains, Keys
+
+    browser = look(stacked.as_uri(), 1200)
+    above, below = drawn(browser, 2)
+    whole = ticks(below)
+    browser.execute_script("arguments[0].focus()", above)
+    assert above.value_of_css_property("outline-style") == "solid"
+    ActionChains(browser).send_keys("+").perform()
+    assert browser.switch_to.active_element == above
+    zoomed = [float(t) for t in ticks(below)]
+    assert 20.0 <= min(zoomed) and max(zoomed) <= 80.0
+    ActionChains(browser).send_keys(Keys.ARROW_RIGHT).perform()
+    assert max(float(t) for t in ticks(below)) > max(zoomed)
+    ActionChains(browser).send_keys(Keys.ESCAPE).perform()
+    assert ticks(below) == whole
+    assert browser.get_log("browser") == []
+
+
 def test_tables_sort_and_the_page_follows_light_dark_and_paper(page, look):
     browser = look(page.as_uri(), 1200)
     heads = browser.find_elements("css selector", "th button")

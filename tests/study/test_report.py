@@ -74,6 +74,7 @@ def test_a_design_says_which_loops_are_unstable(tmp_path):
     assert shown.lead.startswith("Unstable on the full plant: IMSC, observer.") and shown.standing == "part"
     page = write_page(tmp_path / "p.html", shown).read_text(encoding="utf-8")
     assert '<p class="lead part">' in page
+    assert [row[-1] for row in shown.tables[1][2]] == ["stable", "unstable"]
 
 
 def test_a_placement_shows_where_and_how_surely(tmp_path):

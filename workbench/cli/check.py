@@ -7,7 +7,7 @@ import typer
 
 from workbench.cli import options
 from workbench.cli.possible import predicted, record_of
-from workbench.cli.terminal import check_target, guarded, reporting, say, short, tell, write_json
+from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, tell, write_json
 
 LOG = "tests.csv"
 
@@ -68,5 +68,7 @@ def check(
         },
     )
     target = page or Path("out") / f"{found.name}-check.html"
-    shown = prediction_page(prediction, target, name=found.name, folder=case, check=result, measured=measured)
+    shown = prediction_page(
+        prediction, target, name=found.name, folder=case, check=result, measured=measured, made_by=as_typed()
+    )
     say(f"  page       {short(shown)}")

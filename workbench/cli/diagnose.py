@@ -8,7 +8,7 @@ import typer
 
 from workbench.cli import options
 from workbench.cli.possible import write_verdict
-from workbench.cli.terminal import check_target, guarded, names_in, reporting, say, short
+from workbench.cli.terminal import as_typed, check_target, guarded, names_in, reporting, say, short
 
 SHOWN_RIVALS = 3
 
@@ -119,5 +119,5 @@ def diagnose(
     if json_path is not None:
         write_verdict(verdict, json_path)
         say(f"  verdict    {short(json_path)}")
-    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case)
+    target = verdict_page(verdict, found, page or Path("out") / f"{found.name}.html", folder=case, made_by=as_typed())
     say(f"  page       {short(target)}")

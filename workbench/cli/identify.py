@@ -7,7 +7,17 @@ from typing import Annotated
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import check_target, guarded, names_in, reporting, say, short, show_table, write_json
+from workbench.cli.terminal import (
+    as_typed,
+    check_target,
+    guarded,
+    names_in,
+    reporting,
+    say,
+    short,
+    show_table,
+    write_json,
+)
 
 
 @guarded
@@ -61,15 +71,16 @@ def identify(
             read, start=start, n_modes=modes, ambient=ambient, band_hz=band_hz, seconds=seconds, progress=report
         )
     as_read = dict.fromkeys(remark for measured in read for remark in getattr(measured, "remarks", ()))
-    found = replace(found, lines=(*found.lines, *(f"as read: {remark}" for remark in as_read)))
+    lines = [line.replace("`seconds`", "--seconds") for line in found.lines]
+    found = replace(found, lines=(*lines, *(f"as read: {remark}" for remark in as_read)))
     say(found.heading, bold=True)
     show_table(HEADINGS, found.rows, right=[heading for heading in HEADINGS if "[" in heading])
     for line in found.lines:
-        say(f"  {line.replace('`seconds`', '--seconds')}")
+        say(f"  {line}")
     if page is not None:
         from workbench.study.pages.page import write_page
         from workbench.study.report import identification_page
 
-        made_by = " ".join(["workbench identify", *map(str, records)])
-        say(f"  page {short(write_page(page, identification_page(found, read, made_by=made_by)))}")
+        shown = identification_page(found, read, made_by=as_typed(), band_hz=band_hz)
+        say(f"  page {short(write_page(page, shown))}")
     write_json(json_path, {**found.content, "heading": found.heading, "lines": found.lines})

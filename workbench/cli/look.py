@@ -1,12 +1,13 @@
 """`workbench look`: what a measured file holds."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from workbench.cli import options
-from workbench.cli.terminal import guarded, names_in, say, short, show_table
+from workbench.cli.terminal import as_typed, guarded, names_in, say, short, show_table
 
 
 @guarded
@@ -28,10 +29,11 @@ def look(
 
     measured = read_measured(file, sample_rate_hz=sample_rate_hz, inputs=names_in(inputs), limits=Limits.of_gib(memory))
     seen = look_at(measured, file)
+    shown = replace(seen.page_content, made_by=as_typed())
     say(seen.heading, bold=True)
     show_table(HEADINGS, seen.rows, right=HEADINGS[2:])
     for remark in seen.remarks:
         say(f"  {remark}")
-    say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', seen.page_content))}")
+    say(f"  page     {short(write_page(page or Path('out') / f'{file.stem}.html', shown))}")
     command = seen.command + (f" --sample-rate-hz {sample_rate_hz:g}" if sample_rate_hz else "")
     say(f"  go on    {command}")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from workbench.cli import options
 from workbench.cli.possible import predicted, record_of
-from workbench.cli.terminal import check_target, guarded, reporting, say, short, tell, write_json
+from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, tell, write_json
 
 
 @guarded
@@ -43,4 +43,4 @@ def predict(
         },
     )
     target = page or Path("out") / f"{found.name}-prediction.html"
-    say(f"  page       {short(prediction_page(prediction, target, name=found.name, folder=case))}")
+    say(f"  page       {short(prediction_page(prediction, target, name=found.name, folder=case, made_by=as_typed()))}")

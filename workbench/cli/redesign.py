@@ -9,7 +9,7 @@ from workbench.cli import options
 from workbench.cli.control import check_rate, count_of, law_from, observed
 from workbench.cli.possible import possible_rig
 from workbench.cli.rig_file import impulse_place
-from workbench.cli.terminal import check_target, guarded, reporting, say, short, show_table, write_json
+from workbench.cli.terminal import as_typed, check_target, guarded, reporting, say, short, show_table, write_json
 
 
 @guarded
@@ -121,4 +121,5 @@ def redesign(
         say(f"  controller {names}: {'the redesigned one' if result.pays else 'the present one, which is kept'}")
     target = page or Path("out") / f"{found.name}-redesign.html"
     shown = (found.validation or found.fit)[0]
-    say(f"  page       {short(redesign_page(result, target, name=found.name, record=shown, folder=case))}")
+    target = redesign_page(result, target, name=found.name, record=shown, folder=case, made_by=as_typed())
+    say(f"  page       {short(target)}")

@@ -2,6 +2,8 @@
 
 import json
 import re
+import shlex
+import sys
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -149,6 +151,11 @@ def short(path: Path) -> str:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
         return str(path)
+
+
+def as_typed() -> str:
+    """The command that runs, with its options, for the foot of a page."""
+    return shlex.join(["workbench", *sys.argv[1:]])
 
 
 def names_in(text: str) -> tuple[str, ...]:

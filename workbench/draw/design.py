@@ -68,7 +68,7 @@ def plot_two_works(works: Mapping[str, np.ndarray], *, first: int) -> Figure:
     width = 0.8 / len(works)
     for i, (name, work) in enumerate(works.items()):
         numbers = first + 1 + np.arange(work.size)
-        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.2e}")
+        ax.bar(numbers + (i - 0.5 * (len(works) - 1)) * width, work, width, label=f"{name}: W_R = {work.sum():.3g}")
     ax.set(xticks=numbers, xlabel="residual mode", ylabel="spillover work in the mode, W_r")
     ax.set_title("spillover work by residual mode")
     ax.legend()

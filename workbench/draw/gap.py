@@ -156,8 +156,13 @@ def _short(where: Where) -> str:
     return " to ".join(map(str, where)) if isinstance(where, Between) else str(where)
 
 
-def plot_unmodelled_force(verdict: Verdict) -> Figure:
-    """The force missing at its place beside other effects and freed figures, over displacement and velocity."""
+def plot_unmodelled_force(verdict: Verdict, *, length: str = "m", force: str = "N") -> Figure:
+    """The force missing at its place beside other effects and freed figures, over displacement and velocity.
+
+    Args:
+        verdict: of the diagnosis.
+        length, force: units, where the case is not in metres and newtons.
+    """
     evidence = verdict.attribution.evidence
     chosen = [e for e in verdict.effects if e.at is not None and e.kind.path == "structure"]
     beside = [e for e in verdict.effects if chosen and e is not chosen[0]]
@@ -169,8 +174,8 @@ def plot_unmodelled_force(verdict: Verdict) -> Figure:
     there = there if isinstance(place.at, Between) else f"at {there}"
     step = max(1, place.force.size // 4000)
     for ax, series, name in (
-        (axes[0], place.displacement, "displacement [m]"),
-        (axes[1], place.velocity, "velocity [m/s]"),
+        (axes[0], place.displacement, f"displacement [{length}]"),
+        (axes[1], place.velocity, f"velocity [{length}/s]"),
     ):
         ax.plot(series[::step], place.force[::step], ".", color=COLOURS[0], markersize=2, alpha=0.5)
         ax.set_xlabel(f"{name} {there}")
@@ -178,7 +183,7 @@ def plot_unmodelled_force(verdict: Verdict) -> Figure:
         if law is not None:
             ax.plot(*law, color=COLOURS[1], linewidth=2.2, label="fitted law")
             ax.legend()
-    axes[0].set(ylabel="unmodelled force [N]", title="unmodelled force, no law assumed")
+    axes[0].set(ylabel=f"unmodelled force [{force}]", title="unmodelled force, no law assumed")
     return figure
 
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
@@ -16,6 +17,8 @@ from workbench.structure.modes import Modes, SampledModes
 
 SYMBOLS = {"omega": "frequency", "zeta": "damping ratio"}
 LABELS = ("printed in 1981", "two delays, as in 1981", "this project's default")
+# the complex to real: seen on white and on black alike
+REAL = LinearSegmentedColormap.from_list("real", ["#8f979f", COLOURS[0]])
 Case = tuple[LocatedDamage, Callable[[np.ndarray], np.ndarray], np.ndarray]
 
 
@@ -106,9 +109,9 @@ def distribution_errors(
 
 
 def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz: float) -> Figure:
-    """Frequencies at each order; dark dots have real shapes (phase collinearity near 1), pale ones complex shapes."""
+    """Frequencies at each order; blue dots have real shapes (phase collinearity near 1), grey ones complex shapes."""
     figure, ax = new_figure(width=9, height=4.5)
-    look: Any = {"cmap": "Blues", "vmin": 0, "vmax": 1, "s": 22, "edgecolors": GREY, "linewidths": 0.4, "zorder": 3}
+    look: Any = {"cmap": REAL, "vmin": 0, "vmax": 1, "s": 22, "edgecolors": GREY, "linewidths": 0.4, "zorder": 3}
     for line, frequency in enumerate(stayed.frequencies_hz):
         ax.axvline(frequency, color=COLOURS[1], alpha=0.5, lw=5, label=None if line else "stable")
     for order, modes in zip(diagram.orders, diagram.found, strict=True):
@@ -116,7 +119,7 @@ def stabilisation_diagram(diagram: Stabilisation, stayed: SampledModes, band_hz:
         at, collinearity = np.full(keep.sum(), order), modes.phase_collinearity[keep]
         dots = ax.scatter(modes.frequencies_hz[keep], at, c=collinearity, **look)
     figure.colorbar(dots, ax=ax, label="phase collinearity of the shape")
-    ax.set(xlabel="frequency, Hz", ylabel="model order (modes)")
+    ax.set(xlabel="frequency [Hz]", ylabel="model order (modes)")
     ax.yaxis.set_major_locator(MaxNLocator(integer=True))
     figure.legend(loc="outside upper right")
     return figure

@@ -19,6 +19,7 @@ MOST_FRAMES = 600
 SHOWN_SECONDS = 12.0
 PER_SIDE = 19  # lines of a plate's net along the longer side
 MOST_NODES = 400  # of a frame, that are drawn
+ALONG = "x [m]"
 SWAY = 0.15  # of the structure's size: the largest motion as drawn
 
 
@@ -66,7 +67,7 @@ def response_motion(
     x = np.linspace(0.0, first.modes.length, N_PLACES)
     for track, response in zip(tracks, responses.values(), strict=True):
         track["shapes"] = _numbers(response.modes.phi(x))
-    return shown | {"x": _numbers(x), **_places(actuators, sensors)}
+    return shown | {"x": _numbers(x), "label": ALONG, **_places(actuators, sensors)}
 
 
 def mode_motion(
@@ -112,7 +113,8 @@ def mode_motion(
                 "damping": _numbers(found.zeta),
             }
         )
-    return {"kind": "modes", "x": tracks[0]["x"], "tracks": tracks, **_places(actuators, sensors)}
+    label = "sensor" if isinstance(first, SampledModes) and not first.is_along else ALONG
+    return {"kind": "modes", "x": tracks[0]["x"], "label": label, "tracks": tracks, **_places(actuators, sensors)}
 
 
 def _net_motion(

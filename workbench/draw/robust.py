@@ -77,6 +77,7 @@ def plot_prediction(prediction: Prediction, measured: Record | None = None) -> F
         left.plot(prediction.time, prediction.median[j], color=BAND, linewidth=0.8, label="predicted")
         left.set_ylabel(in_units(channel.name, channel.unit))
         low, high = prediction.spectrum_lower[j, 1:], prediction.spectrum_upper[j, 1:]
+        right.set_ylabel(in_units(f"|{channel.name}|", channel.unit))
         least = 1e-3 * high[high > 0].min() if (high > 0).any() else 1e-300
         right.fill_between(f, np.maximum(low, least), np.maximum(high, least), **band)
         right.loglog(f, np.maximum(prediction.spectrum_median[j, 1:], least), color=BAND, linewidth=0.8)

@@ -327,7 +327,7 @@ def _coloured_residual(records: list[Record], left: list[np.ndarray]) -> tuple[s
         return ()
     share = 100 * np.sqrt(squares / about)
     return (
-        f"the residual, {share:.2g} % of the motion, is not white: standard errors by its spectrum about each mode",
+        f"the residual, {share:.3g} % of the motion, is not white: standard errors by its spectrum about each mode",
     )
 
 

@@ -242,7 +242,7 @@ def _modes_of(
 def _uneven(whole: TransferModes) -> tuple[str, ...]:
     """A remark on the modes whose peaks are not those of one pole."""
     which = [
-        f"mode {r + 1} ({whole.modes.frequencies_hz[r]:.4g} Hz, by {scatter:.2g} Hz rms)"
+        f"mode {r + 1} ({whole.modes.frequencies_hz[r]:.4g} Hz, by {scatter:.3g} Hz rms)"
         for r, scatter in enumerate(whole.scatter_hz)
         if scatter > 0
     ]

@@ -32,6 +32,7 @@ ON_AXIS = 1e-9  # rad/s from the imaginary axis within which a pole is undamped
 MOST_SAMPLES = 4096  # of each decay, in the stabilisation diagram
 BEYOND = 8  # orders more than modes that it shows
 SAMPLES_AN_ORDER = 8  # at least
+STABLE = "Stabilisation diagram: the poles of models of each order, blue where a shape is real; bands where they stay."
 
 
 def page_content_about(what: str) -> tuple[str, PageContent]:
@@ -200,16 +201,16 @@ def _designed(content: dict[str, Any]) -> dict[str, Any]:
         [
             one["design"],
             _short(one["margin"]),
-            one["stable"],
+            "stable" if one["stable"] else "unstable",
             "" if one.get("robustness") is None else one["robustness"],
         ]
         for one in content.get("through_sensors", ())
         if "stable" in one
     ]
-    heads: tuple[str, ...] = ("controller", "margin [1/s]", "stable", "share of perturbed models stable")
+    heads: tuple[str, ...] = ("controller", "margin [1/s]", "loop", "share of perturbed models stable")
     if sensed and all(row[-1] == "" for row in sensed):
         heads, sensed = heads[:-1], [row[:-1] for row in sensed]
-    unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if not row[2]]
+    unstable = [row[0] for row in rows if row[-1] == "unstable"] + [row[0] for row in sensed if row[2] == "unstable"]
     loops = [row[0] for row in (*rows, *sensed)]
     return {
         "lead": "" if not sensed else _stability(loops, unstable),
@@ -308,11 +309,15 @@ KINDS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def identification_page(
-    report: IdentificationReport, measured: Sequence[Record | TransferFunctions], *, made_by: str
+    report: IdentificationReport,
+    measured: Sequence[Record | TransferFunctions],
+    *,
+    made_by: str,
+    band_hz: tuple[float, float] | None = None,
 ) -> PageContent:
-    """The page of a report, and of the data that it is of."""
+    """The page of a report, and of the data that it is of; of transfer functions, the band that was fitted."""
     content = identified({**report.content, "heading": report.heading, "lines": list(report.lines)})
-    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0])]
+    blocks = [*content.pop("blocks"), *_stabilisation(report), *_response(measured[0], band_hz)]
     return PageContent(title="Identified modes", blocks=blocks, made_by=made_by, **content)
 
 
@@ -327,12 +332,16 @@ def _stabilisation(report: IdentificationReport) -> list[dict[str, Any]]:
     diagram = stabilise(decays, orders=range(1, highest + 1))
     nyquist = 0.5 * decays[0].sample_rate_hz
     figure = stabilisation_diagram(diagram, stable_modes(diagram).modes, nyquist)
-    return [block(figure, "Stabilisation diagram: the poles of models of each order; bands where they stay the same.")]
+    return [block(figure, STABLE)]
 
 
-def _response(measured: Record | TransferFunctions) -> list[dict[str, Any]]:
+def _response(measured: Record | TransferFunctions, band_hz: tuple[float, float] | None) -> list[dict[str, Any]]:
     if isinstance(measured, TransferFunctions):
+        if band_hz is not None:
+            lines = measured.frequencies_hz
+            kept = (lines >= band_hz[0]) & (lines <= band_hz[1])
+            measured = replace(measured, values=measured.values[..., kept], frequencies_hz=lines[kept])
         return [block(plot_transfer(measured), "Magnitude of the transfer functions.")]
     if measured.n_inputs == 1 and np.ptp(measured.inputs):
         return [block(plot_frf(measured), "Frequency response functions and coherence.")]
-    return [block(plot_spectra(measured), "Power spectral density, by Welch's method.")]
+    return [block(plot_spectra(measured), f"Power spectral density of {measured.name}, by Welch's method.")]

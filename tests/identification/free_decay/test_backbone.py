@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from workbench.identification.free_decay.backbone import left_by_backbone
+from workbench.identification.free_decay.backbone import POWERS, _Backbone, _envelopes, left_by_backbone
 from workbench.identification.free_decay.order import identify
 from workbench.records.record import Channel, Record
 
@@ -38,6 +38,30 @@ def test_a_mode_on_a_backbone_leaves_noise_and_no_more():
     enough = 1.1 * TIME.size * noise**2  # squares of the noise stray by 4 % (one sigma)
     left = left_by_backbone(record, pair, np.array([-0.1 + 50.0j]), offset=True, enough=enough)
     assert 0.9 * TIME.size * noise**2 < left < enough
+
+
+@pytest.mark.parametrize("powers", POWERS)
+def test_the_envelope_follows_its_differential_equation(powers):
+    row, time = 0.1 * np.array([-0.5, -0.2, -0.1]), np.linspace(0.0, 4.0, 151)
+    [u] = _envelopes(row[None], np.array(powers), time, 7.0, 60.0)[0].T
+
+    def rate(_, u):
+        return -np.sum(row * np.exp(-u * np.array(powers)), keepdims=True)
+
+    exact = solve_ivp(rate, (0.0, 4.0), [0.0], t_eval=time, rtol=1e-10, atol=1e-12).y[0]
+    np.testing.assert_allclose(u, exact, atol=1e-8)
+
+
+def test_each_backbone_that_is_tried_is_followed_once(monkeypatch):
+    asked, fitted = [], _Backbone._fitted
+
+    def counted(self, unknowns):
+        asked.append(unknowns.tobytes())
+        return fitted(self, unknowns)
+
+    monkeypatch.setattr(_Backbone, "_fitted", counted)
+    left_by_backbone(noisy(bent(), 0.01, 0), np.array([-0.15 + 20.3j, -0.3 + 20.05j]), np.zeros(0), offset=True)
+    assert asked and all(one != after for one, after in zip(asked, asked[1:]))
 
 
 def test_two_modes_that_one_sensor_sees_are_two():

@@ -12,9 +12,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import least_squares
 
+from workbench.arrays import Floats
 from workbench.identification.signal.projection import project
 from workbench.records.record import Record
 
@@ -58,6 +60,29 @@ def left_by_backbone(
     return least
 
 
+@njit(cache=True, nogil=True)
+def _rate(u: float, real: Floats, powers: Floats, faded: float) -> float:
+    """u' of u = -ln r."""
+    return -float(np.sum(real * np.exp(-min(max(u, -1.0), faded) * powers)))
+
+
+@njit(cache=True, nogil=True)
+def _envelopes(real: Floats, powers: Floats, t: Floats, faded: float, died: float) -> tuple[Floats, Floats]:
+    """u = -ln r and u' at the times t, (n_times, n_rows), for each row of Re λ (n_rows, 3)."""
+    h, u, rates = t[1], np.zeros((t.size, len(real))), np.zeros((t.size, len(real)))
+    for j in range(len(real)):
+        row = real[j]
+        for k in range(t.size):
+            at = u[k, j]
+            rates[k, j] = a = _rate(at, row, powers, faded)
+            if k + 1 < t.size:
+                b = _rate(at + 0.5 * h * a, row, powers, faded)
+                c = _rate(at + 0.5 * h * b, row, powers, faded)
+                d = _rate(at + h * c, row, powers, faded)
+                u[k + 1, j] = min(max(at + h / 6.0 * (a + 2.0 * b + 2.0 * c + d), -1.0), died)
+    return u, rates
+
+
 class _Backbone:
     """The fit of one law of powers; what is linear in the record drops out."""
 
@@ -67,6 +92,7 @@ class _Backbone:
         columns = np.hstack([exponentials.real, exponentials.imag, np.ones((self.time.size, int(offset)))])
         self.beside = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
         self.y = self._apart(record.outputs[0])
+        self.last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
     def fits(self, pair: np.ndarray, amplitudes: np.ndarray) -> Iterator[float]:
         """What is left, from what the two look like, z: their own z'/z by |z|; and from the stronger of them."""
@@ -75,10 +101,16 @@ class _Backbone:
         size = np.abs(z) / max(abs(z[0]), 1e-3 * np.abs(z).max())
         by_power = np.maximum(size, np.exp(-BACKBONE.faded))[:, None] ** self.powers
         alike = np.linalg.lstsq(z[:, None] * by_power, slope, rcond=None)[0]
-        left, slopes = (lambda p, k=k: self._fitted(p)[k] for k in (0, 1))
+        left, slopes = (lambda p, k=k: self._once(p)[k] for k in (0, 1))
         for start in (alike, np.array([pair[np.argmax(np.abs(amplitudes))], 0.0, 0.0])):
             at = np.r_[start.real, start.imag]
             yield 2.0 * float(least_squares(left, at, slopes, x_scale="jac", max_nfev=BACKBONE.most_tries).cost)
+
+    def _once(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`_fitted`, kept for the slopes that are asked for where what is left was."""
+        if self.last is None or not np.array_equal(self.last[0], unknowns):
+            self.last = unknowns.copy(), self._fitted(unknowns)
+        return self.last[1]
 
     def _fitted(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What is left (n,) and its slopes by Re λ and Im λ (n, 6), A projected out (Kaufman 1975)."""
@@ -103,17 +135,7 @@ class _Backbone:
     def _held(self, real: np.ndarray) -> list[np.ndarray]:
         """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
         t = np.linspace(0.0, self.time[-1], BACKBONE.steps + 1)
-        h, u, rates = t[1], np.zeros((BACKBONE.steps + 1, len(real))), np.zeros((BACKBONE.steps + 1, len(real)))
-
-        def rate(u: np.ndarray) -> np.ndarray:
-            return np.asarray(-(real * np.exp(-np.outer(np.clip(u, -1.0, BACKBONE.faded), self.powers))).sum(axis=1))
-
-        for k in range(BACKBONE.steps):
-            rates[k] = a = rate(u[k])
-            b = rate(u[k] + 0.5 * h * a)
-            c = rate(u[k] + 0.5 * h * b)
-            u[k + 1] = np.clip(u[k] + h / 6.0 * (a + 2.0 * b + 2.0 * c + rate(u[k] + h * c)), -1.0, BACKBONE.died)
-        rates[-1] = rate(u[-1])
+        u, rates = _envelopes(real, self.powers, t, BACKBONE.faded, BACKBONE.died)
         powers = np.exp(-np.clip(u, -1.0, BACKBONE.faded)[:, :, None] * self.powers)
         slopes = -self.powers * powers * np.where(u < BACKBONE.faded, rates, 0.0)[:, :, None]
         return list(CubicHermiteSpline(t, powers, slopes).antiderivative()(self.time).swapaxes(0, 1))

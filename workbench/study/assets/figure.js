@@ -1,4 +1,5 @@
-// Figures: panels of marks on axes, drawn as SVG. Drag to zoom, press twice to see all, point to read a value.
+// Figures: panels of marks on axes, drawn as SVG. Drag to zoom, press twice to see all, point to read a value; by
+// keyboard + and − zoom, the arrows move, Escape shows all.
 "use strict";
 var workbench = (function () {
   var NS = "http://www.w3.org/2000/svg", count = 0;
@@ -30,8 +31,7 @@ var workbench = (function () {
     if (v === null || v === undefined || !isFinite(v)) return "–";
     if (v === 0 || (step && Math.abs(v) < 1e-9 * step)) return "0";
     var size = Math.abs(v);
-    if (size >= 1e5 || size < 1e-4) return v.toExponential(step ? Math.max(0, Math.min(4, Math.floor(Math.log10(size) + 1e-9) - Math.floor(Math.log10(step) + 1e-9))) : 3)
-      .replace("e+", "e").replace(/-/g, "−");
+    if (size >= 1e5 || size < 1e-4) return power(v, step ? Math.max(0, Math.min(4, Math.floor(Math.log10(size) + 1e-9) - Math.floor(Math.log10(step) + 1e-9))) : 3);
     if (!step) return String(parseFloat(v.toPrecision(5))).replace("-", "−");
     var digits = Math.max(0, Math.min(8, -Math.floor(Math.log10(step) + 1e-9)));
     return v.toFixed(digits).replace("-", "−");
@@ -64,9 +64,11 @@ var workbench = (function () {
     pen.font = "12px " + getComputedStyle(document.body).fontFamily;
     return pen.measureText(text).width;
   }
-  function power(v) {
-    var e = Math.floor(Math.log10(v) + 1e-9), part = Math.round(v / Math.pow(10, e)), up = "⁰¹²³⁴⁵⁶⁷⁸⁹";
-    return (part > 1 ? part + "·" : "") + "10" + String(e).split("").map(function (c) { return c === "-" ? "⁻" : up[+c]; }).join("");
+  // −2.5·10⁻⁷
+  function power(v, digits) {
+    var up = "⁰¹²³⁴⁵⁶⁷⁸⁹", parts = Math.abs(v).toExponential(digits || 0).split("e"), part = String(parseFloat(parts[0]));
+    return (v < 0 ? "−" : "") + (part === "1" ? "" : part + "·") + "10" +
+      parts[1].replace("+", "").split("").map(function (c) { return c === "-" ? "⁻" : up[+c]; }).join("");
   }
 
   function draw(root, spec) {
@@ -84,12 +86,12 @@ var workbench = (function () {
       panel.root = html("div", { class: "panel" }, grid);
       if (panel.spec.title) html("h3", {}, panel.root, panel.spec.title);
       if (panel.spec.legend && !spec.legend) legend(html("div", { class: "legend" }, panel.root), [panel]);
-      panel.svg = svg("svg", { role: "img", "aria-label": panel.spec.title || panel.spec.y.label }, panel.root);
+      panel.svg = svg("svg", { role: "img", tabindex: 0, "aria-label": panel.spec.title || panel.spec.y.label }, panel.root);
       listen(panel);
     });
     var wide = 0;
     new ResizeObserver(function () {
-      if (grid.clientWidth !== wide) { wide = grid.clientWidth; panels.forEach(paint); }
+      if (grid.clientWidth !== wide) { wide = grid.clientWidth; paintAll(); }
     }).observe(grid);
 
     function legend(box, of) {
@@ -116,34 +118,56 @@ var workbench = (function () {
           if (other === panel || other.spec.x.group === panel.spec.x.group) other.x = x.slice();
           if (other === panel || other.spec.y.group === panel.spec.y.group) other.y = y.slice();
         }
-        paint(other);
       });
+      paintAll();
       reset.hidden = !panel;
     }
-
-
-    function paint(panel) {
-      var p = panel.spec, node = panel.svg, width = node.clientWidth || panel.root.clientWidth;
-      if (!width) return;
-      var narrow = grid.clientWidth < 600;
+    // of an axis, or of those it is shared with
+    function labelled(panel, axis) {
+      var all = panels.filter(function (other) { return other.spec[axis].group === panel.spec[axis].group; });
+      return all.map(function (other) { return other.spec[axis].label; }).filter(Boolean)[0] || "";
+    }
+    function sized(panel) {
+      var p = panel.spec, width = panel.svg.clientWidth || panel.root.clientWidth, narrow = grid.clientWidth < 600;
+      // on a phone panels side by side stand below each other, away from the one that has the label
+      var apart = narrow && spec.columns > 1, x = apart ? labelled(panel, "x") : p.x.label, y = apart ? labelled(panel, "y") : p.y.label;
       var height = Math.max(150, Math.min(narrow ? 300 : 620, p.height * (narrow ? 1 : Math.min(1, grid.clientWidth / spec.width)) + 34));
       if (narrow) height = Math.max(height, 0.5 * width);
+      var bottom = height - (x ? 38 : 22), yTicks = ticks(p.y, panel.y, Math.max(3, Math.round(bottom / 38)));
+      var longest = Math.max.apply(null, yTicks.map(function (t) { return textWidth(t[1]); }).concat([7]));
+      return { width: width, height: height, bottom: bottom, yTicks: yTicks, x: x, y: y,
+        left: Math.min(0.42 * width, 12 + longest) + (y ? 17 : 0) };
+    }
+    function paintAll() {
+      panels.forEach(function (panel) { panel.size = sized(panel); });
+      panels.forEach(paint);
+    }
+
+    function paint(panel) {
+      var p = panel.spec, node = panel.svg, size = panel.size;
+      if (!size || !size.width) return;
+      var width = size.width, height = size.height, bottom = size.bottom, yTicks = size.yTicks, right = width - 10, top = 8;
       while (node.firstChild) node.removeChild(node.firstChild);
       node.setAttribute("viewBox", "0 0 " + width + " " + height);
       node.setAttribute("height", height);
-      var bottom = height - (p.x.label ? 38 : 22), yTicks = ticks(p.y, panel.y, Math.max(3, Math.round(bottom / 38)));
-      var longest = Math.max.apply(null, yTicks.map(function (t) { return textWidth(t[1]); }).concat([7]));
-      var left = Math.min(0.42 * width, 12 + longest) + (p.y.label ? 17 : 0), right = width - 10, top = 8;
+      // panels above each other that share x begin at one place
+      var left = Math.max.apply(null, panels.filter(function (other) {
+        return other === panel || (other.spec.x.group === p.x.group && other.size.width === width);
+      }).map(function (other) { return other.size.left; }));
       var field = p.marks.filter(function (m) { return m.kind === "field"; })[0];
       if (field) right -= 58;
       p.marks.forEach(function (m) {  // room for words that begin at the right edge
         var out = m.kind === "text" && m.frame === "data" && m.across === "left" && m.x >= p.x.limits[1] - 0.01 * (p.x.limits[1] - p.x.limits[0]);
         if (out) right = Math.min(right, width - 6 - 6.6 * m.text.length);
       });
-      var X = scale(panel.x, p.x.log, left, right), Y = scale(panel.y, p.y.log, bottom, top);
+      var X = scale(panel.x, p.x.log, left, right), Y = scale(panel.y, p.y.log, bottom, top), wanted = Math.max(2, Math.round((right - left) / 75));
+      // room for the half of the last number that stands beyond its tick
+      var over = ticks(p.x, panel.x, wanted).map(function (t) { return X(t[0]) + 0.5 * textWidth(t[1]) - width; });
+      right -= Math.max(0, Math.max.apply(null, over.concat([0])));
+      X = scale(panel.x, p.x.log, left, right);
       panel.frame = { left: left, right: right, top: top, bottom: bottom, X: X, Y: Y };
       panel.hits = [];
-      var xTicks = ticks(p.x, panel.x, Math.max(2, Math.round((right - left) / 75)));
+      var xTicks = ticks(p.x, panel.x, wanted);
       if (p.x.ticks) xTicks = spread(xTicks, X);
       xTicks.forEach(function (t) {
         svg("line", { class: "grid", x1: X(t[0]), x2: X(t[0]), y1: top, y2: bottom }, node);
@@ -154,9 +178,9 @@ var workbench = (function () {
         var name = svg("text", { x: left - 5, y: Y(t[0]) + 4, "text-anchor": "end" }, node, t[1]);
         if (textWidth(t[1]) > left - 12) { name.setAttribute("textLength", left - 12); name.setAttribute("lengthAdjust", "spacingAndGlyphs"); }
       });
-      if (p.x.label) fit(svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, p.x.label), right - left + 16);
-      if (p.y.label) fit(svg("text", { class: "axis", x: 0, y: 0, "text-anchor": "middle",
-        transform: "translate(12," + (top + bottom) / 2 + ") rotate(-90)" }, node, p.y.label), height - 8);
+      if (size.x) fit(svg("text", { class: "axis", x: (left + right) / 2, y: height - 5, "text-anchor": "middle" }, node, size.x), right - left + 16);
+      if (size.y) fit(svg("text", { class: "axis", x: 0, y: 0, "text-anchor": "middle",
+        transform: "translate(12," + (top + bottom) / 2 + ") rotate(-90)" }, node, size.y), height - 8);
       var id = "clip" + (++count), clip = svg("clipPath", { id: id }, svg("defs", {}, node));
       svg("rect", { x: left, y: top, width: right - left, height: bottom - top }, clip);
       var layer = svg("g", { "clip-path": "url(#" + id + ")", class: "marks" }, node);
@@ -316,6 +340,19 @@ var workbench = (function () {
       });
       panel.svg.addEventListener("pointercancel", function () { start = null; panel.rubber.setAttribute("visibility", "hidden"); });
       panel.svg.addEventListener("dblclick", function () { view(null); });
+      // part of the frame to see next, from left to right and from bottom to top
+      var nearer = [0.2, 0.8, 0.2, 0.8], moves = { "+": nearer, "=": nearer, "-": [-1 / 3, 4 / 3, -1 / 3, 4 / 3],
+        ArrowLeft: [-0.2, 0.8, 0, 1], ArrowRight: [0.2, 1.2, 0, 1], ArrowUp: [0, 1, 0.2, 1.2], ArrowDown: [0, 1, -0.2, 0.8] };
+      panel.svg.addEventListener("keydown", function (event) {
+        var f = panel.frame, to = moves[event.key], arrow = event.key.indexOf("Arrow") === 0;
+        if (!f || event.ctrlKey || event.metaKey || event.altKey || (arrow && reset.hidden)) return;  // arrows scroll the page
+        if (event.key === "Escape") return view(null);
+        if (!to) return;
+        event.preventDefault();
+        var x = function (share) { return f.X.back(f.left + share * (f.right - f.left)); };
+        var y = function (share) { return f.Y.back(f.bottom + share * (f.top - f.bottom)); };
+        view(panel, [x(to[0]), x(to[1])], [y(to[2]), y(to[3])]);
+      });
       panel.svg.addEventListener("pointerleave", function () { leave(panel); });
     }
     function leave(panel) { tip.hidden = true; if (panel.dot) panel.dot.setAttribute("visibility", "hidden"); }
@@ -346,7 +383,7 @@ var workbench = (function () {
       panel.dot.setAttribute("cx", best.at[0]); panel.dot.setAttribute("cy", best.at[1]);
       panel.dot.setAttribute("visibility", "visible");
       var lines = best.mark.label && best.value === undefined ? [best.mark.label] : [];
-      lines.push((spec_.x.label || "x") + ": " + named(spec_.x, best.x), (spec_.y.label || "y") + ": " + named(spec_.y, best.y));
+      lines.push((labelled(panel, "x") || "x") + ": " + named(spec_.x, best.x), (labelled(panel, "y") || "y") + ": " + named(spec_.y, best.y));
       if (best.value !== undefined) lines.push((best.mark.label || "value") + ": " + shown(best.value));
       tip.textContent = lines.join("\n");
       tip.hidden = false;

@@ -80,7 +80,7 @@ workbench.move = function (root, spec) {
     tracks.forEach(function (t, i) {
       t.at = modes ? [0, 0] : beside > 1 ? [i * width, 0] : [0, i * height];
       if (!modes || i === 0) svg("path", { d: joined(net.rest, t.at), fill: "none", stroke: "var(--line)", "stroke-width": 1 }, picture);
-      t.line = svg("path", { class: "track", fill: "none", stroke: t.colour, "stroke-width": 1.6 }, picture);
+      t.line = svg("path", { class: "track moves", fill: "none", stroke: t.colour, "stroke-width": 1.6 }, picture);
       if (apart > 1) svg("text", { x: t.at[0] + 0.5 * width, y: t.at[1] + 14, "text-anchor": "middle" }, picture, t.spec.label);
       if (!modes || i === tracks.length - 1) marked(t.at);
     });
@@ -99,29 +99,30 @@ workbench.move = function (root, spec) {
   function measure() {
     var width = picture.clientWidth || 600;
     if (net) { while (picture.firstChild) picture.removeChild(picture.firstChild); drawnNet(width); return; }
-    height = Math.max(170, Math.min(270, 0.36 * width));
+    height = Math.max(170, Math.min(270, 0.36 * width)) + 16;
     picture.setAttribute("viewBox", "0 0 " + width + " " + height);
     picture.setAttribute("height", height);
     while (picture.firstChild) picture.removeChild(picture.firstChild);
     var ends = [Math.min.apply(null, spec.x), Math.max.apply(null, spec.x)];
     X = workbench.scale(ends, false, 14, width - 14);
-    Y = workbench.scale([-reach * 1.12, reach * 1.12], false, height - 34, 8);
+    Y = workbench.scale([-reach * 1.12, reach * 1.12], false, height - 50, 8);
     svg("line", { x1: X(ends[0]), x2: X(ends[1]), y1: Y(0), y2: Y(0), stroke: "var(--line)", "stroke-width": 2 }, picture);
     workbench.ticks({}, ends, Math.round(width / 90)).forEach(function (t) {
-      svg("text", { x: X(t[0]), y: height - 5, "text-anchor": "middle" }, picture, t[1]);
+      svg("text", { x: X(t[0]), y: height - 21, "text-anchor": "middle" }, picture, t[1]);
     });
+    if (spec.label) svg("text", { class: "axis", x: 0.5 * width, y: height - 5, "text-anchor": "middle" }, picture, spec.label);
     (spec.sensors || []).forEach(function (s) {
       svg("title", {}, svg("circle", { cx: X(s.at), cy: Y(0), r: 3.5, fill: "var(--paper)", stroke: "var(--ink)" }, picture), "sensor " + s.name);
     });
     (spec.actuators || []).forEach(function (a) {
-      var g = svg("g", { transform: "translate(" + X(a.at) + "," + (height - 33) + ")" }, picture);
+      var g = svg("g", { transform: "translate(" + X(a.at) + "," + (height - 49) + ")" }, picture);
       svg("path", { d: "M0,-9L6,3H-6Z", fill: "var(--bad)" }, g);
       svg("title", {}, g, "actuator " + a.name);
     });
     tracks.forEach(function (t) {
-      t.ghost = svg("path", { fill: "none", stroke: t.colour, "stroke-width": 1, opacity: 0.35 }, picture);
-      t.line = svg("path", { class: "track", fill: "none", stroke: t.colour, "stroke-width": t.colour === "var(--soft)" ? 1.6 : 2.4 }, picture);
-      t.dots = (t.spec.sampled ? t.spec.x : []).map(function (x) { return svg("circle", { cx: X(x), r: 4, fill: t.colour }, picture); });
+      t.ghost = svg("path", { class: "moves", fill: "none", stroke: t.colour, "stroke-width": 1, opacity: 0.35 }, picture);
+      t.line = svg("path", { class: "track moves", fill: "none", stroke: t.colour, "stroke-width": t.colour === "var(--soft)" ? 1.6 : 2.4 }, picture);
+      t.dots = (t.spec.sampled ? t.spec.x : []).map(function (x) { return svg("circle", { class: "moves", cx: X(x), r: 4, fill: t.colour }, picture); });
     });
     show();
   }

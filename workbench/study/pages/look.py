@@ -72,10 +72,11 @@ def _record(record: Record, path: Path) -> Look:
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
-    forces = [] if inputs else [n for n in record.output_names if n not in faulty and FORCES.search(n)]
+    applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
+    forces = [] if inputs else [name for name in record.output_names if name in applied]
     options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
     if forces:
-        remarks.append(f"{', '.join(forces)}: an input by its name; leave --inputs out if it is not")
+        remarks.append(f"{', '.join(forces)}: an input by its name or unit; leave --inputs out if it is not")
     kept = [name for name in record.output_names if name not in faulty | set(forces)]
     if not options:
         decays = _decays(record.only(kept)) if kept else False

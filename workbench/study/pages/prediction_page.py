@@ -18,6 +18,7 @@ def prediction_page(
     folder: Path,
     check: PredictionCheck | None = None,
     measured: Record | None = None,
+    made_by: str = "",
 ) -> Path:
     """Write the page.
 
@@ -27,6 +28,7 @@ def prediction_page(
         name: of the case.
         folder: that the case was read from.
         check, measured: the test and how it came out, where it was made.
+        made_by: the command that makes the page again; of the case and the record alone unless given.
     """
     draws = prediction.expected.shape[0]
     caption = f"Bands that hold {100 * LEVEL:g} % of the readings of each sensor, from {draws} draws."
@@ -42,6 +44,6 @@ def prediction_page(
         blocks=[block(plot_prediction(prediction, measured), caption)],
         tables=[("By sensor" if check is None else "Readings inside the bands", heads, rows)],
         inputs=case_inputs(folder),
-        made_by=f"workbench {'predict' if check is None else 'check'} {folder} {prediction.name}",
+        made_by=made_by or f"workbench {'predict' if check is None else 'check'} {folder} {prediction.name}",
     )
     return write_page(path, page_content)

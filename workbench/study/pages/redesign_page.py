@@ -26,7 +26,13 @@ NOTHING = 1e-4  # of the vibration and effort: a loss that no step need make up 
 
 
 def redesign_page(
-    found: Redesign, path: Path, *, name: str, record: Record | None = None, folder: Path | None = None
+    found: Redesign,
+    path: Path,
+    *,
+    name: str,
+    record: Record | None = None,
+    folder: Path | None = None,
+    made_by: str = "",
 ) -> Path:
     """Write the page.
 
@@ -36,6 +42,7 @@ def redesign_page(
         name: of the case.
         record: measured, whose inputs are then replayed as forces on both loops.
         folder: that the case was read from.
+        made_by: the command that makes the page again; of the case alone unless given.
     """
     blocks = []
     if record is not None:
@@ -76,7 +83,7 @@ def redesign_page(
         blocks=blocks,
         tables=tables,
         inputs={} if folder is None else case_inputs(folder),
-        made_by=f"workbench redesign {folder or name}",
+        made_by=made_by or f"workbench redesign {folder or name}",
     )
     return write_page(path, page_content)
 

@@ -29,7 +29,7 @@ MOVING = (
 STANDING_OF = {"none": "good", "explained": "good", "part": "part", "unknown": "bad"}  # by outcome
 
 
-def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None) -> Path:
+def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | None = None, made_by: str = "") -> Path:
     """Write the page: the verdict, measured beside nominal and corrected, where, the unmodelled force, the rivals.
 
     Args:
@@ -37,6 +37,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         case: that was diagnosed.
         path: of the HTML file.
         folder: that the case was read from, so that the page can say what it was.
+        made_by: the command that makes the page again; of the case alone unless given.
     """
     nominal, corrected = verdict.nominal.modes, verdict.corrected.modes
     changed = nominal.n_modes != corrected.n_modes or not np.allclose(nominal.omega, corrected.omega, rtol=1e-6)
@@ -94,7 +95,7 @@ def verdict_page(verdict: Verdict, case: Case, path: Path, *, folder: Path | Non
         ],
         tables=verdict_tables(verdict.to_json()),
         inputs={} if folder is None else case_inputs(folder),
-        made_by=f"workbench diagnose {folder or verdict.case}",
+        made_by=made_by or f"workbench diagnose {folder or verdict.case}",
     )
     return write_page(path, page_content)
 
@@ -114,7 +115,7 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
     ]
     gap, closed = content["gap"], content.get("shrinkage", {})
     gaps = [
-        [record, *(gap[name].get(record) for name in ("before", "after", "floor")), closed.get(record, "")]
+        [record, *(_short(gap[name].get(record)) for name in ("before", "after", "floor")), _short(closed.get(record))]
         for record in gap["before"]
     ]
     rivals = [
@@ -126,6 +127,11 @@ def verdict_tables(content: Mapping[str, Any]) -> list[Table]:
         ("Rivals", ("set of effects", "probability"), rivals),
     ]
     return [table for table in tables if table[2]]
+
+
+def _short(number: float | None) -> float | str:
+    """To four digits; "" where there is none."""
+    return "" if number is None else float(f"{number:.4g}")
 
 
 def _of_lowest_and_highest(records: Sequence[Record]) -> list[Distortion]:
