@@ -181,6 +181,37 @@ def test_standard_deviations_are_true():
     assert (spread > 0.6).all() and (spread < 1.5).all()
 
 
+def pair_on(rig, record_of, levels=(0.3, 1.0)):
+    """Records of a beam with a cubic spring and a delayed actuator."""
+    rng = np.random.default_rng(5)
+    real = kind_named("cubic_spring").apply(rig, None, {"at": 0.62, "stiffness": 2000.0})
+    real = kind_named("actuator_delay").apply(real, "all", {"delay": 0.02})
+    commands = [level * np.repeat(rng.normal(size=40), 10)[None] for level in levels]
+    return [record_of(real, command, rng, name=f"r{i}") for i, command in enumerate(commands)]
+
+
+def test_a_clean_pair_is_found_before_errors_of_the_model_are_asked_for(hinged_rig, record_of):
+    rig, told = hinged_rig(3), []
+    fitted, kept = pair_on(rig, record_of)
+    catalogue = tuple(kind_named(n) for n in ("actuator_delay", "cubic_spring", "modal_damping", "point_mass"))
+    report = lambda text, share: told.append(text)  # noqa: E731
+    verdict = diagnose(rig, [fitted], validation=[kept], catalogue=catalogue, report=report, workers=1)
+    assert verdict.outcome == "explained"
+    assert {effect.kind.name for effect in verdict.effects} == {"actuator_delay", "cubic_spring"}
+    assert "all pairs at once" in told and not any("small errors" in text for text in told)
+
+
+def test_a_nearest_set_that_makes_the_gap_of_others_larger_corrects_nothing(hinged_rig, record_of):
+    """A mass that is no part of it bends to what is there, and the record held out is of another beam."""
+    rig, rng = hinged_rig(3), np.random.default_rng(3)
+    fitted, _ = pair_on(rig, record_of)
+    kept = record_of(rig, 0.5 * np.repeat(rng.normal(size=40), 10)[None], rng, name="kept")
+    verdict = diagnose(rig, [fitted], validation=[kept], catalogue=(kind_named("point_mass"),), workers=1)
+    assert verdict.outcome in ("part", "unknown")
+    assert verdict.effects == () and verdict.corrected is verdict.nominal
+    assert verdict.shrinkage.after == verdict.shrinkage.before
+
+
 def test_validation_records_never_reach_the_search(hinged_rig, record_of):
     """Spoilt validation records change the shrinkage and nothing else."""
     rig, rng = hinged_rig(3), np.random.default_rng(5)
