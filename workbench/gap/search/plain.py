@@ -17,6 +17,7 @@ from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
 from workbench.gap.search.search import Search
 from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, SELECTION, STEPWISE
+from workbench.rig.rig import Rig
 from workbench.structure.domain import middle
 from workbench.structure.member import Structure
 
@@ -33,17 +34,19 @@ def are_common(effects: Sequence[Effect]) -> bool:
 
 def may_be_error(effect: Effect, search: Search) -> bool:
     """Whether a careful model may be off by as much as an effect at a port says: in timing, a gain or a place."""
-    widest, values = dict(JOINT.widest), effect.values
-    late = next((values[name] for name in ("delay", "time_constant") if name in values), np.inf)
-    if late < widest["delay"] * search.data.records[0].sample_time:
-        return True
-    if "gain" in values:
-        return bool(abs(np.log(abs(values["gain"]))) < PLAIN.most_gain)
-    standing = [a.at for a in search.rig.actuators if a.name == effect.target]
-    standing += [s.at for s in search.rig.sensors if s.name == effect.target]
+    late = next((effect.values[name] for name in ("delay", "time_constant") if name in effect.values), np.inf)
+    return late < dict(JOINT.widest)["delay"] * search.data.records[0].sample_time or is_slight(effect, search.rig)
+
+
+def is_slight(effect: Effect, rig: Rig) -> bool:
+    """Whether an effect is a gain or a place that any calibration and any tape measure may be off by."""
+    if "gain" in effect.values:
+        return bool(abs(np.log(abs(effect.values["gain"]))) < PLAIN.most_gain)
+    standing = [a.at for a in rig.actuators if a.name == effect.target]
+    standing += [s.at for s in rig.sensors if s.name == effect.target]
     if effect.at is None or not standing:
         return False
-    return search.rig.modes.domain.separation(effect.at, middle(standing[0])) < PLAIN.most_moved
+    return rig.modes.domain.separation(effect.at, middle(standing[0])) < PLAIN.most_moved
 
 
 def common_as_errors(search: Search, found: Fit, *, alone: bool = False) -> Fit:

@@ -23,7 +23,7 @@ from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
 from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
-from workbench.gap.search.plain import COMMON, in_place_of_errors, one_late
+from workbench.gap.search.plain import COMMON, in_place_of_errors, is_slight, one_late
 from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
 from workbench.gap.search.selection import fitted_ahead, one_more
 from workbench.gap.search.settings import FINISH, JOINT, PLAIN, SEARCH, STEPWISE
@@ -79,7 +79,7 @@ class Stepwise:
     def alone(self) -> list[Step]:
         """The likeliest single effects beside errors that start from none, best first."""
         sets = [f.effects for f in self._likeliest_alone()] if self.singles is None else self.singles
-        found = [s for s in self.search.workers.map(self.afresh, list(sets)) if not self._is_timing(s)]
+        found = [s for s in self.search.workers.map(self.afresh, list(sets)) if not self._may_be_errors(s)]
         best = sorted(found, key=lambda s: s.fit.cost)
         if not (self.search.by_mode and best and self.explains(best[0])):
             return best
@@ -356,7 +356,7 @@ class Stepwise:
 
     def _in_place_of_inputs(self, step: Step) -> Step | None:
         """The step with one more effect that leaves only noise of the sensors, as noise of the inputs never does."""
-        near = [s for s in self._with_each(step) if s.fit.cost < PLAIN.near and not self._is_timing(s)]
+        near = [s for s in self._with_each(step) if s.fit.cost < PLAIN.near and not self._may_be_errors(s)]
         near = sorted(near, key=lambda s: s.fit.cost)[: STEPWISE.finalists]
         found = [s for s in map(self._whole, near) if self.explains(s) and s.is_plausible and self._is_worth(s, step)]
         return self._simplest_of(sorted(found, key=lambda s: s.fit.cost)) if found else None
@@ -382,7 +382,7 @@ class Stepwise:
         """The best on whole records of sets fitted to the most telling ones."""
         # and of what was found before errors could bend to it
         alone = [] if step.effects else self.alone
-        tried = sorted((s for s in tried if not self._is_timing(s)), key=self._loss)
+        tried = sorted((s for s in tried if not self._may_be_errors(s)), key=self._loss)
         near = [s for s in tried if s.fit.cost < STEPWISE.near * tried[0].fit.cost][: STEPWISE.finalists]
         whole = sorted((*(self._without_idle(self._whole(s)) for s in near), *alone), key=self._loss)
         return self._simplest_of(whole) if whole else step
@@ -455,6 +455,10 @@ class Stepwise:
             return max(float(np.sqrt((((a - b) / scale) ** 2).mean())) for a, b, scale in each)
 
         return tuple(effect for effect in effects if altered(effect) > self.tolerance)
+
+    def _may_be_errors(self, step: Step) -> bool:
+        """Whether an effect of a set is what the model may be off by at a port, which errors beside it are too."""
+        return self._is_timing(step) or any(is_slight(effect, self.search.rig) for effect in step.effects)
 
     def _is_timing(self, step: Step, kinds: Collection[str] = ("sensor_delay",)) -> bool:
         """Whether an effect of a set is what the timing of a sensor may be off by: late by less than believed."""
