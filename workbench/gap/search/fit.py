@@ -31,6 +31,7 @@ class Fit:
         covariance: (n, n) of the free coordinates of all parameters, in the order of `parameters_of`; None before
             `with_intervals`.
         stepping: (n_records,) mean square error of the steps of time, in units of the noise, where it was measured.
+        normal: (n, n) Jᵀ J of the free coordinates of all parameters, with the precision of what is believed.
     """
 
     effects: tuple[Effect, ...]
@@ -41,6 +42,7 @@ class Fit:
     falling: float = 0.0
     covariance: np.ndarray | None = None
     stepping: np.ndarray | float = 0.0
+    normal: np.ndarray | None = None
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -262,6 +264,7 @@ def fit(
     workers: Workers = ALONE,
     known: np.ndarray | None = None,
     chord: bool = False,
+    damping: float = FIT.damping,
 ) -> Fit:
     """Levenberg-Marquardt over all parameters of the effects, from the values they carry.
 
@@ -275,6 +278,7 @@ def fit(
         workers: processes that share the sensitivities, where they are many.
         known: (n_values, n_believed) sensitivities to parameters with priors, where they are at hand.
         chord: keep those of the first iteration; small errors move the residual all but linearly.
+        damping: of the first step, as a share of the diagonal of Jᵀ J.
     """
     problem = _Problem(rig, effects, data, held, workers, known, chord)
     free = problem.start.copy()
@@ -283,7 +287,7 @@ def fit(
         shape = (len(data.records), data.noise.size)
         return Fit(tuple(effects), HOPELESS, np.full(shape, HOPELESS), free.size, "no rig at the start")
     cost = residual @ residual
-    damping, status, falling = 1e-3, "most iterations done", 0.0
+    status, falling = "most iterations done", 0.0
     normal = np.zeros((free.size, free.size))
     for _ in range(iterations if free.size else 0):
         if data.deadline.is_past:
@@ -398,6 +402,7 @@ def _result(
         spread[i][parameter.name] = float(abs(parameter.slope(value)) * deviation)
     return Fit(
         effects=tuple(replace(e, deviations=s) for e, s in zip(effects, spread, strict=True)),
+        normal=normal,
         cost=cost,
         cost_by_channel=problem.data.by_channel(residual),
         n_parameters=free.size,

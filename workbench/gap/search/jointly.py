@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from workbench.arrays import Floats
+from workbench.arrays import Floats, scaled_inverse
 from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.prediction.logged_inputs import logging_noise
 from workbench.gap.prediction.noise import is_noise_alone, noise_found
-from workbench.gap.search.fit import Fit, fit
+from workbench.gap.search.fit import Fit, fit, parameters_of
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import JOINT, SELECTION
+from workbench.gap.search.settings import FIT, JOINT, SELECTION
 
 
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
@@ -112,6 +112,7 @@ def fit_jointly(
     if known is None:
         errors = opened(search, errors)
     i = counted = 0
+    is_settled, reached = True, np.inf
     while counted < rounds and i < JOINT.most_rounds:
         # the two most telling records lead the way
         quickly = known is not None or (i == 0 and not to_the_end)
@@ -119,7 +120,7 @@ def fit_jointly(
         left = data.residual(apply_all(search.rig, (*effects, errors)))
         with np.errstate(over="ignore"):  # of a motion that runs away
             level = max(float(left @ left) / left.size, 1.0)
-        if level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
+        if is_settled and level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
             break
         counted += level > JOINT.falling * before or not np.isfinite(before)
         before = level if known is not None or not quickly else np.inf
@@ -134,9 +135,16 @@ def fit_jointly(
             workers=search.workers,
             known=None if known is None else known / np.sqrt(level),
             chord=True,
+            damping=FIT.damping if i == 1 or to_the_end else JOINT.undamped,
         )
         *effects, errors = found.effects
-        errors = _resized(errors)
+        # far from what the records say, all that is left counts as noise, beside which no error would be seen; and the
+        # short waves of the last fit follow what no variation is
+        at_rest = level > JOINT.falling * reached and not to_the_end
+        sizes = _likeliest_sizes(search, found) if at_rest else _next_sizes(errors)
+        changes = [abs(np.log(size / getattr(errors.target, group))) for group, size in sizes.items()]
+        is_settled = to_the_end or max(changes, default=0.0) < JOINT.sized
+        reached, errors = level, replace(errors, target=replace(errors.target, **sizes))
     return measured(
         search, replace(found, effects=(*effects, errors if to_the_end else _closed(errors))), whole.substeps
     )
@@ -161,19 +169,50 @@ def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
     return Step(step, sensor_noise, logged, sensor_noise + logged**2 * per_unit)
 
 
-def _resized(errors: Effect) -> Effect:
-    """The errors with prior deviations as large as the records make them."""
-    prior = errors.target
-    assert isinstance(prior, NominalPrior)
-    sizes: dict[str, Any] = {}
-    for group, widest in _widest(prior):
-        if group not in prior.groups:
-            continue
-        values, spread = _drawn(errors, group)
-        known = np.clip(1.0 - (spread / getattr(prior, group)) ** 2, 0.0, 1.0).sum()
-        size = np.sqrt((values**2).sum() / max(known, 1e-3))
-        sizes[group] = float(np.clip(size, JOINT.narrowest * widest, widest))
-    return replace(errors, target=replace(prior, **sizes))
+def _next_sizes(errors: Effect) -> dict[str, float]:
+    """Prior deviations as large as the records make the errors of each group, one step nearer to the likeliest."""
+    prior, each = errors.target, {group: _drawn(errors, group) for group, _ in _widest(errors.target)}
+    return {g: _size(*each[g], getattr(prior, g), widest) for g, widest in _widest(prior) if g in prior.groups}
+
+
+def _size(values: Floats, spread: Floats, size: float, widest: float) -> float:
+    """The next size of errors with those posterior standard deviations, after MacKay."""
+    known = np.clip(1.0 - (spread / size) ** 2, 0.0, 1.0).sum()
+    return float(np.clip(np.sqrt((values**2).sum() / max(known, 1e-3)), JOINT.narrowest * widest, widest))
+
+
+def _likeliest_sizes(search: Search, found: Fit) -> dict[str, float]:
+    """The sizes where `_next_sizes` comes to rest, errors and effects going with them to first order.
+
+    Simulations are not asked again: where the records hardly tell errors apart, the cost does not change on the way.
+    """
+    errors, prior = found.effects[-1], found.effects[-1].target
+    each = [parameter for _, parameter in parameters_of(search.rig, found.effects)]
+    mine = np.arange(len(each) - len(errors.values), len(each))
+    names, free = [each[j].name for j in mine], np.array([each[j].to_free(errors.values[each[j].name]) for j in mine])
+    groups = np.array([group_of(name) for name in names])
+    sizes = {group: float(getattr(prior, group)) for group in prior.groups}
+    unit = np.array([each[j].prior_std / sizes[g] for j, g in zip(mine, groups, strict=True)])
+    widest = dict(_widest(prior))
+
+    def precision() -> Floats:
+        of_each: Floats = np.zeros(len(each))
+        of_each[mine] = 1.0 / (unit * [sizes[g] for g in groups]) ** 2
+        return of_each
+
+    assert found.normal is not None
+    was = precision()
+    for _ in range(JOINT.likeliest):
+        now, before = precision(), dict(sizes)
+        inverse = scaled_inverse(found.normal + np.diag(now - was))
+        moved = inverse[mine][:, mine] @ ((was - now)[mine] * free)
+        values, spread = (free + moved) / unit, np.sqrt(np.maximum(np.diag(inverse)[mine], 0.0)) / unit
+        for group in sizes:
+            of_group = groups == group
+            sizes[group] = _size(values[of_group], spread[of_group], sizes[group], widest[group])
+        if all(abs(np.log(sizes[g] / before[g])) < 0.1 * JOINT.sized for g in sizes):
+            break
+    return sizes
 
 
 def _drawn(errors: Effect, group: str) -> Floats:

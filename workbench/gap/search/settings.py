@@ -26,6 +26,7 @@ class SearchSettings:
 class FitSettings:
     """Constants of a fit."""
 
+    damping: float = 1e-3  # of the first step, of the diagonal of the normal equations; less is free to go astray
     bent: float = 0.1  # of a step: the stretch over which its curvature is taken
     # of a step: what it may turn by, twice that turn over its length (Transtrum & Sethna, 2012)
     most_bent: float = 0.75
@@ -197,6 +198,10 @@ class JointSettings:
     # settled, last_settled: share of what is left that a round must have taken away for another; in the last fit
     settled: float = 0.02
     last_settled: float = 1e-3
+    sized: float = 0.2  # logarithm of a size: what it must have changed by for another round all the same
+    likeliest: int = 200  # steps of the sizes to where they come to rest, at most, without a simulation
+    # first damping of the fits that follow the first: more holds what the records hardly tell apart where it is
+    undamped: float = 1e-8
     iterations: int = 4  # iterations, tolerance: of the fit in each round
     tolerance: float = 1e-4
     last_iterations: int = 6  # last_iterations, last_tolerance: of the last fit, which intervals are taken from
