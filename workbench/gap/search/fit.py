@@ -94,7 +94,7 @@ class _Problem:
         self.parameters = parameters_of(rig, self.effects)
         self.start = np.array([p.to_free(self.effects[i].values[p.name]) for i, p in self.parameters])
         floor = [
-            1e-2 if p.logarithmic or p.name in COORDINATES or p.prior_std else 1e-3 * abs(z) + 1e-9
+            FIT.short if p.prior_std else 1e-2 if p.logarithmic or p.name in COORDINATES else 1e-3 * abs(z) + 1e-9
             for (_, p), z in zip(self.parameters, self.start, strict=True)
         ]
         self.steps = np.array(floor)
@@ -235,7 +235,10 @@ def slopes(
     """
     problem = _Problem(rig, effects, data, held, workers)
     if wide:
-        problem.steps *= [FIT.wider_place if p.name in COORDINATES else FIT.wider for _, p in problem.parameters]
+        problem.steps *= [
+            FIT.wider_place if p.name in COORDINATES else FIT.wider * (1e-2 / FIT.short if p.prior_std else 1.0)
+            for _, p in problem.parameters
+        ]
     residual = problem.residual(problem.start)
     if residual is None:
         raise ValueError("the rig cannot be simulated with these effects")

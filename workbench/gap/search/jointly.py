@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -11,9 +10,11 @@ from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import JUST_LATE, NominalPrior, group_of, nominal_errors, weight_of
 from workbench.gap.prediction.logged_inputs import logging_noise
 from workbench.gap.prediction.noise import is_noise_alone, noise_found
+from workbench.gap.prediction.residuals import FitData
 from workbench.gap.search.fit import Fit, fit, parameters_of
 from workbench.gap.search.search import Search
-from workbench.gap.search.settings import FIT, JOINT, SELECTION
+from workbench.gap.search.settings import JOINT, SELECTION
+from workbench.rig.rig import Rig
 
 
 def are_plausible(errors: Effect, *, damping: bool = True) -> bool:
@@ -112,42 +113,75 @@ def fit_jointly(
     if known is None:
         errors = opened(search, errors)
     i = counted = 0
-    is_settled, reached = True, np.inf
     while counted < rounds and i < JOINT.most_rounds:
         # the two most telling records lead the way
         quickly = known is not None or (i == 0 and not to_the_end)
         data = search.quick.stepped(whole.substeps) if quickly else whole
-        left = data.residual(apply_all(search.rig, (*effects, errors)))
-        with np.errstate(over="ignore"):  # of a motion that runs away
-            level = max(float(left @ left) / left.size, 1.0)
-        if is_settled and level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
+        level = _level(search.rig, (*effects, errors), data)
+        if level > (1.0 - (JOINT.last_settled if to_the_end else JOINT.settled)) * before:
             break
         counted += level > JOINT.falling * before or not np.isfinite(before)
         before = level if known is not None or not quickly else np.inf
         i += 1
-        tempered = data.tempered(level)
         found = fit(
             search.rig,
             (*effects, errors),
-            tempered,
+            data.tempered(level),
             iterations=JOINT.last_iterations if to_the_end else JOINT.iterations,
             tolerance=JOINT.last_tolerance if to_the_end else JOINT.tolerance,
             workers=search.workers,
             known=None if known is None else known / np.sqrt(level),
             chord=True,
-            damping=FIT.damping if i == 1 or to_the_end else JOINT.undamped,
         )
         *effects, errors = found.effects
-        # far from what the records say, all that is left counts as noise, beside which no error would be seen; and the
-        # short waves of the last fit follow what no variation is
-        at_rest = level > JOINT.falling * reached and not to_the_end
-        sizes = _likeliest_sizes(search, found) if at_rest else _next_sizes(errors)
+        errors = _sized(errors, _next_sizes(errors))
+    if to_the_end:
+        return measured(search, replace(found, effects=(*effects, errors)), whole.substeps)
+    moving = measured(search, replace(found, effects=(*effects, _closed(errors))), whole.substeps)
+    resting = found if known is not None else _at_rest(search, found, whole)
+    if resting is found:
+        return moving
+    *effects, errors = resting.effects
+    rested = measured(search, replace(resting, effects=(*effects, _closed(errors))), whole.substeps)
+    # errors that come to rest far off bend to what no error of the model is
+    return min((rested, moving), key=lambda step: step.description(rested.noise_power))
+
+
+def _at_rest(search: Search, found: Fit, data: FitData) -> Fit:
+    """The fit with the sizes of errors where they come to rest, which the records may be slow to lead to.
+
+    Where they hardly tell errors apart, the cost does not change on the way.
+    """
+    for _ in range(JOINT.rests):
+        errors = found.effects[-1]
+        sizes = _likeliest_sizes(search, found)
         changes = [abs(np.log(size / getattr(errors.target, group))) for group, size in sizes.items()]
-        is_settled = to_the_end or max(changes, default=0.0) < JOINT.sized
-        reached, errors = level, replace(errors, target=replace(errors.target, **sizes))
-    return measured(
-        search, replace(found, effects=(*effects, errors if to_the_end else _closed(errors))), whole.substeps
-    )
+        if max(changes, default=0.0) < JOINT.sized:
+            break
+        effects = (*found.effects[:-1], _sized(errors, sizes))
+        found = fit(
+            search.rig,
+            effects,
+            data.tempered(_level(search.rig, effects, data)),
+            iterations=JOINT.iterations,
+            tolerance=JOINT.tolerance,
+            workers=search.workers,
+            chord=True,
+            damping=JOINT.undamped,
+        )
+    return found
+
+
+def _level(rig: Rig, effects: Sequence[Effect], data: FitData) -> float:
+    """Mean square of what effects and errors leave, in units of the noise; no less than that."""
+    left = data.residual(apply_all(rig, effects))
+    with np.errstate(over="ignore"):  # of a motion that runs away
+        return max(float(left @ left) / left.size, 1.0)
+
+
+def _sized(errors: Effect, sizes: dict[str, float]) -> Effect:
+    """The errors with prior deviations of those sizes."""
+    return replace(errors, target=replace(errors.target, **sizes))
 
 
 def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
@@ -192,7 +226,7 @@ def _likeliest_sizes(search: Search, found: Fit) -> dict[str, float]:
     names, free = [each[j].name for j in mine], np.array([each[j].to_free(errors.values[each[j].name]) for j in mine])
     groups = np.array([group_of(name) for name in names])
     sizes = {group: float(getattr(prior, group)) for group in prior.groups}
-    unit = np.array([each[j].prior_std / sizes[g] for j, g in zip(mine, groups, strict=True)])
+    unit = np.array([each[j].prior_std for j in mine], float) / [sizes[g] for g in groups]
     widest = dict(_widest(prior))
 
     def precision() -> Floats:

@@ -30,6 +30,9 @@ class FitSettings:
     bent: float = 0.1  # of a step: the stretch over which its curvature is taken
     # of a step: what it may turn by, twice that turn over its length (Transtrum & Sethna, 2012)
     most_bent: float = 0.75
+    # of an error of the model, in its unit (a hundredth, say): the step of its slope. Mass, stiffness and gains may
+    # alter nothing together, though each by itself turns the phase of a long record: what a long step bends hides that
+    short: float = 1e-4
     slope_substeps: int = 2  # of a sample, for slopes: they need not be as exact as residuals
     wider: float = 30.0  # times the steps of a fit: of numbers a hundredth
     wider_place: float = 1000.0  # likewise: of a place a thousandth
@@ -198,9 +201,10 @@ class JointSettings:
     # settled, last_settled: share of what is left that a round must have taken away for another; in the last fit
     settled: float = 0.02
     last_settled: float = 1e-3
-    sized: float = 0.2  # logarithm of a size: what it must have changed by for another round all the same
+    rests: int = 3  # fits to where sizes come to rest, at most
+    sized: float = 0.2  # logarithm of a size: what it must change by for another of these
     likeliest: int = 200  # steps of the sizes to where they come to rest, at most, without a simulation
-    # first damping of the fits that follow the first: more holds what the records hardly tell apart where it is
+    # first damping of these fits: more holds what the records hardly tell apart where it is
     undamped: float = 1e-8
     iterations: int = 4  # iterations, tolerance: of the fit in each round
     tolerance: float = 1e-4
