@@ -205,12 +205,13 @@ def measured(search: Search, found: Fit, substeps: int | None = None) -> Step:
 
 def _next_sizes(errors: Effect) -> dict[str, float]:
     """Prior deviations as large as the records make the errors of each group, one step nearer to the likeliest."""
-    prior, each = errors.target, {group: _drawn(errors, group) for group, _ in _widest(errors.target)}
-    return {g: _size(*each[g], getattr(prior, g), widest) for g, widest in _widest(prior) if g in prior.groups}
+    prior = errors.target
+    return {g: _size(_drawn(errors, g), getattr(prior, g), widest) for g, widest in _widest(prior) if g in prior.groups}
 
 
-def _size(values: Floats, spread: Floats, size: float, widest: float) -> float:
-    """The next size of errors with those posterior standard deviations, after MacKay."""
+def _size(drawn: Floats, size: float, widest: float) -> float:
+    """The next size of errors, drawn (2, n_errors) with their posterior standard deviations, after MacKay."""
+    values, spread = drawn
     known = np.clip(1.0 - (spread / size) ** 2, 0.0, 1.0).sum()
     return float(np.clip(np.sqrt((values**2).sum() / max(known, 1e-3)), JOINT.narrowest * widest, widest))
 
@@ -240,10 +241,9 @@ def _likeliest_sizes(search: Search, found: Fit) -> dict[str, float]:
         now, before = precision(), dict(sizes)
         inverse = scaled_inverse(found.normal + np.diag(now - was))
         moved = inverse[mine][:, mine] @ ((was - now)[mine] * free)
-        values, spread = (free + moved) / unit, np.sqrt(np.maximum(np.diag(inverse)[mine], 0.0)) / unit
+        drawn = np.array([free + moved, np.sqrt(np.maximum(np.diag(inverse)[mine], 0.0))]) / unit
         for group in sizes:
-            of_group = groups == group
-            sizes[group] = _size(values[of_group], spread[of_group], sizes[group], widest[group])
+            sizes[group] = _size(drawn[:, groups == group], sizes[group], widest[group])
         if all(abs(np.log(sizes[g] / before[g])) < 0.1 * JOINT.sized for g in sizes):
             break
     return sizes

@@ -37,16 +37,19 @@ def one_more(
 
 
 def _exchanged(found: Sequence[Fit], screened: Screening) -> list[Effect]:
-    """Linear kinds of the structure, each where the likeliest of others stand."""
+    """Linear kinds of the structure, each where the likeliest of others stand; what else may ail the likeliest port."""
 
     def is_linear(effect: Effect) -> bool:
         return effect.kind.path == "structure" and not effect.kind.nonlinear and effect.at is not None
 
+    starts, best = screened.likeliest(), found[0].effects[-1]
+    of_port = [e for e in starts if isinstance(e.target, str) and e.target == best.target and e.kind is not best.kind]
     if isinstance(screened.domain, NamedPoints):
-        return []
+        return of_port
     likeliest = [f.effects[-1] for f in spread_over_kinds(found, 1) if is_linear(f.effects[-1])][: SELECTION.exchanged]
-    starts = {effect.kind: effect for effect in reversed(screened.likeliest()) if is_linear(effect)}
-    return [e.moved_to(one.at) for one in likeliest for e in starts.values() if e.kind is not one.kind]
+    linear = {effect.kind: effect for effect in reversed(starts) if is_linear(effect)}
+    there = [e.moved_to(one.at) for one in likeliest for e in linear.values() if e.kind is not one.kind]
+    return [*there, *of_port]
 
 
 def pairs_at_once(search: Search, screened: Screening) -> list[Fit]:
