@@ -11,6 +11,7 @@ where d_rj is zero at c_j: an error of the forces F costs only to second order. 
 minimised over the cell under each limit linearised alike (a linear programme of one constraint, solved by its dual).
 
 Where B may be singular, or nearly so, duality bounds ‖Y‖ under each limit (`dual_bound.py`); the larger bound counts.
+A cell that neither bounds as wanted may still be excluded by determinants (`hull_bound.py`).
 """
 
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from numba import njit
 
 from workbench.arrays import Flags, Floats, Integers
 from workbench.design.placement.dual_bound import dual_bound, inverse_of
-from workbench.design.placement.hull_bound import is_excluded
+from workbench.design.placement.hull_bound import HullBound
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
@@ -40,8 +41,7 @@ class Intervals:
         centre, half: (n_intervals,) m.
         value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
         most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and rate of change of φ'' on the interval.
-        quadratics: a_0, a_1 and a_2 of φ = a_0 + a_1 s + a_2 (2s² - 1) at Chebyshev's points s of the interval, each
-            (n_intervals, n_modes); None where the nodes are no intervals.
+        most_fourth: (n_intervals, n_modes) largest fourth derivative; None where the nodes are no intervals.
     """
 
     centre: np.ndarray
@@ -51,7 +51,7 @@ class Intervals:
     bend: np.ndarray
     most_bend: np.ndarray
     most_rate: np.ndarray
-    quadratics: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    most_fourth: np.ndarray | None = None
 
     @classmethod
     def of(cls, task: PlacementTask) -> "Intervals":
@@ -61,23 +61,21 @@ class Intervals:
         grid = np.linspace(first, last, 2 * leaves + 1)
         step = grid[1] - grid[0]
         value, slope, bend = (task.shapes(grid, derivative) for derivative in (0, 1, 2))
-        rate = np.abs(np.diff(bend, axis=0)) / step
+        third = np.diff(bend, axis=0) / step
+        fourth = np.diff(third, axis=0, prepend=third[:1], append=third[-1:]) / step
+        fourth = np.maximum(np.abs(fourth[:-1]), np.abs(fourth[1:])) + np.abs(np.diff(fourth, axis=0))
+        rate = np.abs(third)
         varied = np.abs(np.diff(rate, axis=0, prepend=rate[:1], append=rate[-1:]))
         rate = rate + np.maximum(varied[:-1], varied[1:])
         steep = np.maximum(np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])), np.abs(np.diff(slope, axis=0)) / step)
         steep = steep + 0.5 * step * rate
-        most_bend, most_rate = (np.maximum(part[::2], part[1::2]) for part in (steep, rate))
-        levels = [(most_bend, most_rate)]
+        levels = [tuple(np.maximum(part[::2], part[1::2]) for part in (steep, rate, fourth))]
         for _ in range(LEVELS):
             levels.append(tuple(np.maximum(part[::2], part[1::2]) for part in levels[-1]))
         at = np.concatenate([(2 * np.arange(2**k) + 1) * 2 ** (LEVELS - k) for k in range(LEVELS + 1)])
         half = np.concatenate([np.full(2**k, 0.5 * (last - first) / 2**k) for k in range(LEVELS + 1)])
-        most_bend, most_rate = (np.concatenate([level[i] for level in reversed(levels)]) for i in (0, 1))
-        before, after = (task.shapes(grid[at] + side * np.sqrt(0.75) * half) for side in (-1.0, 1.0))
-        square = (before + after - 2.0 * value[at]) / 3.0
-        quadratics = (frozen(value[at] + square), frozen((after - before) / np.sqrt(3.0)), frozen(square))
-        parts = (grid[at], half, value[at], slope[at], bend[at], most_bend, most_rate)
-        return cls(*(frozen(part) for part in parts), quadratics)
+        most = (np.concatenate([level[i] for level in reversed(levels)]) for i in range(3))
+        return cls(*(frozen(part) for part in (grid[at], half, value[at], slope[at], bend[at], *most)))
 
 
 class CellBounds:
@@ -92,7 +90,7 @@ class CellBounds:
         self, task: PlacementTask, limits: Limits, intervals: Intervals | None = None, wanted: float = 0.0
     ) -> None:
         n, self.wanted = task.n_controlled, wanted
-        self.intervals = Intervals.of(task) if intervals is None else intervals
+        self.intervals = table = Intervals.of(task) if intervals is None else intervals
         forces = task.forces[:, :: max(1, task.forces.shape[1] // INSTANTS)]
         # what is limited, as tr(B⁻¹ S B⁻ᵀ) <= L²: the effort; n times the square of the peak, above any mean of the
         # forces' squares; and the condition, L = limit / ‖B‖
@@ -111,7 +109,6 @@ class CellBounds:
             roots[i] = vectors * np.sqrt(values)
             if values[0] > FLAT * values[-1]:
                 inverses[i] = (vectors / np.sqrt(values)).T
-        table = self.intervals
         self._arguments = (
             table.half,
             table.value,
@@ -129,57 +126,21 @@ class CellBounds:
             np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
             float(limits.peak_force),
         )
-        kept = np.flatnonzero(inverses.any(axis=(1, 2)))
-        transforms, bounded = np.ascontiguousarray(task.roots), np.array([limit for _, limit in squares])[kept]
-        self._limited = (transforms, roots[kept], inverses[kept], bounded, float(limits.condition))
+        self._hull: HullBound | None = None
+        if n > 1 and table.most_fourth is not None:
+            kept = inverses.any(axis=(1, 2))
+            bounded = np.array([limit for _, limit in squares])[kept]
+            measures = (table.centre, table.half, table.most_fourth)
+            self._hull = HullBound(task, measures, roots[kept], inverses[kept], bounded, limits.condition)
 
     def __call__(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lower bounds of √W_R (inf where the limits leave no place), √W_R at the centres, and the axis to halve."""
         lower, work = np.empty(len(cells)), np.empty(len(cells))
         axis = np.empty(len(cells), np.int64)
         _bounds(cells, *self._arguments, lower, work, axis)
-        table = self.intervals
-        if self.wanted > 0 and table.quadratics is not None and cells.shape[1] > 1:
-            _exclude(cells, table.half, table.quadratics, table.most_rate, *self._limited, self.wanted, lower)
+        if self._hull is not None and self.wanted > 0:
+            self._hull.raise_to(self.wanted, cells, lower)
         return lower, work, axis
-
-
-@njit(cache=True, nogil=True)
-def _exclude(
-    cells: Integers,
-    halves: Floats,
-    quadratics: tuple[Floats, Floats, Floats],
-    most_rate: Floats,
-    transforms: Floats,
-    roots: Floats,
-    inverses: Floats,
-    square_limits: Floats,
-    condition: float,
-    wanted: float,
-    lower: Floats,
-) -> None:
-    """Raise the bounds of cells to what is wanted where the corners of polygons about the modal shapes prove it."""
-    n = cells.shape[1]
-    for cell in range(len(cells)):
-        if lower[cell] >= wanted:
-            continue
-        node = cells[cell]
-        shapes = (quadratics[0][node], quadratics[1][node], quadratics[2][node])
-        remainder = most_rate[node] * (halves[node] ** 3 / 24.0).reshape(n, 1)
-        least_frame = 0.0
-        for j in range(n):
-            spread = np.abs(shapes[1][j, :n]) + 2.0 * np.abs(shapes[2][j, :n]) + remainder[j, :n]
-            at = np.sqrt(((shapes[0][j, :n] - shapes[2][j, :n]) ** 2).sum()) - np.sqrt((spread**2).sum())
-            least_frame += max(at, 0.0) ** 2
-        for s in range(len(roots)):
-            limit = square_limits[s]
-            if np.isinf(limit) and least_frame > 0.0:
-                limit = condition / np.sqrt(least_frame)
-            if np.isfinite(limit) and is_excluded(
-                shapes, remainder, transforms, roots[s], inverses[s], limit, np.sqrt(2.0) * wanted
-            ):
-                lower[cell] = wanted
-                break
 
 
 @njit(cache=True, nogil=True)

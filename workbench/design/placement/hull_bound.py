@@ -1,4 +1,4 @@
-"""Whether a cell of places can hold a better placement, by the corners of polygons about the modal shapes.
+"""Whether a cell of places can hold a better placement, by the hulls of the modal shapes on its intervals.
 
 With f_j the rows of B⁻¹, any linear T = Σ_j f_j w(x_j) is G / D for D = det B and G = d/dε det(B + εW) at ε = 0. Both
 are affine in the column of each actuator. Where each column (b(x_j), w(x_j)) stays in the convex hull of a few points,
@@ -11,26 +11,114 @@ a limit ‖B⁻¹ S^½‖ <= L: where t = α y + β L, none that keeps the limit
 of the forces over the cell, where duality (`dual_bound.py`) allows any forces within the limit, and needs no
 convergent series (`cell_bounds.py`).
 
-The shapes on an interval are a_0 + a_1 s + a_2 (2s² - 1), |s| <= 1, to within h³/24 max |φ'''|, by interpolation at
-Chebyshev's points. The parabola (s, 2s² - 1) lies in the trapezoid of its tangents at s = -1, 0, 1. The remainder e of
-the columns b, and e_w of w - Λᵀb, change T by at most
+On an interval the shapes follow the cubic through Chebyshev's points to within h⁴/192 max |φ''''|, and a cubic lies in
+the hull of its four Bernstein points. The remainder e of the columns b, and e_w of w - Λᵀb, change T by at most
 
     L ‖S^-½ (e_w - Λᵀe)‖ + L η / (1 - η) ‖S^-½ (w - Λᵀb)‖,   η = L ‖S^-½ e‖ < 1,
 
-for any Λ; that of the centre makes w - Λᵀb vanish there. V and A only decide whether the test succeeds: they separate
-the values of (Y, B⁻¹ S^½) at the corners from all that the limits leave, by the method of Frank and Wolfe.
+for any Λ, with ‖a‖² = Σ_j max_x ‖a(x_j)‖²; that of the centre makes w - Λᵀb vanish there. V and A only decide whether
+the test succeeds: they separate the values of (Y, B⁻¹ S^½) at the choices from all that the limits leave, by the method
+of Frank and Wolfe.
 """
 
 import numpy as np
 from numba import njit
 
 from workbench.arrays import Floats, Integers
-from workbench.design.placement.dual_bound import inverse_of
+from workbench.design.placement.dual_bound import inverse_of, product
+from workbench.design.placement.task import PlacementTask
 
 STEPS = 4  # of Frank and Wolfe: sixteen prove no more cells
-MOST_REMAINDER = 0.5  # η from which a cell is too wide to try
-SINGULAR = 1e-13  # pivot over the largest entry of B
+SINGULAR = 1e-9  # pivot over the largest entry of B: below, determinants are not trusted
+ROUND_OFF = 1e-6  # of ratios of determinants whose pivots are above
 LINE = 12  # steps of the search along a line
+
+
+class HullBound:
+    """Excludes cells (n_cells, n_actuators) of intervals that hold no placement as good as wanted within the limits."""
+
+    def __init__(
+        self,
+        task: PlacementTask,
+        measures: tuple[Floats, Floats, Floats],
+        roots: Floats,
+        inverses: Floats,
+        limits: Floats,
+        condition: float,
+    ) -> None:
+        """Tables of the shapes on intervals.
+
+        Args:
+            measures: centre and half-width (n_intervals,), largest fourth derivative (n_intervals, n_modes).
+            roots, inverses, limits: S^½ and S^-½ (n_limits, n, n) and L (n_limits,), inf for that of the condition.
+        """
+        n = task.n_controlled
+        centre, half, most_fourth = measures
+        angles = np.pi * np.array([7, 5, 3, 1]) / 8.0
+        values = np.array([task.shapes(centre + s * half) for s in np.cos(angles)])
+        a = [np.tensordot(np.cos(k * angles), values, 1) * (0.5 if k else 0.25) for k in range(4)]
+        remainder = most_fourth * (half[:, None] ** 4 / 192.0)
+        c = a[0] - a[2], a[1] - 3.0 * a[3], 2.0 * a[2], 4.0 * a[3]  # c_0 + c_1 s + c_2 s² + c_3 s³
+        inner, outer = (c[0] - c[2] / 3.0, c[1] / 3.0 - c[3]), (c[0] + c[2], c[1] + c[3])
+        points = np.stack([p + side * q for p, q in (outer, inner) for side in (-1.0, 1.0)], axis=1)
+        # of the columns of B on each interval: the least size, and the remainder weighted by each S^-½
+        spread = np.abs(a[1]) + 2.0 * np.abs(a[2]) + np.abs(a[3]) + remainder
+        sizes = np.linalg.norm(c[0][:, :n], axis=1) - np.linalg.norm(spread[:, :n], axis=1)
+        doubts = remainder[:, :n] @ np.abs(inverses).transpose(0, 2, 1)
+        self._arguments = (
+            points,
+            remainder,
+            np.maximum(sizes, 0.0) ** 2,
+            (doubts**2).sum(axis=2),
+            np.ascontiguousarray(task.roots),
+            roots,
+            inverses,
+            limits,
+            float(condition),
+        )
+
+    def raise_to(self, wanted: float, cells: Integers, lower: Floats) -> None:
+        """Raise lower bounds (n_cells,) of √W_R that are below to what is wanted, where that is proven."""
+        _raise_to(wanted, cells, *self._arguments, lower)
+
+
+@njit(cache=True, nogil=True)
+def _raise_to(
+    wanted: float,
+    cells: Integers,
+    points: Floats,
+    remainder: Floats,
+    squared_sizes: Floats,
+    squared_doubts: Floats,
+    transforms: Floats,
+    roots: Floats,
+    inverses: Floats,
+    limits: Floats,
+    condition: float,
+    lower: Floats,
+) -> None:
+    n = cells.shape[1]
+    for cell in range(len(cells)):
+        node = cells[cell]
+        tried = lower[cell] < wanted
+        for j in range(1, n):  # two in one interval: B is singular at the centre
+            tried = tried and node[j] != node[j - 1]
+        if not tried:
+            continue
+        for s in range(len(roots)):
+            limit, size, doubt = limits[s], 0.0, 0.0
+            for j in range(n):
+                size += squared_sizes[node[j]]
+                doubt += squared_doubts[s, node[j]]
+            if np.isinf(limit) and size > 0.0:
+                limit = condition / np.sqrt(size)
+            eta = limit * np.sqrt(doubt)
+            least = np.sqrt(2.0) * wanted
+            if eta < 1.0 and is_excluded(
+                points[node], remainder[node], transforms, roots[s], inverses[s], limit, eta, least
+            ):
+                lower[cell] = wanted
+                break
 
 
 @njit(cache=True, nogil=True)
@@ -60,18 +148,21 @@ def least_ratio(
         if at[depth] == n_points:
             depth -= 1
             continue
-        column, other = bs[depth, depth, at[depth]], ws[depth, depth, at[depth]]
+        own = at[depth]
         if depth == n - 2:  # the last two columns at once: most of the choices differ in these alone
-            last, last_w = bs[depth, n - 1], ws[depth, n - 1]
-            first, second, first_w, second_w = column[n - 2], column[n - 1], other[n - 2], other[n - 1]
+            first, second = bs[depth, depth, own, n - 2], bs[depth, depth, own, n - 1]
+            first_w, second_w = ws[depth, depth, own, n - 2], ws[depth, depth, own, n - 1]
             for k in range(n_points):
-                det = first * last[k, n - 1] - second * last[k, n - 2]
-                change = first * last_w[k, n - 1] - second * last_w[k, n - 2]
-                change += first_w * last[k, n - 1] - second_w * last[k, n - 2]
+                last, end = bs[depth, n - 1, k, n - 2], bs[depth, n - 1, k, n - 1]
+                det = first * end - second * last
+                if not abs(det) > singular * max(abs(first), abs(second)):
+                    return -np.inf, 0.0
+                change = first * ws[depth, n - 1, k, n - 1] - second * ws[depth, n - 1, k, n - 2]
+                change += first_w * end - second_w * last
                 change = sign * (g[depth] * det + d[depth] * change)
                 det *= d[depth]
-                if change < least * abs(det) or (det == 0.0 and change < 0.0):
-                    least, of_least = change / abs(det) if det != 0.0 else -np.inf, np.sign(det)
+                if change < least * abs(det):
+                    least, of_least = change / abs(det), np.sign(det)
                     chosen[:] = at
                     chosen[n - 1] = k
                     if least < stop:
@@ -79,24 +170,23 @@ def least_ratio(
             continue
         p = depth
         for i in range(depth + 1, n):
-            if abs(column[i]) > abs(column[p]):
+            if abs(bs[depth, depth, own, i]) > abs(bs[depth, depth, own, p]):
                 p = i
-        pivot = column[p]
+        pivot, pivot_w = bs[depth, depth, own, p], ws[depth, depth, own, p]
         if not abs(pivot) > singular:
             return -np.inf, 0.0
         turn = 1.0 if p == depth else -1.0
         d[depth + 1] = turn * d[depth] * pivot
-        g[depth + 1] = turn * (g[depth] * pivot + d[depth] * other[p])
+        g[depth + 1] = turn * (g[depth] * pivot + d[depth] * pivot_w)
         for j in range(depth + 1, n):
             for k in range(n_points):
-                source, source_w = bs[depth, j, k], ws[depth, j, k]
-                target, target_w = bs[depth + 1, j, k], ws[depth + 1, j, k]
-                factor = source[p] / pivot
-                factor_w = (source_w[p] - factor * other[p]) / pivot
+                factor = bs[depth, j, k, p] / pivot
+                factor_w = (ws[depth, j, k, p] - factor * pivot_w) / pivot
                 for i in range(depth + 1, n):
                     row = depth if i == p else i
-                    target[i] = source[row] - factor * column[row]
-                    target_w[i] = source_w[row] - factor * other[row] - factor_w * column[row]
+                    column, other = bs[depth, depth, own, row], ws[depth, depth, own, row]
+                    bs[depth + 1, j, k, i] = bs[depth, j, k, row] - factor * column
+                    ws[depth + 1, j, k, i] = ws[depth, j, k, row] - factor * other - factor_w * column
         depth += 1
         at[depth] = -1
     return least, of_least
@@ -125,92 +215,89 @@ def _step(y: Floats, new_y: Floats, f: Floats, new_f: Floats, least: float, limi
 
 @njit(cache=True, nogil=True)
 def _evaluate(
-    columns: Floats, transforms: Floats, root: Floats, sign: float, singular: float, y: Floats, f: Floats
+    columns: Floats,
+    transforms: Floats,
+    root: Floats,
+    sign: float,
+    singular: float,
+    inverse: Floats,
+    y: Floats,
+    f: Floats,
 ) -> bool:
-    """Y (n_residual, n_columns) and B⁻¹ S^½ (n, n) of columns (n, n_modes), each by the sign; whether B is regular."""
+    """B⁻¹ of columns (n, n_modes), and by the sign Y (n_residual, n_columns) and B⁻¹ S^½; whether B is regular."""
     n = columns.shape[0]
-    inverse = np.empty((n, n))
-    if not inverse_of(np.ascontiguousarray(columns[:, :n].T), inverse, singular):
+    if not inverse_of(columns[:, :n].T.copy(), inverse, singular):
         return False
-    f[:] = sign * (inverse @ root)
-    z = sign * (columns[:, n:].T @ inverse)
+    f[:] = sign * product(inverse, root)
+    z = sign * product(columns[:, n:].T, inverse)
     for r in range(y.shape[0]):
-        y[r] = z[r] @ transforms[r]
+        y[r] = product(z[r : r + 1], transforms[r])[0]
     return True
 
 
 @njit(cache=True, nogil=True)
 def is_excluded(
-    quadratics: tuple[Floats, Floats, Floats],
+    points: Floats,
     remainder: Floats,
     transforms: Floats,
     root: Floats,
     inverse_root: Floats,
     limit: float,
+    eta: float,
     least: float,
 ) -> bool:
     """Whether no placement in the cell that keeps the limit has a ‖Y‖ below the least.
 
     Args:
-        quadratics: a_0, a_1 and a_2, each (n, n_modes).
-        remainder: (n, n_modes) by how much the shapes differ from them at most.
+        points: (n, 4, n_modes) of Bernstein, of the cubics.
+        remainder: (n, n_modes) by how much the shapes differ from the cubics at most.
         transforms: T (n_residual, n, n_columns).
-        root, inverse_root, limit: S^½ and S^-½, (n, n), and L.
+        root, inverse_root, limit, eta: S^½ and S^-½ (n, n), L, and η < 1.
     """
-    mean, linear, square = quadratics
-    n, n_modes = mean.shape
+    n, n_points, n_modes = points.shape
     n_residual, _, n_columns = transforms.shape
-    size = np.abs(inverse_root.T)
-    eta = limit * np.sqrt(((remainder[:, :n] @ size) ** 2).sum())
-    if not eta < MOST_REMAINDER:
-        return False
-    singular = SINGULAR * np.abs(mean[:, :n]).max()
-    corners = np.empty((n, 4, n_modes))
-    for j in range(n):
-        corners[j, 0] = mean[j] - linear[j] + square[j]
-        corners[j, 1] = mean[j] + linear[j] + square[j]
-        corners[j, 2] = mean[j] - 0.5 * linear[j] - square[j]
-        corners[j, 3] = mean[j] + 0.5 * linear[j] - square[j]
-    centre = mean - square
-    b = np.ascontiguousarray(corners[:, :, :n])
-    w = np.empty((n, 4, n))
+    centre = 0.125 * (points[:, 0] + points[:, 1]) + 0.375 * (points[:, 2] + points[:, 3])
+    singular = SINGULAR * np.abs(centre[:, :n]).max()
     y, f = np.empty((n_residual, n_columns)), np.empty((n, n))
     new_y, new_f = np.empty((n_residual, n_columns)), np.empty((n, n))
+    inverse, ignored = np.empty((n, n)), np.empty((n, n))
+    if not _evaluate(centre, transforms, root, 1.0, singular, inverse, y, f):
+        return False
     chosen, choice = np.zeros(n, np.int64), np.empty((n, n_modes))
-    middle = np.ascontiguousarray(centre[:, :n])
-    inverse = np.empty((n, n))
-    if not inverse_of(middle.T.copy(), inverse, singular):
-        return False
-    _, sign = least_ratio(middle.reshape(n, 1, n), middle.reshape(n, 1, n), 1.0, -np.inf, singular, chosen)
-    if sign == 0.0 or not _evaluate(centre, transforms, root, 1.0, singular, y, f):
-        return False
+    b = np.ascontiguousarray(points[:, :, :n])
+    ends, every = b[:, :2].copy(), points.reshape(-1, n_modes)
+    middle = centre[:, :n].copy().reshape(n, 1, n)
+    _, sign = least_ratio(middle, middle, 1.0, -np.inf, singular, chosen)
     for _ in range(STEPS):
         size_y, size_f = np.sqrt((y**2).sum()), np.sqrt((f**2).sum())
         alpha, beta = max(size_y / least - 1.0, 0.0) / least, max(size_f / limit - 1.0, 0.0) / limit
         if alpha == 0.0 and beta == 0.0:
-            return False  # a mean of corners is where a better placement might be
+            return False  # a mean of choices is where a better placement might be
         weights = np.zeros((n_residual, n))
         if alpha > 0.0:
             for r in range(n_residual):
-                weights[r] = transforms[r] @ (alpha / size_y * y[r])
-        constant = (beta / size_f * f) @ root.T
-        for j in range(n):
-            w[j] = corners[j, :, n:] @ weights + constant[j]
-        multiplier = inverse.T @ (centre[:, n:] @ weights + constant)
-        rest = remainder[:, n:] @ np.abs(weights) + remainder[:, :n] @ np.abs(multiplier)
-        needed = alpha * least + beta * limit + limit * np.sqrt(((rest @ size) ** 2).sum())
-        slope = (linear[:, n:] @ weights - linear[:, :n] @ multiplier) @ inverse_root.T
-        bend = 2.0 * (square[:, n:] @ weights - square[:, :n] @ multiplier) @ inverse_root.T
-        change = np.sqrt(((np.sqrt((slope**2).sum(axis=1)) + np.sqrt((bend**2).sum(axis=1))) ** 2).sum())
-        needed += limit * eta / (1.0 - eta) * change
-        ratio, of_choice = least_ratio(b[:, :2].copy(), w[:, :2].copy(), sign, -np.inf, singular, chosen)
-        if ratio >= needed:
+                weights[r] = alpha / size_y * product(y[r : r + 1], transforms[r].T)[0]
+        constant = beta / size_f * product(f, root.T)
+        w = product(every[:, n:], weights).reshape(n, n_points, n) + constant.reshape(n, 1, n)
+        needed = (1.0 + ROUND_OFF) * (alpha * least + beta * limit)
+        ratio, of_choice = least_ratio(ends, w[:, :2].copy(), sign, -np.inf, singular, chosen)
+        if ratio >= needed:  # at the ends of the intervals alone, which takes little time
+            multiplier = product(inverse.T, product(centre[:, n:], weights) + constant)
+            left = product(w.reshape(-1, n) - product(every[:, :n], multiplier), inverse_root.T)
+            change = 0.0
+            for j in range(n):
+                change += (left[n_points * j : n_points * (j + 1)] ** 2).sum(axis=1).max()
+            rest = product(remainder[:, n:], np.abs(weights)) + product(remainder[:, :n], np.abs(multiplier))
+            rest = product(rest, np.abs(inverse_root.T))
+            needed += limit * (np.sqrt((rest**2).sum()) + eta / (1.0 - eta) * np.sqrt(change))
             ratio, of_choice = least_ratio(b, w, sign, needed, singular, chosen)
             if ratio >= needed:
                 return True
         for j in range(n):
-            choice[j] = corners[j, chosen[j]]
-        if np.isinf(ratio) or not _evaluate(choice, transforms, root, sign * of_choice, singular, new_y, new_f):
+            choice[j] = points[j, chosen[j]]
+        if np.isinf(ratio) or not _evaluate(
+            choice, transforms, root, sign * of_choice, singular, ignored, new_y, new_f
+        ):
             return False
         t = _step(y, new_y, f, new_f, least, limit)
         y, f = (1.0 - t) * y + t * new_y, (1.0 - t) * f + t * new_f
