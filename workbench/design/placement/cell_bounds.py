@@ -138,6 +138,8 @@ class CellBounds:
         lower, work = np.empty(len(cells)), np.empty(len(cells))
         axis = np.empty(len(cells), np.int64)
         _bounds(cells, *self._arguments, lower, work, axis)
+        for j in reversed(range(cells.shape[1] - 1)):  # halving an interval of two actuators parts them
+            axis[cells[:, j] == cells[:, j + 1]] = j
         if self._hull is not None and self.wanted > 0:
             self._hull.raise_to(self.wanted, cells, lower)
         return lower, work, axis
