@@ -30,6 +30,7 @@ LEVELS = 12  # halvings of the length of the structure: its 1/8192 to each side
 INSTANTS = 48  # of the modal forces, for their peak
 SINGULAR = 1e-13  # pivot of B over its largest entry
 SWEEPS = 3  # of the descent to the least ‖Y‖ to first order
+OF_JUMP = 26.0  # h J / 192: by how much a cubic fails at most to follow a jump J of the slope
 FLAT = 1e-12  # a limited square form whose least eigenvalue over the largest is below has no inverse
 
 
@@ -41,7 +42,8 @@ class Intervals:
         centre, half: (n_intervals,) m.
         value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
         most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and rate of change of φ'' on the interval.
-        most_fourth: (n_intervals, n_modes) largest fourth derivative; None where the nodes are no intervals.
+        most_fourth: (n_intervals, n_modes) largest fourth derivative, enough for a cubic's error also where a lower one
+            jumps; None where the nodes are no intervals.
     """
 
     centre: np.ndarray
@@ -63,15 +65,19 @@ class Intervals:
         value, slope, bend = (task.shapes(grid, derivative) for derivative in (0, 1, 2))
         third = np.diff(bend, axis=0) / step
         fourth = np.diff(third, axis=0, prepend=third[:1], append=third[-1:]) / step
-        fourth = np.maximum(np.abs(fourth[:-1]), np.abs(fourth[1:])) + np.abs(np.diff(fourth, axis=0))
+        fourth = np.maximum(np.abs(fourth[:-1]), np.abs(fourth[1:])) + 3.0 * np.abs(np.diff(fourth, axis=0))
         rate = np.abs(third)
         varied = np.abs(np.diff(rate, axis=0, prepend=rate[:1], append=rate[-1:]))
         rate = rate + np.maximum(varied[:-1], varied[1:])
-        steep = np.maximum(np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])), np.abs(np.diff(slope, axis=0)) / step)
-        steep = steep + 0.5 * step * rate
-        levels = [tuple(np.maximum(part[::2], part[1::2]) for part in (steep, rate, fourth))]
-        for _ in range(LEVELS):
-            levels.append(tuple(np.maximum(part[::2], part[1::2]) for part in levels[-1]))
+        steep = np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])) + 0.5 * step * rate
+        # jumps of the slope, at a step of a bar's stiffness say: what of its change the bends do not show
+        jump = np.abs(np.diff(slope, axis=0) - 0.5 * step * (bend[:-1] + bend[1:]))
+        h, levels = step, []
+        for _ in range(LEVELS + 1):
+            steep, rate, fourth = (np.maximum(part[::2], part[1::2]) for part in (steep, rate, fourth))
+            jump = jump[::2] + jump[1::2]
+            levels.append((steep + 2.0 * jump / h, rate + 2.0 * jump / h**2, fourth + OF_JUMP * jump / h**3))
+            h *= 2.0
         at = np.concatenate([(2 * np.arange(2**k) + 1) * 2 ** (LEVELS - k) for k in range(LEVELS + 1)])
         half = np.concatenate([np.full(2**k, 0.5 * (last - first) / 2**k) for k in range(LEVELS + 1)])
         most = (np.concatenate([level[i] for level in reversed(levels)]) for i in range(3))
