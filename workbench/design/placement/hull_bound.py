@@ -133,13 +133,14 @@ def least_ratio(
         b, w: (n, n_points, n) columns of B and of W.
         sign: of D at the centre.
         stop: the first ratio below ends the search.
-        singular: pivots of this size or less end it too, with -inf.
+        singular: a first pivot of this size or less ends it too, with -inf; later ones likewise, by as much more as the
+            round-off has grown.
         chosen: (n,) set to the choice.
     """
     n, n_points, _ = b.shape
     bs, ws = np.empty((n, n, n_points, n)), np.empty((n, n, n_points, n))
     bs[0], ws[0] = b, w
-    d, g = np.ones(n), np.zeros(n)
+    d, g, least_pivot = np.ones(n), np.zeros(n), np.full(n, singular)
     at = np.full(n, -1)
     least, of_least = np.inf, 1.0
     depth = 0
@@ -152,10 +153,13 @@ def least_ratio(
         if depth == n - 2:  # the last two columns at once: most of the choices differ in these alone
             first, second = bs[depth, depth, own, n - 2], bs[depth, depth, own, n - 1]
             first_w, second_w = ws[depth, depth, own, n - 2], ws[depth, depth, own, n - 1]
+            pivot = max(abs(first), abs(second))
+            if not pivot > least_pivot[depth]:
+                return -np.inf, 0.0
             for k in range(n_points):
                 last, end = bs[depth, n - 1, k, n - 2], bs[depth, n - 1, k, n - 1]
                 det = first * end - second * last
-                if not abs(det) > singular * max(abs(first), abs(second)):
+                if not abs(det) > least_pivot[depth] * (pivot + max(abs(last), abs(end))):
                     return -np.inf, 0.0
                 change = first * ws[depth, n - 1, k, n - 1] - second * ws[depth, n - 1, k, n - 2]
                 change += first_w * end - second_w * last
@@ -173,20 +177,23 @@ def least_ratio(
             if abs(bs[depth, depth, own, i]) > abs(bs[depth, depth, own, p]):
                 p = i
         pivot, pivot_w = bs[depth, depth, own, p], ws[depth, depth, own, p]
-        if not abs(pivot) > singular:
+        if not abs(pivot) > least_pivot[depth]:
             return -np.inf, 0.0
         turn = 1.0 if p == depth else -1.0
         d[depth + 1] = turn * d[depth] * pivot
         g[depth + 1] = turn * (g[depth] * pivot + d[depth] * pivot_w)
+        most = 0.0
         for j in range(depth + 1, n):
             for k in range(n_points):
                 factor = bs[depth, j, k, p] / pivot
+                most = max(most, abs(factor))
                 factor_w = (ws[depth, j, k, p] - factor * pivot_w) / pivot
                 for i in range(depth + 1, n):
                     row = depth if i == p else i
                     column, other = bs[depth, depth, own, row], ws[depth, depth, own, row]
                     bs[depth + 1, j, k, i] = bs[depth, j, k, row] - factor * column
                     ws[depth + 1, j, k, i] = ws[depth, j, k, row] - factor * other - factor_w * column
+        least_pivot[depth + 1] = (1.0 + most) * least_pivot[depth]  # as the round-off does
         depth += 1
         at[depth] = -1
     return least, of_least
