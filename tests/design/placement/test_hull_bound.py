@@ -13,13 +13,15 @@ from workbench.design.placement.hull_bound import ROUND_OFF, SINGULAR, HullBound
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.placement import placement_task
 from workbench.design.placement.task import batch_costs
-from workbench.structure.member import Beam
+from workbench.rig.actuators import piezo_patch
+from workbench.structure.member import Bar, Beam
 from workbench.structure.profile import Profile
+from workbench.structure.supports import PointMass
 
 
-def beam_modes(ends, n_modes, rigidity=1.0):
+def beam_modes(ends, n_modes):
     left, right = ends.split()
-    return Beam(length=10.0, mass_per_length=1.0, bending_stiffness=rigidity, left=left, right=right).modes(n_modes)
+    return Beam(length=10.0, mass_per_length=1.0, bending_stiffness=1.0, left=left, right=right).modes(n_modes)
 
 
 def evenly(modes, n, factor):
@@ -82,27 +84,61 @@ def test_ratios_of_all_choices_are_those_of_the_inverse(n, apart):
     assert finite > 0 or apart < 1e-3
 
 
-@pytest.mark.parametrize("profile", ["uniform", "stepped"])
-def test_shapes_stay_by_the_cubics(profile, hinged_modes):
-    """Also about a step of the stiffness, where φ'' jumps."""
-    step = Profile(lambda x: np.where(x < 3.7, 1.0, 2.0), breaks=(3.7,))
-    modes = hinged_modes(9) if profile == "uniform" else beam_modes("clamped free", 9, step)
-    task = placement_task(modes, 4, impulse_at=6.3, weight=20.0)
+def test_ratios_are_exact_enough_where_several_pivots_are_small(hinged_modes):
+    """Six actuators of which some all but meet: pivots shrink one after the other, and round-off grows with each."""
+    n, rng, finite = 6, np.random.default_rng(0), 0
+    task, effort = evenly(hinged_modes(10), n, 10.0)
+    points = CellBounds(task, Limits(effort=effort))._hull._arguments[0]
+    for cell in cells_that_meet(rng, n, [6, 9], 150):
+        at = points[cell, rng.integers(0, 4, n)]
+        b, w = at[:, :n].copy(), at[:, n:] @ rng.normal(size=(task.modes.n_modes - n, n))
+        least, sign = least_ratio(
+            b[:, None], w[:, None], 1.0, -np.inf, SINGULAR * np.abs(b).max(), np.zeros(n, np.int64)
+        )
+        if np.isfinite(least):
+            finite += 1
+            exact, exact_sign = exact_ratio(b, w)
+            assert sign == exact_sign and least == pytest.approx(sign * exact, rel=ROUND_OFF)
+    assert finite > 30
+
+
+def member_modes(name, n_modes):
+    """Of a beam or a bar of 10 m, named by its ends, with a step of stiffness or a mass of 2 kg if the name says so."""
+    kind, left, right, *more = name.split()
+    step = Profile(lambda x: np.where(x < 4.1, 1.0, 2.0), breaks=(4.1,)) if "step" in more else 1.0
+    mass = (PointMass(at=4.1, mass=2.0),) if "mass" in more else ()
+    make = Beam if kind == "beam" else Bar
+    stiffness = {"bending_stiffness" if kind == "beam" else "axial_stiffness": step}
+    return make(length=10.0, mass_per_length=1.0, left=left, right=right, attachments=mass, **stiffness).modes(n_modes)
+
+
+@pytest.mark.parametrize("patched", [False, True])
+@pytest.mark.parametrize("member", ["beam hinged hinged", "beam clamped free step", "bar fixed free step mass"])
+def test_shapes_stay_by_the_parabolas_and_the_cubics(member, patched):
+    """Also where the slope jumps or φ'' does, as that of a bar about a mass, or of what a patch across a step takes."""
+    if patched and member.startswith("bar"):
+        pytest.skip("a bar takes no moment")
+    actuator = piezo_patch("P", 5.0, length=1.0) if patched else None
+    task = placement_task(member_modes(member, 9), 4, impulse_at=6.3, weight=20.0, actuator=actuator)
     table, rng = Intervals.of(task), np.random.default_rng(5)
     identity = np.eye(4)[None]
     hull = HullBound(task, (table.centre, table.half, table.most_fourth), identity, identity, np.ones(1), np.inf)
     points, remainder = hull._arguments[:2]
+    breaks = (3.6, 4.6) if patched else (4.1,)
+    near = [np.flatnonzero(np.abs(table.centre - x) < 2.0 * table.half) for x in breaks]
+    nodes = np.concatenate([rng.choice(len(table.half), 200), *near])
     s = np.linspace(-1.0, 1.0, 41)[:, None, None]
     u, v = 0.5 * (1.0 - s), 0.5 * (1.0 + s)
-    near = np.flatnonzero(np.abs(table.centre - 3.7) < 2.0 * table.half)
-    nodes = np.concatenate([rng.choice(len(table.half), 200), near])
-    at = points[nodes]
+    at, h = points[nodes], table.half[nodes, None]
     cubic = u**3 * at[:, 0] + v**3 * at[:, 1] + 3 * u**2 * v * at[:, 2] + 3 * u * v**2 * at[:, 3]
-    shapes = task.shapes(table.centre[nodes] + s[:, :, 0] * table.half[nodes])
+    shapes = task.shapes(table.centre[nodes] + s[:, :, 0] * h[:, 0])
     beyond = np.abs(shapes - cubic).max(axis=0)
     assert (beyond <= remainder[nodes] + 1e-12).all()
-    if profile == "uniform":
-        wide = table.half[nodes] > 0.05
+    bent = np.minimum(np.abs(table.bend[nodes]) + h * table.most_rate[nodes], table.most_bend[nodes])
+    linear = table.value[nodes] + s * h * table.slope[nodes]
+    assert (np.abs(shapes - linear).max(axis=0) <= 0.5 * h**2 * bent + 1e-12).all()
+    if member == "beam hinged hinged":
+        wide = h[:, 0] > 0.05
         assert (beyond[wide] > 0.3 * remainder[nodes][wide]).mean() > 0.3
 
 
@@ -131,6 +167,56 @@ def test_no_placement_in_an_excluded_cell_is_better(limited, meeting, hinged_mod
         assert (least[proven] >= wanted * (1 - 1e-9)).all()
         excluded += (proven & (known < wanted)).sum()
     assert excluded > 20
+
+
+def random_task(rng):
+    """A task of two to four actuators, or patches, on a beam or a bar, and a limit that even places keep, or nearly."""
+    beams = [f"beam {ends}" for ends in ("hinged hinged", "clamped free", "clamped clamped", "hinged free")]
+    member = rng.choice([*beams, "bar fixed free step mass"])
+    n = int(rng.integers(2, 5))
+    patch = piezo_patch("P", 5.0, length=0.5) if member == "beam clamped free" and rng.random() < 0.3 else None
+    modes = member_modes(member, int(rng.integers(n + 1, 9)))
+    task = placement_task(
+        modes, n, impulse_at=rng.uniform(1.0, 9.0), weight=10.0 ** rng.uniform(-1.0, 2.0), actuator=patch
+    )
+    even = task.placed(np.linspace(*task.reach, n + 2)[1:-1], "")
+    limited = str(rng.choice(["effort", "peak_force", "condition"]))
+    limited = "condition" if member == "beam hinged free" else limited  # nothing else limits a rigid mode
+    return task, Limits(**{limited: 10.0 ** rng.uniform(-0.2, 2.0) * getattr(even, limited)}), limited
+
+
+def least_work(task, limits, limited, low, high, rng):
+    """Least √W_R met in a cell from low to high (n_actuators,), m, within the limits; inf where none keeps them."""
+    best, centre, reach = np.inf, 0.5 * (low + high), 0.5 * (high - low)
+    for shrink in 0.4 ** np.arange(8):
+        at = np.clip(centre + shrink * reach * rng.uniform(-1.2, 1.2, (150, len(low))), low, high)
+        costs = batch_costs(task, task.shapes(at))
+        work = np.where(getattr(costs, limited) <= getattr(limits, limited), costs.work, np.inf)
+        if work.min() < best:
+            best, centre = work.min(), at[np.argmin(work)]
+    return np.sqrt(best)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_bound_is_above_what_is_met_in_its_cell(seed):
+    """Of random tasks and cells, wanted a little above the least that a search in the cell meets: all ask too much."""
+    rng = np.random.default_rng(seed)
+    task, limits, limited = random_task(rng)
+    n, bounds = task.n_controlled, CellBounds(task, limits)
+    table, levels = bounds.intervals, np.arange(3, 9)
+    cells = [cells_of(rng, n, levels, 40, apart=0.0), cells_that_meet(rng, n, levels, 40)]
+    raised = 0
+    for cell in np.concatenate(cells):
+        low, high = table.centre[cell] - table.half[cell], table.centre[cell] + table.half[cell]
+        least = least_work(task, limits, limited, low, high, rng)
+        known = bounds(cell[None])[0][0]
+        for share in (1.0 + 1e-6, 0.7):
+            bounds.wanted = share * least if np.isfinite(least) else 1.0
+            lower = bounds(cell[None])[0][0]
+            assert lower <= least * (1.0 + 1e-9)
+            raised += lower > known
+        bounds.wanted = 0.0
+    assert raised > 0
 
 
 @pytest.mark.parametrize(
