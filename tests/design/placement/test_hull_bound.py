@@ -112,12 +112,18 @@ def member_modes(name, n_modes):
     return make(length=10.0, mass_per_length=1.0, left=left, right=right, attachments=mass, **stiffness).modes(n_modes)
 
 
-@pytest.mark.parametrize("patched", [False, True])
-@pytest.mark.parametrize("member", ["beam hinged hinged", "beam clamped free step", "bar fixed free step mass"])
+@pytest.mark.parametrize(
+    ("member", "patched"),
+    [
+        ("beam hinged hinged", False),
+        ("beam hinged hinged", True),
+        ("beam clamped free step", False),
+        ("beam clamped free step", True),
+        ("bar fixed free step mass", False),
+    ],
+)
 def test_shapes_stay_by_the_parabolas_and_the_cubics(member, patched):
     """Also where the slope jumps or φ'' does, as that of a bar about a mass, or of what a patch across a step takes."""
-    if patched and member.startswith("bar"):
-        pytest.skip("a bar takes no moment")
     actuator = piezo_patch("P", 5.0, length=1.0) if patched else None
     task = placement_task(member_modes(member, 9), 4, impulse_at=6.3, weight=20.0, actuator=actuator)
     table, rng = Intervals.of(task), np.random.default_rng(5)
@@ -137,7 +143,7 @@ def test_shapes_stay_by_the_parabolas_and_the_cubics(member, patched):
     bent = np.minimum(np.abs(table.bend[nodes]) + h * table.most_rate[nodes], table.most_bend[nodes])
     linear = table.value[nodes] + s * h * table.slope[nodes]
     assert (np.abs(shapes - linear).max(axis=0) <= 0.5 * h**2 * bent + 1e-12).all()
-    if member == "beam hinged hinged":
+    if member == "beam hinged hinged" and not patched:
         wide = h[:, 0] > 0.05
         assert (beyond[wide] > 0.3 * remainder[nodes][wide]).mean() > 0.3
 
