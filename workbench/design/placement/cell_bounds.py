@@ -11,6 +11,7 @@ where d_rj is zero at c_j: an error of the forces F costs only to second order. 
 minimised over the cell under each limit linearised alike (a linear programme of one constraint, solved by its dual).
 
 Where B may be singular, or nearly so, duality bounds ‖Y‖ under each limit (`dual_bound.py`); the larger bound counts.
+A cell that neither bounds as wanted may still be excluded by determinants (`hull_bound.py`).
 """
 
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from numba import njit
 
 from workbench.arrays import Flags, Floats, Integers
 from workbench.design.placement.dual_bound import dual_bound, inverse_of
+from workbench.design.placement.hull_bound import HullBound
 from workbench.design.placement.limits import Limits
 from workbench.design.placement.task import PlacementTask
 from workbench.structure.modes import frozen
@@ -28,6 +30,7 @@ LEVELS = 12  # halvings of the length of the structure: its 1/8192 to each side
 INSTANTS = 48  # of the modal forces, for their peak
 SINGULAR = 1e-13  # pivot of B over its largest entry
 SWEEPS = 3  # of the descent to the least ‖Y‖ to first order
+OF_JUMP = 26.0  # h J / 192: by how much a cubic fails at most to follow a jump J of the slope
 FLAT = 1e-12  # a limited square form whose least eigenvalue over the largest is below has no inverse
 
 
@@ -39,6 +42,8 @@ class Intervals:
         centre, half: (n_intervals,) m.
         value, slope, bend: (n_intervals, n_modes) φ, φ' and φ'' at the centre.
         most_bend, most_rate: (n_intervals, n_modes) largest |φ''| and rate of change of φ'' on the interval.
+        most_fourth: (n_intervals, n_modes) largest fourth derivative, enough for a cubic's error also where a lower one
+            jumps; None where the nodes are no intervals.
     """
 
     centre: np.ndarray
@@ -48,6 +53,7 @@ class Intervals:
     bend: np.ndarray
     most_bend: np.ndarray
     most_rate: np.ndarray
+    most_fourth: np.ndarray | None = None
 
     @classmethod
     def of(cls, task: PlacementTask) -> "Intervals":
@@ -57,19 +63,25 @@ class Intervals:
         grid = np.linspace(first, last, 2 * leaves + 1)
         step = grid[1] - grid[0]
         value, slope, bend = (task.shapes(grid, derivative) for derivative in (0, 1, 2))
-        rate = np.abs(np.diff(bend, axis=0)) / step
+        third = np.diff(bend, axis=0) / step
+        fourth = np.diff(third, axis=0, prepend=third[:1], append=third[-1:]) / step
+        fourth = np.maximum(np.abs(fourth[:-1]), np.abs(fourth[1:])) + 3.0 * np.abs(np.diff(fourth, axis=0))
+        rate = np.abs(third)
         varied = np.abs(np.diff(rate, axis=0, prepend=rate[:1], append=rate[-1:]))
         rate = rate + np.maximum(varied[:-1], varied[1:])
-        steep = np.maximum(np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])), np.abs(np.diff(slope, axis=0)) / step)
-        steep = steep + 0.5 * step * rate
-        most_bend, most_rate = (np.maximum(part[::2], part[1::2]) for part in (steep, rate))
-        levels = [(most_bend, most_rate)]
-        for _ in range(LEVELS):
-            levels.append(tuple(np.maximum(part[::2], part[1::2]) for part in levels[-1]))
+        steep = np.maximum(np.abs(bend[:-1]), np.abs(bend[1:])) + 0.5 * step * rate
+        # jumps of the slope, at a step of a bar's stiffness say: what of its change the bends do not show
+        jump = np.abs(np.diff(slope, axis=0) - 0.5 * step * (bend[:-1] + bend[1:]))
+        h, levels = step, []
+        for _ in range(LEVELS + 1):
+            steep, rate, fourth = (np.maximum(part[::2], part[1::2]) for part in (steep, rate, fourth))
+            jump = jump[::2] + jump[1::2]
+            levels.append((steep + 2.0 * jump / h, rate + 2.0 * jump / h**2, fourth + OF_JUMP * jump / h**3))
+            h *= 2.0
         at = np.concatenate([(2 * np.arange(2**k) + 1) * 2 ** (LEVELS - k) for k in range(LEVELS + 1)])
         half = np.concatenate([np.full(2**k, 0.5 * (last - first) / 2**k) for k in range(LEVELS + 1)])
-        most_bend, most_rate = (np.concatenate([level[i] for level in reversed(levels)]) for i in (0, 1))
-        return cls(*(frozen(part) for part in (grid[at], half, value[at], slope[at], bend[at], most_bend, most_rate)))
+        most = (np.concatenate([level[i] for level in reversed(levels)]) for i in range(3))
+        return cls(*(frozen(part) for part in (grid[at], half, value[at], slope[at], bend[at], *most)))
 
 
 class CellBounds:
@@ -77,11 +89,14 @@ class CellBounds:
 
     Attributes:
         intervals: the halved length.
+        wanted: √W_R that cells are to be proven not to go below; 0 where they need not.
     """
 
-    def __init__(self, task: PlacementTask, limits: Limits, intervals: Intervals | None = None) -> None:
-        n = task.n_controlled
-        self.intervals = Intervals.of(task) if intervals is None else intervals
+    def __init__(
+        self, task: PlacementTask, limits: Limits, intervals: Intervals | None = None, wanted: float = 0.0
+    ) -> None:
+        n, self.wanted = task.n_controlled, wanted
+        self.intervals = table = Intervals.of(task) if intervals is None else intervals
         forces = task.forces[:, :: max(1, task.forces.shape[1] // INSTANTS)]
         # what is limited, as tr(B⁻¹ S B⁻ᵀ) <= L²: the effort; n times the square of the peak, above any mean of the
         # forces' squares; and the condition, L = limit / ‖B‖
@@ -100,7 +115,6 @@ class CellBounds:
             roots[i] = vectors * np.sqrt(values)
             if values[0] > FLAT * values[-1]:
                 inverses[i] = (vectors / np.sqrt(values)).T
-        table = self.intervals
         self._arguments = (
             table.half,
             table.value,
@@ -118,12 +132,22 @@ class CellBounds:
             np.array(forces if np.isfinite(limits.peak_force) else forces[:, :0], order="C"),
             float(limits.peak_force),
         )
+        self._hull: HullBound | None = None
+        if n > 1 and table.most_fourth is not None:
+            kept = inverses.any(axis=(1, 2))
+            bounded = np.array([limit for _, limit in squares])[kept]
+            measures = (table.centre, table.half, table.most_fourth)
+            self._hull = HullBound(task, measures, roots[kept], inverses[kept], bounded, limits.condition)
 
     def __call__(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Lower bounds of √W_R (inf where the limits leave no place), √W_R at the centres, and the axis to halve."""
         lower, work = np.empty(len(cells)), np.empty(len(cells))
         axis = np.empty(len(cells), np.int64)
         _bounds(cells, *self._arguments, lower, work, axis)
+        for j in reversed(range(cells.shape[1] - 1)):  # halving an interval of two actuators parts them
+            axis[cells[:, j] == cells[:, j + 1]] = j
+        if self._hull is not None and self.wanted > 0:
+            self._hull.raise_to(self.wanted, cells, lower)
         return lower, work, axis
 
 

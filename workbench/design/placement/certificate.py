@@ -134,7 +134,7 @@ class _Search:
         self._task, self._limits, self._best = task, limits, best
         self._wanted = np.sqrt(best.residual_work * (1.0 - gap))
         self._tree = CellTree.of(task, limits)
-        self._bounds = CellBounds(task, limits, self._tree.table)
+        self._bounds = CellBounds(task, limits, self._tree.table, self._wanted)
         self._shelves: list[list[np.ndarray]] = [[] for _ in range(SHELVES)]
         self._stuck = np.inf  # least bound of a cell that is as small as the table has them
         self._stuck_cell: np.ndarray | None = None

@@ -56,6 +56,17 @@ def inverse_of(matrix: Floats, inverse: Floats, least: float) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def product(a: Floats, b: Floats) -> Floats:
+    """Of two small matrices: a call of BLAS takes longer than their products."""
+    found = np.zeros((a.shape[0], b.shape[1]))
+    for i in range(a.shape[0]):
+        for k in range(a.shape[1]):
+            for j in range(b.shape[1]):
+                found[i, j] += a[i, k] * b[k, j]
+    return found
+
+
+@njit(cache=True, nogil=True)
 def _of_each(matrices: Floats, vectors: Floats) -> Floats:
     """Each matrix (n_residual, n, m) by its vector (n_residual, m), (n_residual, n)."""
     found = np.zeros(matrices.shape[:2])
