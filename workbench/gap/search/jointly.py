@@ -138,7 +138,9 @@ def fit_jointly(
     if to_the_end:
         return measured(search, replace(found, effects=(*effects, errors)), whole.substeps)
     moving = measured(search, replace(found, effects=(*effects, _closed(errors))), whole.substeps)
-    resting = found if known is not None else _at_rest(search, found, whole)
+    # of what is far from noise the sizes say little
+    near = moving.excess(moving.noise_power) < JOINT.near * float(moving.noise_power.mean())
+    resting = _at_rest(search, found, whole) if known is None and near else found
     if resting is found:
         return moving
     *effects, errors = resting.effects
