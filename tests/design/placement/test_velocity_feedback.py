@@ -10,6 +10,7 @@ from workbench.rig.actuators import piezo_patch
 from workbench.structure.damping import ModalDamping
 from workbench.structure.member import Beam
 from workbench.structure.modes import modal_state_matrix
+from workbench.structure.profile import Profile
 
 # V. K. Singla, project report of MAE 538, NC State University (2017): acrylic beam, PVDF patches 0.1 m long, ζ = 0.01
 WIDTH, THICKNESS, FILM = 0.01, 1.6e-3, 4e-5
@@ -73,6 +74,32 @@ def test_bounds_hold_on_every_cell():
         inside = centres[:, None] + moves
         assert (task.index(inside) >= lower[:, None] * (1 - 1e-9)).all()
     assert informative > 100
+
+
+def test_a_step_of_stiffness_bends_the_participation_no_more_than_bounds_allow():
+    beam = Beam(
+        length=0.5,
+        mass_per_length=0.02,
+        bending_stiffness=Profile(lambda x: np.where(x < 0.25, 0.01, 0.05), breaks=(0.25,)),
+        left="hinged",
+        right="hinged",
+        damping=ModalDamping(0.01),
+    )
+    patch = piezo_patch("patch", 0.25, length=0.1, gain=0.05)
+    task = FeedbackTask(beam.modes(4), patch, np.array([[0.4]]), report(1).state, 0.1)
+
+    def participation(x, derivative=0):
+        return 0.05 * (task.modes.phi(x + 0.05, 1 + derivative) - task.modes.phi(x - 0.05, 1 + derivative))
+
+    rng = np.random.default_rng(3)
+    for half in (4e-3, 5e-4, 2e-5):
+        # the middles at which an end of the patch meets the step, and some where none does
+        for centre in (0.2 - 0.4 * half, 0.2, 0.3 + 0.7 * half, *rng.uniform(0.06, 0.44, 4)):
+            off = np.linspace(-half, half, 101)
+            tangent = participation(np.array([centre])) + off[:, None] * participation(np.array([centre]), 1)
+            left = np.abs(participation(centre + off) - tangent).max(axis=0)
+            bound = task.curved(np.array([centre]), np.array([half]))[0]
+            assert (left <= bound * (1 + 1e-6) + 1e-12).all()
 
 
 def test_what_cannot_be_placed_is_refused():

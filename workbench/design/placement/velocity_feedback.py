@@ -9,6 +9,7 @@ A(x)ᵀ S + S A(x) + Q is of second order in δ but for η Q; where it is not ne
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations_with_replacement
 
 import numpy as np
@@ -72,6 +73,27 @@ class FeedbackTask:
         """Where the middle of a pair can stand, (from, to) m."""
         half = 0.5 * extent(self.actuator)
         return half, self.modes.length - half
+
+    @cached_property
+    def _course(self) -> tuple[Floats, Floats, Floats]:
+        """Places (n,); of a pair's participation the largest second derivative (n_modes,), and what the jumps of its
+        slope sum to up to each place, (n, n_modes)."""
+        grid = np.linspace(*self.reach, GRID)
+        slope, bend = (participation_along(self.modes, self.actuator, grid, order) for order in (1, 2))
+        varied, half_step = np.abs(np.diff(bend, axis=0)), 0.5 * (grid[1] - grid[0])
+        jumps = np.abs(np.diff(slope, axis=0) - half_step * (bend[:-1] + bend[1:])) + half_step * varied
+        kinks = np.concatenate([np.zeros((1, self.modes.n_modes)), np.cumsum(jumps, axis=0)])
+        return grid, np.abs(bend).max(axis=0) + varied.max(axis=0), kinks
+
+    def curved(self, centres: Floats, halves: Floats) -> Floats:
+        """What the participation differs by at most from its tangent at the centre, (..., n_modes), within (...,) m.
+
+        Where the stiffness has a step, the slope of a patch's participation jumps.
+        """
+        grid, bend, kinks = self._course
+        first, last = grid.searchsorted(centres - halves, "right"), grid.searchsorted(centres + halves)
+        jumps = kinks[np.minimum(last, grid.size - 1)] - kinks[np.maximum(first - 1, 0)]
+        return halves[..., None] * (0.5 * halves[..., None] * bend + jumps)
 
     def index(self, positions: ArrayLike) -> np.ndarray:
         """E (...) of pairs at the places (..., n_pairs), m; inf where the loop is unstable."""
@@ -193,7 +215,7 @@ class _Expansion:
     """E and its derivatives at centres (n_cells, n_pairs), by Lyapunov equations of all of them together."""
 
     def __init__(self, task: FeedbackTask, centres: np.ndarray) -> None:
-        self._task = task
+        self._task, self._centres = task, centres
         modes, h = task.modes, task.gain
         n = modes.n_modes
         b, slope = (self._participation(centres, derivative) for derivative in (0, 1))
@@ -236,7 +258,7 @@ class _Expansion:
         right = right + right.swapaxes(2, 3)
         derivatives = self._solved(right)
         gradient = np.einsum("i,pjik,k->pj", self._start, derivatives, self._start)
-        curved = 0.5 * halves[:, :, None] ** 2 * _curvature(task)
+        curved = task.curved(self._centres, halves)
         moved = np.abs(slope) * halves[:, :, None] + curved
         size, strength = np.abs(b), np.abs(gain)
 
@@ -260,10 +282,3 @@ class _Expansion:
         lower = np.where(self.stable & np.isfinite(lower), np.maximum(lower, 0.0), 0.0)
         loose = self.index[:, None] * (by_axis + moved.max(axis=2) / np.maximum(size.max(axis=(1, 2)), 1e-300)[:, None])
         return lower, np.abs(gradient) * halves + np.maximum(loose, 1e-12 * halves)
-
-
-def _curvature(task: FeedbackTask) -> Floats:
-    """Largest second derivative of a pair's participation in each mode anywhere, (n_modes,)."""
-    grid = np.linspace(*task.reach, GRID)
-    bend = participation_along(task.modes, task.actuator, grid, 2)
-    return np.asarray(np.abs(bend).max(axis=0) + np.abs(np.diff(bend, axis=0)).max(axis=0))
