@@ -1,8 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from workbench.identification.free_decay.order import identify
-from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
+from workbench.identification.free_decay.refinement import cramer_rao_bound, in_coloured_noise, refine
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ProportionalDamping
@@ -90,3 +92,34 @@ def test_crowded_modes_at_two_sensors_are_two():
     found, limit = identify(record).modes, cramer_rao_bound(truth, record, noise_std=0.002)
     assert found.n_modes == 3
     assert (np.abs(found.omega - truth.omega) < 4 * limit.omega_std).all()
+
+
+def shaken(n_samples, seed, share=0.9):
+    """Four modes at four sensors in noise of which most is common to all; the second mode moves all alike."""
+    rng = np.random.default_rng(seed)
+    shapes = rng.standard_normal((4, 4))
+    shapes[:, 1] = 1.0 + 0.1 * rng.standard_normal(4)
+    omega = 2 * np.pi * np.array([11.7, 38.2, 92.9, 181.4])
+    modes = SampledModes(omega, [0.006, 0.004, 0.005, 0.003], shapes, np.linspace(0, 1, 4))
+    quiet = free_decay(modes, sample_time=1e-3, n_samples=n_samples)
+    common, own = rng.standard_normal(n_samples), rng.standard_normal((4, n_samples))
+    noise = 3e-3 * np.abs(quiet.outputs).max() * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own)
+    return modes, replace(quiet, outputs=quiet.outputs + noise)
+
+
+@pytest.mark.parametrize(("n_samples", "seed"), [(4096, 2), (4096, 5), (40_000, 2), (40_000, 4)])
+def test_noise_that_sensors_share_is_no_mode(n_samples, seed):
+    modes, record = shaken(n_samples, seed)
+    found = identify(record)
+    np.testing.assert_allclose(found.modes.omega, modes.omega, rtol=1e-3)
+
+
+def test_standard_errors_hold_in_noise_that_sensors_share():
+    """Of the mode that moves all sensors as that noise does: by each sensor's noise alone they would be half as large."""
+    off = []
+    for seed in range(40):
+        modes, record = shaken(1024, seed)
+        found = in_coloured_noise(refine(record, modes, offset=True), record)
+        off.append((found.modes.omega[1] - modes.omega[1]) / found.omega_std[1])
+        off.append((found.modes.zeta[1] - modes.zeta[1]) / found.zeta_std[1])
+    assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25

@@ -30,7 +30,7 @@ from workbench.identification.free_decay.refinement import (
     search,
 )
 from workbench.identification.signal.modal_estimates import Identified
-from workbench.identification.signal.projection import Projection, forget_transforms
+from workbench.identification.signal.projection import Projection, forget_transforms, independent
 from workbench.identification.signal.searches import FALSE_ALARM, FIT, SELECTION, Budget, spurious_modes
 from workbench.records.record import Record
 
@@ -72,21 +72,19 @@ def identify_long(
         false_alarm: chance that noise alone is taken for a mode.
         budget: of time; none unless given.
     """
-    search_for, fruitless = _Search(records, false_alarm, budget or Budget()), 0
-    for _ in range(LONG.most_rounds):
-        before = search_for.poles.size
-        # The first modes are worth the wait.
-        ended = fruitless >= LONG.most_fruitless or (before > 0 and search_for.budget.spent("search for further modes"))
-        peaks = np.zeros(0) if ended else search_for.peaks()[: max(most_modes - before, 0)]
-        if peaks.size:
-            search_for.take_in(peaks)
-            search_for.prune()
-            fruitless = 0 if search_for.poles.size > before else fruitless + 1
-        else:
-            search_for.settle(search_for.poles, FIT.most_steps)
-            if not search_for.prune(thoroughly=not search_for.budget.spent("check of each mode")):
-                break
-    return search_for.report() if search_for.poles.size else None
+    measured = _Search(records, false_alarm, budget or Budget())
+    measured.run(most_modes)
+    apart = independent(records, [fit.residual.T for fit in measured.fits]) if measured.poles.size else None
+    if apart is None:
+        return measured.report(measured.evidence()) if measured.poles.size else None
+    # noise that outputs share makes peaks in all of them
+    mixed = _Search(apart[0], false_alarm, measured.budget)
+    mixed.origins = measured.origins
+    mixed.settle(measured.poles, LONG.steps)
+    mixed.run(most_modes)
+    measured.rejected += mixed.rejected
+    measured.settle(mixed.poles, FIT.most_steps)
+    return measured.report(mixed.evidence()) if mixed.poles.size else None
 
 
 class _Search:
@@ -113,6 +111,23 @@ class _Search:
         self.weights = np.ones((len(records), records[0].n_outputs))
         self.fine = np.zeros(1)
         self.settle(np.zeros(0, complex), 0)
+
+    def run(self, most_modes: int) -> None:
+        """Take in peaks, and leave out what is no mode, until none is higher than noise makes it."""
+        fruitless = 0
+        for _ in range(LONG.most_rounds):
+            before = self.poles.size
+            # The first modes are worth the wait.
+            ended = fruitless >= LONG.most_fruitless or (before > 0 and self.budget.spent("search for further modes"))
+            peaks = np.zeros(0) if ended else self.peaks()[: max(most_modes - before, 0)]
+            if peaks.size:
+                self.take_in(peaks)
+                self.prune()
+                fruitless = 0 if self.poles.size > before else fruitless + 1
+            else:
+                self.settle(self.poles, FIT.most_steps)
+                if not self.prune(thoroughly=not self.budget.spent("check of each mode")):
+                    break
 
     def take_in(self, peaks: np.ndarray) -> None:
         self.origins = np.append(self.origins, peaks)
@@ -190,11 +205,12 @@ class _Search:
         shapes = np.hstack(np.split(self._shapes[:, near[near != r]], len(self.fits)))
         return self._strength(r, np.linalg.qr(np.hstack([shapes.real, shapes.imag]))[0])
 
-    def report(self) -> Identified:
+    def report(self, evidence: np.ndarray) -> Identified:
+        """The modes with their covariance, and the evidence (n_modes,) of each."""
         found = self.records, self.poles, self.fits, self.noise
         refined = as_refined(*found, converged=self.converged, steps=self.steps)
         refined = in_coloured_noise(refined, self.records, self.fits)
-        evidence = self.evidence()[np.argsort(np.abs(self.poles))]
+        evidence = evidence[np.argsort(np.abs(self.poles))]
         found_modes = identified(refined, evidence, self.limit, self.rejected, self.records[0])
         return replace(found_modes, remarks=self.budget.remarks)
 

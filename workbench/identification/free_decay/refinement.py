@@ -24,7 +24,14 @@ from workbench.identification.signal.modal_estimates import (
     normalised_shapes,
     time_derivatives,
 )
-from workbench.identification.signal.projection import Projection, noise_near, pole_blocks, project, variances
+from workbench.identification.signal.projection import (
+    Projection,
+    correlation,
+    noise_near,
+    pole_blocks,
+    project,
+    variances,
+)
 from workbench.identification.signal.searches import FIT, Budget, minimise
 from workbench.records.record import Record
 from workbench.structure.modes import SampledModes, frozen
@@ -57,7 +64,8 @@ def in_coloured_noise(
 
         J_j^T S_j J_j  ≈  κ_jr^½ κ_js^½ (J_jr^T J_js),     κ_jr = S_j(ω_r) / s_j²,
 
-    for modes r and s. Where the noise may be white κ is one: the Cramér-Rao bound.
+    for modes r and s. Where the noise may be white κ is one: the Cramér-Rao bound. Where outputs share a part of their
+    noise, of correlation C, it disturbs a mode of amplitudes a_r, over the noise, by a_r^H C a_r / a_r^H a_r as much.
 
     Args:
         refined: of `refine` with a constant in each output, made for white noise.
@@ -69,10 +77,14 @@ def in_coloured_noise(
     poles = fits[0].poles
     each = zip(records, fits, refined.noise, strict=True)
     ratios = np.array([noise_near(poles, fit.residual, noise, record.sample_time) for record, fit, noise in each])
-    if (ratios == 1.0).all():
+    common = correlation([fit.residual.T for fit in fits])
+    amplitudes = [fit.complex_amplitudes / noise[:, None] for fit, noise in zip(fits, refined.noise, strict=True)]
+    shared = np.array([(a.conj() * (common @ a)).sum(axis=0).real / (np.abs(a) ** 2).sum(axis=0) for a in amplitudes])
+    shared = np.where(np.abs(shared - 1.0).max() < 1e-9, 1.0, shared)
+    if (ratios == 1.0).all() and (shared == 1.0).all():
         return refined
     found = records, poles, fits, refined.noise
-    return as_refined(*found, converged=refined.converged, steps=refined.steps, noise_ratio=ratios)
+    return as_refined(*found, converged=refined.converged, steps=refined.steps, noise_ratio=ratios, shared=shared)
 
 
 def as_refined(
@@ -84,6 +96,7 @@ def as_refined(
     converged: bool,
     steps: int,
     noise_ratio: np.ndarray | None = None,
+    shared: np.ndarray | float = 1.0,
 ) -> Refined:
     """What a search ended with, with the covariance that follows from it.
 
@@ -95,11 +108,13 @@ def as_refined(
         converged, steps: of the search.
         noise_ratio: κ (n_records, n_outputs, n_modes), variance of the noise about each mode over its mean; 1 unless
             given.
+        shared: (n_records, n_modes) variance of what noise does to each pole over that of independent noise.
     """
     n = poles.size
     covariance = scaled_inverse(normal_equations(fits, 1.0 / noise)[0], rcond=1e-14)
     if noise_ratio is not None:
-        disturbed = normal_equations(fits, 1.0 / noise, np.sqrt(noise_ratio).swapaxes(1, 2))[0]
+        disturbance = np.sqrt(noise_ratio.swapaxes(1, 2) * np.atleast_2d(shared)[..., None])
+        disturbed = normal_equations(fits, 1.0 / noise, disturbance)[0]
         covariance = covariance @ disturbed @ covariance
     jacobian = by_poles(poles) * np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
     order = np.argsort(np.abs(poles))

@@ -42,6 +42,7 @@ class ProjectionSettings:
     split: float = 0.05  # chance that records of one noise are each given their own, which costs little
     false_alarm: float = 1e-3  # chance that white noise is taken for coloured
     least_bins: int = 6  # over which a spectrum is averaged
+    own: float = 1e-3  # share of an output's noise, at least, that no other output has
     order: int = 12  # of the autoregressive model of coloured noise
     samples_each: int = 40  # for each of its coefficients
     rounding: float = 1e-9  # residual of records without noise, relative
@@ -223,20 +224,27 @@ class _Exponentials:
 
 
 def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | None:
-    """The records behind filters, one an output, that whiten the residual of `poles`; None where it may be white.
+    """The records behind filters that whiten the residual of `poles`; None where it may be white.
+
+    Where outputs share a part of their noise, as what shakes the whole bench, combinations of them that do not come
+    first: noise of two outputs counts twice else, and its peaks for modes. Each then has a filter of its own.
 
     Args:
         records: free decays, of the same outputs.
         poles: (n_modes,) of their modes, rad/s.
     """
     left = [project(record, poles, True).residual.T for record in records]
-    powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in left]
     order = min(PROJECTION.order, sum(each.shape[1] for each in left) // PROJECTION.samples_each)
     squares = sum((each**2).sum(axis=1) for each in left)
     whole = sum((record.outputs**2).sum(axis=1) for record in records)
-    rounding = (squares < PROJECTION.rounding**2 * whole).any()
-    if order == 0 or rounding or all(white(power, poles.size).all() for power in powers):
+    if order == 0 or (squares < PROJECTION.rounding**2 * whole).any():
         return None
+    apart = independent(records, left)
+    if apart is not None:
+        records, left = apart
+    powers = [np.abs(np.fft.rfft(each, axis=1)[:, 1:].T) ** 2 for each in left]
+    if all(white(power, poles.size).all() for power in powers):
+        return None if apart is None else list(records)
     filters = []
     for rows in zip(*left, strict=True):
         # Records of one spectrum may differ in variance.
@@ -252,6 +260,46 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
         )
         for record in records
     ]
+
+
+def correlation(left: Sequence[np.ndarray]) -> Floats:
+    """Of the noise of outputs, over all records, (n_outputs, n_outputs); the identity where they may share none.
+
+    Bartlett's test of sphericity (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det R is chi-square of
+    m (m - 1)/2 for N samples of m outputs.
+
+    Args:
+        left: (n_outputs, n_samples) a record.
+    """
+    m, size = left[0].shape[0], sum(each.shape[1] for each in left)
+    products = [each @ each.T for each in left]
+    sizes = [np.sqrt(np.diag(product) / each.shape[1]) + 1e-300 for product, each in zip(products, left, strict=True)]
+    shared: Floats = sum(product / np.outer(own, own) for product, own in zip(products, sizes, strict=True)) / size
+    lost = -(size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
+    if m == 1 or lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2):
+        return np.eye(m)
+    return (1.0 - PROJECTION.own) * shared + PROJECTION.own * np.eye(m)
+
+
+def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
+    """Records of combinations of the outputs whose noise is independent and of unit variance, and what is left of them.
+
+    A free decay stays a free decay of the same poles.
+
+    Args:
+        records: of the same outputs.
+        left: (n_outputs, n_samples) noise of each.
+
+    Returns:
+        None where the outputs may share no noise as they are.
+    """
+    shared = correlation(left)
+    if not np.triu(shared, 1).any():
+        return None
+    apart = np.linalg.inv(np.linalg.cholesky(shared))
+    mixing = [apart / np.sqrt((each**2).mean(axis=1)) for each in left]
+    mixed = [replace(record, outputs=m @ record.outputs) for record, m in zip(records, mixing, strict=True)]
+    return mixed, [m @ each for m, each in zip(mixing, left, strict=True)]
 
 
 def noise_near(poles: np.ndarray, residual: np.ndarray, noise: np.ndarray, sample_time: float) -> np.ndarray:
