@@ -115,7 +115,7 @@ def test_noise_that_sensors_share_is_no_mode(n_samples, seed):
 
 
 def test_standard_errors_hold_in_noise_that_sensors_share():
-    """Of the mode that moves all sensors as that noise does: by each sensor's noise alone they would be half as large."""
+    """Of the mode that moves all sensors as that noise does: by each sensor's noise alone they were half as large."""
     off = []
     for seed in range(40):
         modes, record = shaken(1024, seed)

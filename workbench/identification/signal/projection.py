@@ -43,6 +43,8 @@ class ProjectionSettings:
     false_alarm: float = 1e-3  # chance that white noise is taken for coloured
     least_bins: int = 6  # over which a spectrum is averaged
     own: float = 1e-3  # share of an output's noise, at least, that no other output has
+    band: int = 32  # lines in which the correlation of noise is taken
+    of_median: float = 0.6  # samples that the median over bands is worth, of the mean
     order: int = 12  # of the autoregressive model of coloured noise
     samples_each: int = 40  # for each of its coefficients
     rounding: float = 1e-9  # residual of records without noise, relative
@@ -265,20 +267,28 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
 def correlation(left: Sequence[np.ndarray]) -> Floats:
     """Of the noise of outputs, over all records, (n_outputs, n_outputs); the identity where they may share none.
 
-    Bartlett's test of sphericity (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det R is chi-square of
-    m (m - 1)/2 for N samples of m outputs.
+    The median over bands of frequency, so that modes not found yet do not count for noise. Bartlett's test of
+    sphericity (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det C is chi-square of m (m - 1)/2 for N samples
+    of m outputs.
 
     Args:
         left: (n_outputs, n_samples) a record.
     """
     m, size = left[0].shape[0], sum(each.shape[1] for each in left)
-    products = [each @ each.T for each in left]
-    sizes = [np.sqrt(np.diag(product) / each.shape[1]) + 1e-300 for product, each in zip(products, left, strict=True)]
-    shared: Floats = sum(product / np.outer(own, own) for product, own in zip(products, sizes, strict=True)) / size
-    lost = -(size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
-    if m == 1 or lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2):
+    if m == 1 or min(each.shape[1] for each in left) <= 2 * PROJECTION.band:
         return np.eye(m)
-    return (1.0 - PROJECTION.own) * shared + PROJECTION.own * np.eye(m)
+    bands = []
+    for each in left:
+        lines = rfft(each, axis=1)[:, 1:]
+        lines = lines[:, : lines.shape[1] // PROJECTION.band * PROJECTION.band].reshape(m, -1, PROJECTION.band)
+        powers = np.einsum("jbk,lbk->bjl", lines, lines.conj()).real
+        own = np.sqrt(np.einsum("bjj->bj", powers)) + 1e-300
+        bands.append(powers / (own[:, :, None] * own[:, None, :]))
+    values, vectors = np.linalg.eigh(np.median(np.concatenate(bands), axis=0))
+    shared: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
+    shared /= np.sqrt(np.outer(np.diag(shared), np.diag(shared)))
+    lost = -(PROJECTION.of_median * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
+    return np.eye(m) if lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) else shared
 
 
 def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
