@@ -231,6 +231,18 @@ def test_inputs_that_run_straight_between_samples():
     assert np.abs(found.state_space(w) - plant(w)).max() < 1e-6 * np.abs(plant(w)).max()
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_that_outputs_share_is_no_mode(seed):
+    """As of what shakes the whole bench: its peaks counted once an output."""
+    quiet = measured(system(4, 1, seed=seed), excitation("noise", 1))
+    rng = np.random.default_rng(seed)
+    common, own = rng.standard_normal(N), rng.standard_normal((4, N))
+    noise = 0.05 * quiet.outputs.std(axis=1, keepdims=True) * (np.sqrt(0.9) * common + np.sqrt(0.1) * own)
+    found = identify_driven(replace(quiet, outputs=quiet.outputs + noise))
+    np.testing.assert_allclose(found.modes.omega, OMEGA, rtol=5e-3)
+    assert (np.abs(found.modes.omega - OMEGA) < 4 * found.omega_std).all()
+
+
 def test_what_cannot_be_identified_is_refused():
     decay = free_decay(SampledModes([10.0], [0.01], [[1.0]], [0.0]), sample_time=DT, n_samples=200)
     with pytest.raises(ValueError, match="has no inputs; use `identify`"):

@@ -38,6 +38,7 @@ class DrivenSettings:
 
     strongest: int = 8  # modes for the first estimate of the noise
     learnt: int = 4  # times that noise and modes are estimated in turn
+    apart: int = 2  # times that modes are looked for in combinations of outputs that share no noise
     spare: int = 20  # states of a subspace model beyond two for each of the most modes: for noise
 
 
@@ -317,8 +318,29 @@ def _selected(
     estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
     """
     how["budget"] = budget
-    few = _few(how)
     strongest = _strongest(data, **how) if strongest is None else strongest
+    apart = data.apart(strongest.fit)
+    if apart is None:
+        return _in_noise(data, strongest, how, budget)
+    # noise that outputs share makes peaks in all of them; what was not found yet may have looked like it
+    for _ in range(DRIVEN.apart):
+        apart, found = _in_noise(apart, _strongest(apart, strongest.fit, **how), how, budget)
+        again = apart.apart(found.fit)
+        if again is None or budget.spent("search beside noise that outputs share"):
+            break
+        apart, strongest = again, found
+    data = data.beside_as(apart)
+    fit = settled(data, projected(data, found.fit.poles, found.fit.participation), budget=budget)
+    data = data.weighted_by(data.noise_spectrum(fit))
+    fit = settled(data, only(data, fit, np.argsort(np.abs(fit.poles))), budget=budget)
+    return data, found.refitted(fit)
+
+
+def _in_noise(
+    data: KnownInputs, strongest: Selected, how: dict[str, Any], budget: Budget
+) -> tuple[KnownInputs, Selected]:
+    """The same where outputs share no noise."""
+    few = _few(how)
     few["most_modes"] = max(few["most_modes"], strongest.fit.poles.size)
     data, selected = _with_noise(data, strongest, few, how, budget)
     doubtful = (selected.evidence < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
@@ -442,7 +464,7 @@ def _report(records: Sequence[Record], data: KnownInputs, selected: Selected, re
         direct_std = fixed_std(fit, noise_ratio, beside)[:n_inputs].T
     return Driven(
         modes=SampledModes.of_poles(fit.poles, shapes, records[0].positions),
-        covariance=frozen(pole_covariance(fit, noise_ratio)),
+        covariance=frozen(pole_covariance(fit, noise_ratio * data.disturbed(fit))),
         vector_covariance=frozen(vectors),
         participation=frozen(participation[:, :n_inputs], complex),
         feedthrough=frozen(direct),

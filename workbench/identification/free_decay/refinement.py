@@ -27,6 +27,7 @@ from workbench.identification.signal.modal_estimates import (
 from workbench.identification.signal.projection import (
     Projection,
     correlation,
+    disturbed,
     noise_near,
     pole_blocks,
     project,
@@ -79,8 +80,7 @@ def in_coloured_noise(
     ratios = np.array([noise_near(poles, fit.residual, noise, record.sample_time) for record, fit, noise in each])
     common = correlation([fit.residual.T for fit in fits])
     amplitudes = [fit.complex_amplitudes / noise[:, None] for fit, noise in zip(fits, refined.noise, strict=True)]
-    shared = np.array([(a.conj() * (common @ a)).sum(axis=0).real / (np.abs(a) ** 2).sum(axis=0) for a in amplitudes])
-    shared = np.where(np.abs(shared - 1.0).max() < 1e-9, 1.0, shared)
+    shared = np.array([disturbed(common, each) for each in amplitudes])
     if (ratios == 1.0).all() and (shared == 1.0).all():
         return refined
     found = records, poles, fits, refined.noise
@@ -114,8 +114,8 @@ def as_refined(
     covariance = scaled_inverse(normal_equations(fits, 1.0 / noise)[0], rcond=1e-14)
     if noise_ratio is not None:
         disturbance = np.sqrt(noise_ratio.swapaxes(1, 2) * np.atleast_2d(shared)[..., None])
-        disturbed = normal_equations(fits, 1.0 / noise, disturbance)[0]
-        covariance = covariance @ disturbed @ covariance
+        between = normal_equations(fits, 1.0 / noise, disturbance)[0]
+        covariance = covariance @ between @ covariance
     jacobian = by_poles(poles) * np.r_[-np.ones(n), np.ones(n)]  # σ = -Re λ
     order = np.argsort(np.abs(poles))
     both = np.r_[order, order + n]

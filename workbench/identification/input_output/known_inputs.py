@@ -28,7 +28,14 @@ from workbench.arrays import Floats
 from workbench.identification.input_output.fit_errors import covariance
 from workbench.identification.input_output.modal_fit import Fit, columns, free_parameters, modal_coordinate, moves
 from workbench.identification.input_output.noise_spectrum import lines_of, noise_spectrum, samples_of
-from workbench.identification.signal.projection import noise_along, noise_near, variances
+from workbench.identification.signal.projection import (
+    correlation,
+    disturbed,
+    independent,
+    noise_along,
+    noise_near,
+    variances,
+)
 from workbench.identification.signal.searches import SELECTION
 from workbench.records.record import Record
 
@@ -128,8 +135,30 @@ class KnownInputs:
         lengths = [rows.stop - rows.start for rows in found.rows]
         return found.weighted_by([_resampled(std, n) for std, n in zip(self.line_std, lengths, strict=True)])
 
+    def apart(self, fit: Fit) -> "KnownInputs | None":
+        """Combinations of the outputs of unit noise that share none of what a fit leaves, lines of equal weight.
+
+        Poles and participation stay as they are. None where the outputs may share no noise.
+        """
+        found = independent(self.records, [left.T for left in self._left(fit)])
+        return None if found is None else self._with(records=found[0], line_std=None)
+
+    def disturbed(self, fit: Fit) -> Floats:
+        """Variance of what noise does to each mode over that of noise which outputs do not share, (n_modes,)."""
+        return disturbed(correlation([left.T for left in self._left(fit)]), fit.amplitudes / fit.noise[:, None])
+
+    def beside_as(self, other: "KnownInputs") -> "KnownInputs":
+        """The same records, lines of equal weight, with the fixed columns that another has beside its own."""
+        return self._with(line_std=None, beside=other.beside, changing=other.changing)
+
+    def _left(self, fit: Fit) -> list[np.ndarray]:
+        """What a fit leaves of the samples of each record, (n_samples, n_outputs)."""
+        raw = fit.residual if self.weights is None else fit.residual / self.weights
+        return [self._samples(raw[rows]) for rows in self.rows]
+
     def _with(self, **changed: Any) -> "KnownInputs":
         same = {
+            "records": self.records,
             "at_rest": self.at_rest,
             "straight": self.straight,
             "feedthrough": self.may_feel,
@@ -139,7 +168,7 @@ class KnownInputs:
             "beside": self.beside,
             "changing": self.changing,
         }
-        return KnownInputs(self.records, **{**same, **changed})
+        return KnownInputs(**{**same, **changed})
 
     def noise(self, fit: Fit) -> np.ndarray:
         """Standard deviation of the residual of each output in each record, (n_records, n_outputs)."""
@@ -148,11 +177,9 @@ class KnownInputs:
 
     def noise_spectrum(self, fit: Fit) -> list[np.ndarray] | None:
         """Relative noise of the lines of each record, as `noise_spectrum` estimates it from the residual."""
-        raw = fit.residual if self.weights is None else fit.residual / self.weights
-        left = [self._samples(raw[rows]) for rows in self.rows]
         taken = self._taken(fit)
         shares = [taken[rows] for rows in self.rows]
-        return noise_spectrum(left, self._measured(), shares, fit.poles.size, self._free(fit))
+        return noise_spectrum(self._left(fit), self._measured(), shares, fit.poles.size, self._free(fit))
 
     def _taken(self, fit: Fit) -> np.ndarray:
         """Leverage of each line, the share of its noise that the fit took, (n_rows, n_outputs)."""

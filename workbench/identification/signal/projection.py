@@ -44,6 +44,7 @@ class ProjectionSettings:
     least_bins: int = 6  # over which a spectrum is averaged
     own: float = 1e-3  # share of an output's noise, at least, that no other output has
     band: int = 32  # lines in which the correlation of noise is taken
+    harmless: float = 1.2  # variance of the combination that shares most, over that of an output: less alters nothing
     of_median: float = 0.6  # samples that the median over bands is worth, of the mean
     order: int = 12  # of the autoregressive model of coloured noise
     samples_each: int = 40  # for each of its coefficients
@@ -288,7 +289,22 @@ def correlation(left: Sequence[np.ndarray]) -> Floats:
     shared: Floats = (vectors * np.maximum(values, PROJECTION.own)) @ vectors.T
     shared /= np.sqrt(np.outer(np.diag(shared), np.diag(shared)))
     lost = -(PROJECTION.of_median * size - (2 * m + 5) / 6.0) * np.linalg.slogdet(shared)[1]
-    return np.eye(m) if lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) else shared
+    none = lost < chi2.isf(PROJECTION.false_alarm, m * (m - 1) // 2) or values[-1] < PROJECTION.harmless
+    return np.eye(m) if none else shared
+
+
+def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
+    """Variance of what noise of that correlation does to each mode over that of noise which outputs do not share:
+    a^H C a / a^H a, (n_modes,).
+
+    Args:
+        shared: C (n_outputs, n_outputs).
+        amplitudes: a (n_outputs, n_modes), over the noise of each output.
+    """
+    if not np.triu(shared, 1).any():
+        return np.ones(amplitudes.shape[1])
+    ratio: Floats = (amplitudes.conj() * (shared @ amplitudes)).sum(axis=0).real / (np.abs(amplitudes) ** 2).sum(axis=0)
+    return ratio
 
 
 def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
