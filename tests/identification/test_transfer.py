@@ -59,6 +59,18 @@ def test_modes_of_the_band_whatever_lies_beyond(quantity):
     assert 0.3 < (np.array(errors) ** 2).mean() < 2.2
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_noise_that_outputs_share_is_no_mode(seed):
+    """As of what shakes the whole bench: its peaks counted once an output."""
+    rng = np.random.default_rng(seed)
+    modes, h, channels = beam("acceleration")
+    common, own = (rng.standard_normal((2, n, *h[0, :1].shape)) for n in (1, len(h)))
+    noise = np.tensordot([1.0, 1j], np.sqrt(0.9) * common + np.sqrt(0.1) * own, 1)
+    found = identify_transfer(h[:, :1] + 0.02 * np.abs(h[:, :1]).mean() * noise, F, channels=channels)
+    np.testing.assert_allclose(found.modes.omega, modes.omega[1:4], rtol=2e-3)
+    assert (np.abs(found.modes.omega - modes.omega[1:4]) < 4 * found.omega_std).all()
+
+
 def test_noise_told_in_any_unit_counts_between_lines_alone():
     """Times a thousand it hid every mode."""
     _, h, channels = beam("acceleration")

@@ -20,6 +20,7 @@ from workbench.identification.input_output.model_order import Selected, evidence
 from workbench.identification.input_output.peak_shape import PEAKS, one_uneven_for_two, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
+from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
 from workbench.identification.signal.searches import FALSE_ALARM, SECONDS, Budget, Progress
 from workbench.records.record import Channel
 from workbench.rig.sensors import MEASURED
@@ -177,7 +178,29 @@ def _selected(
     lines, how = Lines(h, omega, powers, noise), {**how, "budget": budget}
     if noise is not None:
         return lines, select_modes(lines, **how)
-    selected = select_modes(lines, **how | {"most_modes": min(TRANSFER.strongest, how["most_modes"])})
+    few = how | {"most_modes": min(TRANSFER.strongest, how["most_modes"])}
+    selected = select_modes(lines, **few)
+    left = lines.left(selected.fit).reshape(len(h), -1)
+    mixing = mixing_of(correlation_of_lines([left]))
+    if mixing is None:
+        return _in_noise(lines, selected, h, powers, how)
+    # noise that outputs share makes peaks in all of them
+    mixed = np.tensordot(mixing / np.sqrt((np.abs(left) ** 2).mean(axis=1)), h, 1)
+    start = Lines(mixed, omega, powers, None)
+    _, selected = _in_noise(start, select_modes(start, **few), mixed, powers, how)
+    fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
+    guessed = noise_with_size(lines.left(fit), lines.fitted(fit))
+    if guessed is not None:
+        lines = Lines(h, omega, powers, guessed, guessed=True)
+        fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
+    return lines, selected.refitted(fit)
+
+
+def _in_noise(
+    lines: Lines, selected: Selected, h: np.ndarray, powers: list[int], how: dict[str, Any]
+) -> tuple[Lines, Selected]:
+    """The modes, and their noise estimated in turn, from the strongest; where outputs share no noise."""
+    budget, omega = how["budget"], lines.omega
     before: np.ndarray | None = None
     for _ in range(TRANSFER.reweighted):
         guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
@@ -210,7 +233,9 @@ def _modes_of(
     found = peaks(lines, fit)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
-    covariance = pole_covariance(fit, noise_ratio)
+    stated = lines.weights is not None and not lines.guessed
+    shared = np.eye(len(channels)) if stated else correlation_of_lines([lines.left(fit).reshape(len(channels), -1)])
+    covariance = pole_covariance(fit, noise_ratio * disturbed(shared, fit.amplitudes / fit.noise[:, None]))
     sure = np.sqrt(np.diag(covariance)[: fit.poles.size]) < TRANSFER.unsure * np.abs(fit.poles)
     sure &= fit.poles.real < SURE * np.sqrt(np.diag(covariance)[fit.poles.size :]) * np.abs(fit.poles)
     within = (fit.poles.imag >= lines.omega[0]) & (fit.poles.imag <= lines.omega[-1])

@@ -268,20 +268,24 @@ def whitened(records: Sequence[Record], poles: np.ndarray) -> list[Record] | Non
 def correlation(left: Sequence[np.ndarray]) -> Floats:
     """Of the noise of outputs, over all records, (n_outputs, n_outputs); the identity where they may share none.
 
-    The median over bands of frequency, so that modes not found yet do not count for noise. Bartlett's test of
-    sphericity (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det C is chi-square of m (m - 1)/2 for N samples
-    of m outputs.
-
     Args:
         left: (n_outputs, n_samples) a record.
     """
-    m, size = left[0].shape[0], sum(each.shape[1] for each in left)
-    if m == 1 or min(each.shape[1] for each in left) <= 2 * PROJECTION.band:
+    return correlation_of_lines([rfft(each, axis=1)[:, 1:] for each in left])
+
+
+def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
+    """The same of lines of frequency, (n_outputs, n_lines) complex a record.
+
+    The median over bands, so that modes not found yet do not count for noise. Bartlett's test of sphericity
+    (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det C is chi-square of m (m - 1)/2, of N values of m.
+    """
+    m, size = len(left[0]), 2 * sum(each.shape[1] for each in left)
+    if m == 1 or min(each.shape[1] for each in left) < PROJECTION.band:
         return np.eye(m)
     bands = []
     for each in left:
-        lines = rfft(each, axis=1)[:, 1:]
-        lines = lines[:, : lines.shape[1] // PROJECTION.band * PROJECTION.band].reshape(m, -1, PROJECTION.band)
+        lines = each[:, : each.shape[1] // PROJECTION.band * PROJECTION.band].reshape(m, -1, PROJECTION.band)
         powers = np.einsum("jbk,lbk->bjl", lines, lines.conj()).real
         own = np.sqrt(np.einsum("bjj->bj", powers)) + 1e-300
         bands.append(powers / (own[:, :, None] * own[:, None, :]))
@@ -307,6 +311,11 @@ def disturbed(shared: Floats, amplitudes: np.ndarray) -> Floats:
     return ratio
 
 
+def mixing_of(shared: Floats) -> Floats | None:
+    """Combinations (n_outputs, n_outputs) of outputs, over their noise, that make it independent; None where it is."""
+    return np.linalg.inv(np.linalg.cholesky(shared)) if np.triu(shared, 1).any() else None
+
+
 def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[list[Record], list[Floats]] | None:
     """Records of combinations of the outputs whose noise is independent and of unit variance, and what is left of them.
 
@@ -319,10 +328,9 @@ def independent(records: Sequence[Record], left: Sequence[np.ndarray]) -> tuple[
     Returns:
         None where the outputs may share no noise as they are.
     """
-    shared = correlation(left)
-    if not np.triu(shared, 1).any():
+    apart = mixing_of(correlation(left))
+    if apart is None:
         return None
-    apart = np.linalg.inv(np.linalg.cholesky(shared))
     mixing = [apart / np.sqrt((each**2).mean(axis=1)) for each in left]
     mixed = [replace(record, outputs=m @ record.outputs) for record, m in zip(records, mixing, strict=True)]
     return mixed, [m @ each for m, each in zip(mixing, left, strict=True)]
