@@ -1,10 +1,13 @@
 """Files as instruments write them: any layout of text, units, time stamps and uneven times, TDMS and WAV."""
 
+import itertools
+
 import numpy as np
 import pytest
 from nptdms import ChannelObject, TdmsWriter
 from scipy.io import wavfile
 
+from workbench.records import csv_file, limits
 from workbench.records.files import read_record
 from workbench.records.limits import Limits, RecordFileError
 from workbench.records.units import split_unit, unit_named
@@ -146,3 +149,18 @@ def test_limits_are_the_callers(tmp_path):
         read(tmp_path, text, limits=Limits(seconds=1e-6))
     with pytest.raises(ValueError, match="memory must be positive"):
         Limits(memory=0.0)
+
+
+@pytest.mark.parametrize(("each", "blocks"), [(0.05, None), (0.3, 8), (0.11, 60)])
+def test_a_file_that_would_take_too_long_is_refused_before_the_time_is_up(tmp_path, monkeypatch, each, blocks):
+    """Of a hundred blocks, each of so many seconds, of which ten are allowed."""
+    clock = itertools.count(0.0, each)
+    monkeypatch.setattr(limits.time, "process_time", lambda: next(clock))
+    monkeypatch.setattr(csv_file, "BLOCK", 1000)
+    text = "t,a\n" + "".join(f"{k:07d},1\n" for k in range(10_000))
+    if blocks is None:
+        assert read(tmp_path, text).n_samples == 10_000
+        return
+    with pytest.raises(RecordFileError, match="more than 10 s to read"):
+        read(tmp_path, text)
+    assert next(clock) <= (blocks + 2) * each

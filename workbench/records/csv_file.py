@@ -9,7 +9,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
-from io import TextIOBase
+from io import TextIOWrapper
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -67,11 +67,12 @@ def write(path: Path, time: np.ndarray, signals: Mapping[str, np.ndarray], heade
         writer.writerows(zip(*(map(repr, map(float, column)) for column in (time, *signals.values())), strict=True))
 
 
-def _blocks(path: Path, file: TextIOBase, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
+def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> Iterator[np.ndarray]:
     """The numbers of the table, (n_rows, n_columns) a block of lines, time stamps as seconds since the first."""
     assert layout.first is not None
     deadline, clock = Deadline(path, limits), _Clock(path)
     number, rest = layout.first[0], layout.first[1] + "\n"
+    size = path.stat().st_size
     n_numbers, n_columns = 0, len(layout.names) + (layout.n_stamps > 0)
     while True:
         text = file.read(BLOCK)
@@ -87,7 +88,7 @@ def _blocks(path: Path, file: TextIOBase, layout: Layout, limits: Limits) -> Ite
         if not text:
             return
         number += block.count("\n")
-        deadline.check()
+        deadline.check(min(file.buffer.tell() / size, 1.0))
 
 
 def _lines(path: Path, block: str) -> list[str]:

@@ -12,6 +12,7 @@ COPIES = 4  # of a record, at most, in memory while it is read
 BYTES_PER_NUMBER = 8
 MOST_BYTES = 2**30
 MOST_CHANNELS = 10_000
+TELLING = 0.1  # of the time, from which on what is read tells how long the rest will take
 LONGEST = 200  # of a message that is passed on, characters
 
 
@@ -73,15 +74,22 @@ class Deadline:
 
     def __init__(self, path: Path, limits: Limits) -> None:
         self._path, self._seconds = path, limits.seconds
-        self._end = time.process_time() + limits.seconds
+        self._begun = time.process_time()
 
-    def check(self) -> None:
-        """Refuse to go on after the end.
+    def check(self, share: float = 1.0) -> None:
+        """Refuse to go on after the end, or where it will come before the file's.
+
+        The rest of a file takes as long as what is read of it: by half of it well known, before with a margin.
+
+        Args:
+            share: of the file that is read.
 
         Raises:
-            RecordFileError: the time is up.
+            RecordFileError: the time is up, or will be.
         """
-        if time.process_time() > self._end:
+        spent = time.process_time() - self._begun
+        whole = spent / share if spent > TELLING * self._seconds else 0.0
+        if spent > self._seconds or whole > self._seconds * (1.0 + max(0.5 - share, 0.0)):
             raise RecordFileError(
                 f"{self._path} takes more than {self._seconds:g} s to read: cut the record, take fewer channels, or"
                 " write it as HDF5 or NPZ"
