@@ -144,3 +144,9 @@ def test_a_weak_mode_beside_strong_ones_is_found():
     assert found.modes.n_modes == 3
     assert (np.abs(found.modes.omega - omega) < 4 * found.omega_std).all()
     assert (np.abs(found.modes.zeta - zeta) < 4 * found.zeta_std).all()
+
+
+def test_a_record_too_short_for_any_correlation_is_told_how_long_it_must_be():
+    record = Record(0.01, np.array([[1.0, 2.0]]), (Channel("a", "acceleration"),))
+    with pytest.raises(ValueError, match="has 2 samples; modes of random vibration take at least 640: measure longer"):
+        identify_ambient(record)

@@ -174,12 +174,18 @@ def _lags(record: Record, longest: float | None, references: Sequence[str] | Non
         rows = sorted(int(j) for j in strongest)
     else:
         rows = [record.output_names.index(name) for name in record.only(references).output_names]
-    most = record.n_samples // (2 * AMBIENT.blocks)
-    lags = most if longest is None else round(longest / record.sample_time)
-    if not AMBIENT.least_lags // 4 <= lags <= most:
+    most, least = record.n_samples // (2 * AMBIENT.blocks), AMBIENT.least_lags // 4
+    if most < least:
         raise ValueError(
-            f"record {record.name!r} has {record.n_samples} samples, enough for lags up to"
-            f" {most * record.sample_time:g} s; {lags * record.sample_time:g} s were asked for: measure longer"
+            f"record {record.name!r} has {record.n_samples} samples; modes of random vibration take at least"
+            f" {2 * AMBIENT.blocks * least}: measure longer"
+        )
+    lags = most if longest is None else round(longest / record.sample_time)
+    if not least <= lags <= most:
+        raise ValueError(
+            f"record {record.name!r} has {record.n_samples} samples, enough for lags from"
+            f" {least * record.sample_time:g} to {most * record.sample_time:g} s;"
+            f" {lags * record.sample_time:g} s were asked for: measure longer, or ask for others"
         )
     if longest is None:
         found = _correlations(record, 4 * lags, rows, 1)[0]
