@@ -151,7 +151,7 @@ def test_limits_are_the_callers(tmp_path):
         Limits(memory=0.0)
 
 
-@pytest.mark.parametrize(("each", "blocks"), [(0.05, None), (0.3, 8), (0.11, 60)])
+@pytest.mark.parametrize(("each", "blocks"), [(0.05, None), (0.3, 8), (0.11, 80)])
 def test_a_file_that_would_take_too_long_is_refused_before_the_time_is_up(tmp_path, monkeypatch, each, blocks):
     """Of a hundred blocks, each of so many seconds, of which ten are allowed."""
     clock = itertools.count(0.0, each)
@@ -164,3 +164,20 @@ def test_a_file_that_would_take_too_long_is_refused_before_the_time_is_up(tmp_pa
     with pytest.raises(RecordFileError, match="more than 10 s to read"):
         read(tmp_path, text)
     assert next(clock) <= (blocks + 2) * each
+
+
+def test_a_file_that_would_hold_too_many_numbers_is_refused_before_they_are_read(tmp_path, monkeypatch):
+    """Of 20,000 numbers 18,500 are allowed: known from three quarters of the file on."""
+    monkeypatch.setattr(csv_file, "BLOCK", 1000)
+    read_so_far, numbers = [], csv_file._numbers
+
+    def counted(*args):
+        read_so_far.append(numbers(*args))
+        return read_so_far[-1]
+
+    monkeypatch.setattr(csv_file, "_numbers", counted)
+    text = "t,a\n" + "".join(f"{k:07d},1\n" for k in range(10_000))
+    with pytest.raises(RecordFileError, match="holds about 2e\\+04 numbers; at most 18500"):
+        read(tmp_path, text, limits=Limits(memory=18_500 * 32))
+    assert sum(map(np.size, read_so_far)) < 0.8 * 20_000
+    assert read(tmp_path, text, limits=Limits(memory=20_000 * 32)).n_samples == 10_000

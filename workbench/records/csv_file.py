@@ -82,13 +82,14 @@ def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> 
         check_length(path, number + block.count("\n"), rest)
         lines = _lines(path, block)
         n_numbers += n_columns * len(lines)
-        check_counts(path, n_columns, n_numbers, limits)
+        share = min(file.buffer.tell() / size, 1.0)
+        check_counts(path, n_columns, n_numbers, limits, share)
         if lines:
             yield _numbers(path, layout, number, block, lines, clock)
         if not text:
             return
         number += block.count("\n")
-        deadline.check(min(file.buffer.tell() / size, 1.0))
+        deadline.check(share)
 
 
 def _lines(path: Path, block: str) -> list[str]:

@@ -13,6 +13,7 @@ BYTES_PER_NUMBER = 8
 MOST_BYTES = 2**30
 MOST_CHANNELS = 10_000
 TELLING = 0.1  # of the time, from which on what is read tells how long the rest will take
+SPARE = 0.3  # by which what is read may mislead about all: rows grow longer with the digits of their times
 LONGEST = 200  # of a message that is passed on, characters
 
 
@@ -77,9 +78,7 @@ class Deadline:
         self._begun = time.process_time()
 
     def check(self, share: float = 1.0) -> None:
-        """Refuse to go on after the end, or where it will come before the file's.
-
-        The rest of a file takes as long as what is read of it: by half of it well known, before with a margin.
+        """Refuse to go on after the end, or where it will come before the file's, as what is read of it tells.
 
         Args:
             share: of the file that is read.
@@ -88,12 +87,17 @@ class Deadline:
             RecordFileError: the time is up, or will be.
         """
         spent = time.process_time() - self._begun
-        whole = spent / share if spent > TELLING * self._seconds else 0.0
-        if spent > self._seconds or whole > self._seconds * (1.0 + max(0.5 - share, 0.0)):
+        telling = spent > TELLING * self._seconds
+        if spent > self._seconds or (telling and spent / share > self._seconds * _allowed(share)):
             raise RecordFileError(
                 f"{self._path} takes more than {self._seconds:g} s to read: cut the record, take fewer channels, or"
                 " write it as HDF5 or NPZ"
             )
+
+
+def _allowed(share: float) -> float:
+    """Times a limit that a whole file may seem to take, of which a share is read."""
+    return 1.0 + SPARE * (1.0 - share)
 
 
 def check_file(path: Path) -> None:
@@ -124,16 +128,24 @@ def check_arrays(path: Path, arrays: Iterable[np.ndarray], limits: Limits = DEFA
     check_counts(path, len(sizes), sum(sizes), limits)
 
 
-def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT) -> None:
+def check_counts(path: Path, n_channels: int, n_numbers: int, limits: Limits = DEFAULT, share: float = 1.0) -> None:
     """Refuse what would hold too many channels or numbers, before it is read.
+
+    Args:
+        path: of the file.
+        n_channels: of all of it.
+        n_numbers: in the share of it that is read.
+        limits: see `Limits`.
+        share: of the file; the rest is taken to be alike.
 
     Raises:
         RecordFileError: more than `MOST_CHANNELS`, or more numbers than the memory allows.
     """
     if n_channels > MOST_CHANNELS:
         raise RecordFileError(f"{path} holds {n_channels} channels; at most {MOST_CHANNELS} are read")
-    if n_numbers > limits.most_numbers:
+    if n_numbers > limits.most_numbers * share * _allowed(share):
+        some = f"{n_numbers}" if share == 1.0 else f"about {n_numbers / share:.3g}"
         raise RecordFileError(
-            f"{path} holds {n_numbers} numbers; at most {limits.most_numbers} are read within"
+            f"{path} holds {some} numbers; at most {limits.most_numbers} are read within"
             f" {limits.memory / 2**30:g} GiB: cut the record, take fewer channels, or allow more memory"
         )
