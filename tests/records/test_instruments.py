@@ -167,7 +167,7 @@ def test_a_file_that_would_take_too_long_is_refused_before_the_time_is_up(tmp_pa
 
 
 def test_a_file_that_would_hold_too_many_numbers_is_refused_before_they_are_read(tmp_path, monkeypatch):
-    """Of 20,000 numbers 18,500 are allowed: known from three quarters of the file on."""
+    """Of 20,000 numbers 17,000 are allowed: known from half of the file on."""
     monkeypatch.setattr(csv_file, "BLOCK", 1000)
     read_so_far, numbers = [], csv_file._numbers
 
@@ -177,7 +177,7 @@ def test_a_file_that_would_hold_too_many_numbers_is_refused_before_they_are_read
 
     monkeypatch.setattr(csv_file, "_numbers", counted)
     text = "t,a\n" + "".join(f"{k:07d},1\n" for k in range(10_000))
-    with pytest.raises(RecordFileError, match="holds about 2e\\+04 numbers; at most 18500"):
-        read(tmp_path, text, limits=Limits(memory=18_500 * 32))
+    with pytest.raises(RecordFileError, match="at most 17000 are read"):
+        read(tmp_path, text, limits=Limits(memory=17_000 * 32))
     assert sum(map(np.size, read_so_far)) < 0.8 * 20_000
     assert read(tmp_path, text, limits=Limits(memory=20_000 * 32)).n_samples == 10_000

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.identification.free_decay.order import identify
+from workbench.identification.free_decay.order import _Grid, identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound, in_coloured_noise, refine
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
@@ -123,3 +123,22 @@ def test_standard_errors_hold_in_noise_that_sensors_share():
         off.append((found.modes.omega[1] - modes.omega[1]) / found.omega_std[1])
         off.append((found.modes.zeta[1] - modes.zeta[1]) / found.zeta_std[1])
     assert 0.75 < np.sqrt(np.mean(np.square(off))) < 1.25
+
+
+def test_candidates_of_fast_decay_are_compared_exactly_and_at_no_more_frequencies_than_they_resolve():
+    """χ² of a damped exponential beside a mode, against least squares, which minds modes far away too; steps of a
+    quarter of its rate at most."""
+    n, dt, time = 3000, 0.01, 0.01 * np.arange(3000)
+    rng, pole = np.random.default_rng(0), -0.5 + 60.0j
+    record = Record(dt, rng.standard_normal((2, n)), tuple(Channel(c, "velocity") for c in "ab"))
+    grid = _Grid(record, n)
+    columns = np.column_stack([part(np.exp(pole * time)) for part in (np.real, np.imag)])
+    left = record.outputs.T - columns @ np.linalg.lstsq(columns, record.outputs.T, rcond=None)[0]
+    strengths = grid.strengths(left, np.ones(2), np.array([pole]))
+    for k, cells in enumerate(grid.cells):
+        at = cells[np.argmin(np.abs(grid.omega[cells] - 61.5 - 2.0 * grid.rates[k]))]
+        trial = np.exp((-grid.rates[k] + 1j * grid.omega[at]) * time)
+        both = np.linalg.qr(np.column_stack([columns, trial.real, trial.imag]))[0]
+        assert strengths[k, at] == pytest.approx(float(((both.T @ left) ** 2).sum()), rel=1e-2)
+        assert np.diff(grid.omega[cells]).max() <= max(grid.rates[k] / 4.0, 1.01 * np.diff(grid.omega).max())
+    assert sum(map(len, grid.cells)) < 0.7 * grid.n_cells

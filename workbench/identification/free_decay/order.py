@@ -17,7 +17,7 @@ from typing import NoReturn
 import numpy as np
 from scipy.stats import chi2
 
-from workbench.arrays import Complexes
+from workbench.arrays import Complexes, Floats
 from workbench.identification.free_decay.backbone import left_by_backbone
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
@@ -185,7 +185,7 @@ class _FreeDecay:
         for pole, _ in rejected:
             strengths[:, grid.near(pole, 2.0)] = 0.0
         best = np.unravel_index(int(np.argmax(strengths)), strengths.shape)
-        pole = complex(grid.poles[best])
+        pole = complex(-grid.rates[best[0]], grid.omega[best[1]])
         return None if strengths[best] < self.enter * self._noise_ratio(model, pole) else pole
 
     def pole_of(self, candidate: complex) -> complex:
@@ -328,22 +328,30 @@ class _Grid:
         span = n * dt
         self.bin_width = self.lowest = 2.0 * np.pi / span
         fastest = 0.1 * np.pi / dt
-        rates = np.r_[0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))]
+        self.rates = np.r_[
+            0.0, np.geomspace(1.0 / span, max(fastest, 2.0 / span), max(int(np.log(fastest * span)) + 1, 2))
+        ]
         inside = (omega > np.pi / span) & (omega < np.pi / dt - np.pi / span)
-        self.columns, self.rates = np.flatnonzero(inside), rates
-        self.poles = -rates[:, None] + 1j * omega[inside]
-        self.allowed = rates[:, None] < SELECTION.most_damped * omega[inside]
-        self.n_cells = int(self.allowed.sum())
-        self.turns = np.exp(self.poles * dt)
-        self._sums: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = {}
+        columns, self.omega = np.flatnonzero(inside), omega[inside]
+        self.n_cells = sum(int((rate < SELECTION.most_damped * self.omega).sum()) for rate in self.rates)
+        step = 2.0 * np.pi / (self.size * dt)
+        self.strides = [1 << int(np.log2(max(rate / (ORDER.coarser * step), 1.0))) for rate in self.rates]
+        # Of each rate: its frequencies among all, and where its transform has them.
+        self.cells = [np.flatnonzero(columns % stride == 0) for stride in self.strides]
+        self.columns = [columns[at] // stride for at, stride in zip(self.cells, self.strides, strict=True)]
+        self._sums: dict[int, list[tuple[Floats, float, Complexes, Complexes, Complexes]]] = {}
 
-    def _of_length(self, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of n samples: decays (n_rates, n), Σ|w|^2t (n_rates,), Σ w*^2t and w^n (n_rates, n_frequencies)."""
+    def _of_length(self, n: int) -> list[tuple[Floats, float, Complexes, Complexes, Complexes]]:
+        """Of n samples and each rate: its decay, Σ|w|^2t, and w, Σ w*^2t and w^n at its frequencies."""
         if n not in self._sums:
-            decays = np.exp(-np.outer(self.rates * self.record.sample_time, np.arange(n)))
-            ends = self.turns**n
-            double = np.array([_geometric(np.ones(1), w.conj() ** 2, n, (w.conj() ** 2) ** n)[0] for w in self.turns])
-            self._sums[n] = decays, np.sum(decays**2, axis=1), double, ends
+            dt, found = self.record.sample_time, []
+            once, end = np.exp(1j * dt * self.omega), np.exp(1j * n * dt * self.omega)
+            for rate, cells, stride in zip(self.rates, self.cells, self.strides, strict=True):
+                decay = np.exp(-rate * dt * np.arange(min(n, self.size // stride)))
+                w, ends = np.exp(-rate * dt) * once[cells], np.exp(-rate * dt * n) * end[cells]
+                double = (1.0 - ends.conj() ** 2) / (1.0 - w.conj() ** 2)
+                found.append((decay, float(decay @ decay), w, double, ends))
+            self._sums[n] = found
         return self._sums[n]
 
     def power(self, residual: np.ndarray) -> np.ndarray:
@@ -352,39 +360,40 @@ class _Grid:
 
     def near(self, pole: complex, bins: float) -> np.ndarray:
         """Frequencies within so many bins, or half as many rates of decay, of a pole's."""
-        return np.asarray(np.abs(self.poles[0].imag - pole.imag) < bins * max(self.bin_width, 0.5 * abs(pole.real)))
+        return np.asarray(np.abs(self.omega - pole.imag) < bins * max(self.bin_width, 0.5 * abs(pole.real)))
 
     def strengths(self, residual: np.ndarray, weights: np.ndarray, poles: np.ndarray) -> np.ndarray:
         """χ² of each, (n_rates, n_frequencies); 0 where it cannot be distinguished from the modes so far."""
         dt, n = self.record.sample_time, residual.shape[0]
         weighted = residual * weights
-        found = np.zeros(self.poles.shape)
-        near = self._beside(poles) & self.allowed
-        decays, sums, doubles, ends = self._of_length(n)
+        found = np.zeros((self.rates.size, self.omega.size))
         modes = _Span(np.exp(poles * dt), n)
-        for k in range(self.rates.size):
-            spectrum = np.fft.rfft(weighted * decays[k][:, None], self.size, axis=0)[self.columns]
+        for k, (decay, whole, w, double, ends) in enumerate(self._of_length(n)):
+            rate, cells = self.rates[k], self.cells[k]
+            allowed = rate < SELECTION.most_damped * self.omega[cells]
+            decayed = weighted[: decay.size] * decay[:, None]
+            spectrum = np.fft.rfft(decayed, self.size // self.strides[k], axis=0)[self.columns[k]]
             own = (np.abs(spectrum) ** 2).sum(axis=1)
-            double = (spectrum.conj() ** 2).sum(axis=1)
-            p, q, w = np.full(own.shape, sums[k]), doubles[k].copy(), self.turns[k]
-            whole = p.copy()
-            at = near[k]
+            turned = (spectrum.conj() ** 2).sum(axis=1)
+            p, q = np.full(own.shape, whole), double.copy()
+            at = self._beside(poles, k) & allowed
             if at.any():
-                dp, dq = modes.shared(w[at], ends[k, at])
+                dp, dq = modes.shared(w[at], ends[at])
                 p[at] -= dp
                 q[at] -= dq
             det = p**2 - np.abs(q) ** 2
-            good = self.allowed[k] & (det > ORDER.least_independent * whole**2) & (p > 0)
-            top = 2.0 * p * own - 2.0 * (q * double.conj()).real
-            found[k] = np.where(good, top / np.where(good, det, 1.0), 0.0)
+            good = allowed & (det > ORDER.least_independent * whole**2) & (p > 0)
+            top = 2.0 * p * own - 2.0 * (q * turned.conj()).real
+            found[k, cells] = np.where(good, top / np.where(good, det, 1.0), 0.0)
         return found
 
-    def _beside(self, poles: np.ndarray) -> np.ndarray:
-        """Which overlap with a mode so far."""
-        near = np.zeros(self.poles.shape, bool)
+    def _beside(self, poles: np.ndarray, k: int) -> np.ndarray:
+        """Which frequencies of a rate overlap with a mode so far."""
+        omega = self.omega[self.cells[k]]
+        near = np.zeros(omega.size, bool)
         for pole in poles:
-            reach = 3.0 * (2.0 * self.bin_width + abs(pole.real) + self.rates[:, None])
-            near |= np.abs(self.poles.imag - pole.imag) < reach
+            reach = 3.0 * (2.0 * self.bin_width + abs(pole.real) + self.rates[k])
+            near[slice(*np.searchsorted(omega, [pole.imag - reach, pole.imag + reach]))] = True
         return near
 
 
