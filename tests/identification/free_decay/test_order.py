@@ -126,8 +126,7 @@ def test_standard_errors_hold_in_noise_that_sensors_share():
 
 
 def test_candidates_of_fast_decay_are_compared_exactly_and_at_no_more_frequencies_than_they_resolve():
-    """χ² of a damped exponential beside a mode, against least squares, which minds modes far away too; steps of a
-    quarter of its rate at most."""
+    """χ² of a damped exponential beside a mode, against least squares; steps of a quarter of its rate at most."""
     n, dt, time = 3000, 0.01, 0.01 * np.arange(3000)
     rng, pole = np.random.default_rng(0), -0.5 + 60.0j
     record = Record(dt, rng.standard_normal((2, n)), tuple(Channel(c, "velocity") for c in "ab"))
@@ -139,6 +138,6 @@ def test_candidates_of_fast_decay_are_compared_exactly_and_at_no_more_frequencie
         at = cells[np.argmin(np.abs(grid.omega[cells] - 61.5 - 2.0 * grid.rates[k]))]
         trial = np.exp((-grid.rates[k] + 1j * grid.omega[at]) * time)
         both = np.linalg.qr(np.column_stack([columns, trial.real, trial.imag]))[0]
-        assert strengths[k, at] == pytest.approx(float(((both.T @ left) ** 2).sum()), rel=1e-2)
+        assert strengths[k, at] == pytest.approx(float(((both.T @ left) ** 2).sum()), rel=1e-6)
         assert np.diff(grid.omega[cells]).max() <= max(grid.rates[k] / 4.0, 1.01 * np.diff(grid.omega).max())
     assert sum(map(len, grid.cells)) < 0.7 * grid.n_cells

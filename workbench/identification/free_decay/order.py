@@ -383,7 +383,7 @@ class _Grid:
                 q[at] -= dq
             det = p**2 - np.abs(q) ** 2
             good = allowed & (det > ORDER.least_independent * whole**2) & (p > 0)
-            top = 2.0 * p * own - 2.0 * (q * turned.conj()).real
+            top = 2.0 * p * own - 2.0 * (q * turned).real
             found[k, cells] = np.where(good, top / np.where(good, det, 1.0), 0.0)
         return found
 
