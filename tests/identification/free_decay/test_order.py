@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.identification.free_decay.order import _Grid, identify
+from workbench.identification.free_decay.order import _FreeDecay, _Grid, identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound, in_coloured_noise, refine
+from workbench.identification.signal.searches import Budget
 from workbench.identification.signal.synthesis import free_decay, impulse_response_modes
 from workbench.records.record import Channel, Record
 from workbench.structure.damping import ProportionalDamping
@@ -141,3 +142,21 @@ def test_candidates_of_fast_decay_are_compared_exactly_and_at_no_more_frequencie
         assert strengths[k, at] == pytest.approx(float(((both.T @ left) ** 2).sum()), rel=1e-6)
         assert np.diff(grid.omega[cells]).max() <= max(grid.rates[k] / 4.0, 1.01 * np.diff(grid.omega).max())
     assert sum(map(len, grid.cells)) < 0.7 * grid.n_cells
+
+
+def search_of(poles, amplitudes):
+    """The selection of one sensor's modes, and its models of some of them, fitted."""
+    time = 0.02 * np.arange(1500)
+    outputs = (np.array(amplitudes) @ np.exp(np.outer(poles, time))).real
+    outputs = outputs + 0.01 * np.random.default_rng(0).standard_normal(time.size)
+    record = Record(0.02, outputs[None], (Channel("a", "velocity"),))
+    problem = _FreeDecay([record], 0.001, [record], Budget())
+    return problem, lambda *which: problem.settled(replace(problem.nothing, poles=np.array(poles)[list(which)]))
+
+
+def test_a_mode_is_not_blamed_for_a_pair_elsewhere(monkeypatch):
+    """Two modes in one sensor may come to look like one when a third, far off, has entered."""
+    problem, of = search_of([-0.2 + 20.0j, -0.2 + 20.4j, -0.3 + 60.0j], [1.0, 0.8, 0.1])
+    monkeypatch.setattr(problem, "_distinct", lambda model, poles, r, s: poles.size == 2)
+    assert not problem.splits(of(0, 1), of(0, 1, 2))
+    assert problem.splits(of(0, 2), of(0, 2, 1))

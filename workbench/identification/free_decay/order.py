@@ -205,8 +205,14 @@ class _FreeDecay:
         return self.limit * self._noise_ratio(model, pole)
 
     def splits(self, model: _Model, trial: _Model) -> bool:
-        # One that splits another already, on its way or to be left out, is not the new one's fault.
+        # One that splits another already, on its way or to be left out, is not the new one's fault; nor is one that
+        # stays where it is, away from the new one, and only now is found to split another.
         before, after = (self._spurious(poles, model) for poles in (model.poles, trial.poles))
+        old, new, width = trial.poles[:-1], trial.poles[-1], self.grids[0].bin_width
+        band = np.abs(old.real) + width
+        stays = np.abs(old - model.poles) < band
+        away = np.abs(old.imag - new.imag) > band + abs(new.real)
+        after[:-1] &= before | ~(stays & away)
         return bool(after.sum() > before.sum())
 
     def settled(self, model: _Model) -> _Model:
