@@ -160,3 +160,13 @@ def test_a_mode_is_not_blamed_for_a_pair_elsewhere(monkeypatch):
     monkeypatch.setattr(problem, "_distinct", lambda model, poles, r, s: poles.size == 2)
     assert not problem.splits(of(0, 1), of(0, 1, 2))
     assert problem.splits(of(0, 2), of(0, 2, 1))
+
+
+def test_what_would_split_a_mode_again_waits_for_modes_elsewhere():
+    poles = [-0.2 + 20.0j, -0.2 + 20.4j, -0.6 + 60.0j]
+    problem, of = search_of(poles, [1.0, 0.8, 0.23])
+    first = problem.strongest(of(0), [])
+    assert first.imag == pytest.approx(20.4, abs=0.1)
+    assert problem.strongest(of(0), [(first, 0.0)]).imag == pytest.approx(60.0, abs=0.5)
+    problem, of = search_of(poles[:2], [1.0, 0.8])
+    assert problem.strongest(of(0), [(first, 0.0)]).imag < 25.0

@@ -184,9 +184,26 @@ class _FreeDecay:
         grid = self.grids[0]
         for pole, _ in rejected:
             strengths[:, grid.near(pole, 2.0)] = 0.0
-        best = np.unravel_index(int(np.argmax(strengths)), strengths.shape)
+        elsewhere = np.where(self._tried(model, rejected), 0.0, strengths)
+        found = self._risen(model, elsewhere)
+        return self._risen(model, strengths) if found is None else found
+
+    def _risen(self, model: _Model, strengths: np.ndarray) -> complex | None:
+        """The strongest, if it rises above the noise."""
+        grid, best = self.grids[0], np.unravel_index(int(np.argmax(strengths)), strengths.shape)
         pole = complex(-grid.rates[best[0]], grid.omega[best[1]])
         return None if strengths[best] < self.enter * self._noise_ratio(model, pole) else pole
+
+    def _tried(self, model: _Model, rejected: list[tuple[complex, float]]) -> np.ndarray:
+        """Which candidates overlap with a mode that a rejected one overlaps with too, (n_rates, n_frequencies): what
+        splits a mode from one side does so from the other, and waits until no other mode is left."""
+        grid = self.grids[0]
+        tried = np.zeros((grid.rates.size, grid.omega.size), bool)
+        for mode in model.poles:
+            band = abs(mode.real) + grid.bin_width
+            if any(abs(pole.imag - mode.imag) < band + abs(pole.real) for pole, _ in rejected):
+                tried |= np.abs(grid.omega - mode.imag) < band + grid.rates[:, None]
+        return tried
 
     def pole_of(self, candidate: complex) -> complex:
         return candidate
