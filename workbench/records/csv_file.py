@@ -6,6 +6,7 @@ lines at a time, so that a file of any length takes the memory of its numbers an
 
 import csv
 import json
+import os
 import re
 from collections.abc import Iterator, Mapping
 from datetime import datetime
@@ -82,7 +83,7 @@ def _blocks(path: Path, file: TextIOWrapper, layout: Layout, limits: Limits) -> 
         check_length(path, number + block.count("\n"), rest)
         lines = _lines(path, block)
         n_numbers += n_columns * len(lines)
-        share = min(file.buffer.tell() / size, 1.0)
+        share = min(os.lseek(file.fileno(), 0, os.SEEK_CUR) / size, 1.0)
         check_counts(path, n_columns, n_numbers, limits, share)
         if lines:
             yield _numbers(path, layout, number, block, lines, clock)

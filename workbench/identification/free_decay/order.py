@@ -48,6 +48,9 @@ class OrderSettings:
     # candidates below the limit one after the other, and candidates that split a mode, after which the search ends
     most_weak: int = 2
     most_splits: int = 6
+    # times the frequency step of the transform, by which rates of decay go on that need no step finer than a quarter
+    # of theirs: what they leave after the shorter transform is e^-25
+    coarser: float = 4.0
     least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
