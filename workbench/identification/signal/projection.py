@@ -10,6 +10,9 @@ which doubling gives in log N steps, and an exponential is left out where it has
 Whitening: the residual of an output is modelled as y_k = Σ_i a_i y_k-i + e_k (Yule & Walker), and the record filtered
 by 1 - Σ_i a_i z^-i. A free decay stays a free decay of the same poles.
 
+Where outputs share noise of correlation C, combinations C^-½ y / s whose noise is independent are filtered instead: the
+same holds of them.
+
 Variance: residuals of one day have one noise, and short records know it better together. Bartlett's statistic tests
 that (Proc. R. Soc. A 160, 1937): with ν_i degrees of freedom behind the variance v_i of record i, and v of all,
 
