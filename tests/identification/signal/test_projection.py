@@ -10,7 +10,15 @@ from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.order import identify
 from workbench.identification.free_decay.refinement import cramer_rao_bound, refine
 from workbench.identification.signal import projection
-from workbench.identification.signal.projection import _project_by_parts, differ, power_sums, project, variances
+from workbench.identification.signal.projection import (
+    _project_by_parts,
+    correlation,
+    differ,
+    independent,
+    power_sums,
+    project,
+    variances,
+)
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
@@ -176,3 +184,31 @@ def test_exponentials_that_round_off_makes_alike_are_refused():
     record = Record(0.002, np.random.default_rng(0).standard_normal((1, 9000)), (Channel("a"),))
     with pytest.raises(np.linalg.LinAlgError):
         _project_by_parts(record, np.array([0.0146 + 1e-5j, -0.8 + 1.7j]), True)
+
+
+@pytest.mark.parametrize(("m", "n"), [(4, 80), (4, 200), (20, 1000), (60, 3000), (200, 2000)])
+def test_independent_noise_is_not_said_to_be_shared(m, n):
+    for seed in range(5):
+        assert (correlation([np.random.default_rng(seed).standard_normal((m, n))]) == np.eye(m)).all()
+
+
+def test_the_correlation_of_noise_beside_modes_that_are_not_found_yet():
+    """These are ten times as loud, within their bands."""
+    rng, n = np.random.default_rng(1), 8000
+    common, own, time = rng.standard_normal(n), rng.standard_normal((3, n)), np.arange(n)
+    modes = 10.0 * rng.standard_normal((3, 4)) @ np.sin(np.outer([0.31, 0.77, 1.4, 2.2], time))
+    noise = np.sqrt(0.8) * common + np.sqrt(0.2) * own
+    found = correlation([np.array([[1.0], [5.0], [-0.1]]) * (noise + modes)])
+    np.testing.assert_allclose(found, np.outer([1, 1, -1], [1, 1, -1]) * (0.8 + 0.2 * np.eye(3)), atol=0.03)
+
+
+def test_combinations_of_outputs_share_no_noise_and_keep_a_decay():
+    rng, n = np.random.default_rng(2), 6000
+    noise = np.array([[2.0], [0.3], [1.0]]) * (rng.standard_normal(n) + 0.5 * rng.standard_normal((3, n)))
+    decay = np.exp((-0.002 + 0.4j) * np.arange(n)).real * np.array([[1.0], [0.5], [-2.0]])
+    record = Record(1.0, noise + decay, tuple(Channel(f"y{i}") for i in range(3)))
+    (mixed,), (left,) = independent([record], [noise])
+    np.testing.assert_allclose(np.corrcoef(left), np.eye(3), atol=0.05)
+    np.testing.assert_allclose(left.std(axis=1), 1.0, atol=0.05)
+    seen = mixed.outputs - left  # the decay alone, seen through the same combinations
+    assert np.linalg.matrix_rank(seen, tol=1e-6 * np.linalg.norm(seen)) == 1

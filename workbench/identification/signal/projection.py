@@ -48,9 +48,9 @@ class ProjectionSettings:
     own: float = 1e-3  # share of an output's noise, at least, that no other output has
     band: int = 32  # lines in which the correlation of noise is taken
     harmless: float = 1.2  # variance of the combination that shares most, over that of an output: less alters nothing
-    of_median: float = 0.6  # samples that the median over bands is worth, of the mean
+    of_median: float = 0.25  # samples that the median over bands is worth, of the mean without a window
     order: int = 12  # of the autoregressive model of coloured noise
-    samples_each: int = 40  # for each of its coefficients
+    samples_each: int = 40  # for each of its coefficients; for each output, where noise that they share is asked for
     rounding: float = 1e-9  # residual of records without noise, relative
     spectra_alike: float = 0.1  # rms of log ratios below which two spectra are the same
     most_taken: float = 0.9  # leverage at most: a line that the fit took whole says nothing of its noise
@@ -274,7 +274,8 @@ def correlation(left: Sequence[np.ndarray]) -> Floats:
     Args:
         left: (n_outputs, n_samples) a record.
     """
-    return correlation_of_lines([rfft(each, axis=1)[:, 1:] for each in left])
+    # by Hann's window, as modes not found yet leak far into other bands
+    return correlation_of_lines([rfft(each * np.hanning(each.shape[1]), axis=1)[:, 1:] for each in left])
 
 
 def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
@@ -284,7 +285,7 @@ def correlation_of_lines(left: Sequence[np.ndarray]) -> Floats:
     (Proc. Camb. Phil. Soc. 47, 1951): -(N - (2 m + 5)/6) ln det C is chi-square of m (m - 1)/2, of N values of m.
     """
     m, size = len(left[0]), 2 * sum(each.shape[1] for each in left)
-    if m == 1 or min(each.shape[1] for each in left) < PROJECTION.band:
+    if m == 1 or min(each.shape[1] for each in left) < PROJECTION.band or size < PROJECTION.samples_each * m:
         return np.eye(m)
     bands = []
     for each in left:
