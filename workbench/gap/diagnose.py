@@ -39,7 +39,7 @@ from workbench.threads import one_blas_thread
 RIVAL = 0.01  # probability from which a rival is worth an experiment
 TOLERANCE = 0.01  # of the signal: a gap that is worth no cause
 PAID = 0.02  # of what is left of records held out: what an effect that acts there must take away, to be named
-TRIFLE = 0.0005  # of the gap there: what an effect beside errors of the model must take away, to be named
+TRIFLE = 0.0005  # of the gap there: likewise
 CLEAR = 10.0  # times that: what is left there without an effect that counts beyond doubt
 HELD_OUT, LEFT = 0.9, 0.1  # share to close on records not fitted; power left beyond the noise that is no chance
 SECONDS = 120.0  # of processor time of this process: twice what cases of a laboratory take at most
@@ -178,8 +178,7 @@ def _paid_for(rig: Rig, found: Attribution, unseen: Sequence[Record], settle: fl
     if found.outcome != "explained" or len(named) < 2 or _remainders(found):
         return found
     after = _left_of(rig, effects, unseen, settle)
-    beside = any(effect.kind is NOMINAL_ERRORS for effect in effects)
-    trifle = max(PAID * after, TRIFLE * _left_of(rig, (), unseen, settle) if beside else 0.0)
+    trifle = max(PAID * after, TRIFLE * _left_of(rig, (), unseen, settle))
     for effect in named:
         rest = [e for e in effects if e is not effect]
         if _acts(rig, effects, rest, unseen, settle) < PAID * after:

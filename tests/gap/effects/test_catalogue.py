@@ -296,3 +296,12 @@ def test_sets_are_named_in_words():
     assert in_words("swapped_outputs[d1, d2]").endswith(", d1, d2") and in_words("own_law") == "own law"
     mine = replace(kind_named("cubic_spring"), name="own_law", phrase="a quadratic spring")
     assert in_words("own_law", [mine]) == "a quadratic spring"
+
+
+@pytest.mark.parametrize("offset", [-2.0, 0.0])
+def test_a_stop_on_a_side_that_a_place_never_comes_to_has_no_start(offset):
+    """As under a constant force: the quantiles of no displacement ended a diagnosis."""
+    moved = offset + (np.sin(np.linspace(0.0, 20.0, 400)) if offset else np.zeros(400))
+    place = SimpleNamespace(displacement=moved, strength_along=lambda over: 1.0, at=0.3)
+    assert not list(kind_named("one_sided_stop").starts(SimpleNamespace(at_peaks=(place,)), None))
+    assert bool(list(kind_named("clearance").starts(SimpleNamespace(at_peaks=(place,)), None))) == bool(offset)

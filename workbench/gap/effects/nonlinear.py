@@ -172,6 +172,8 @@ def _contact_starts(two_sided: bool) -> Callable[[Evidence, object], Iterator[di
     def starts(evidence: Evidence, _: object) -> Iterator[dict[str, Any]]:
         for place in evidence.at_peaks:
             reach = np.abs(place.displacement) if two_sided else place.displacement
+            if not (reach > 0).any():  # it stays on the other side, as under a constant force
+                continue
             levels = np.quantile(reach[reach > 0], (0.3, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99))
             for gap in levels:
                 over = np.maximum(reach - gap, 0.0) * np.sign(place.displacement)
