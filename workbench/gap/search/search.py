@@ -18,7 +18,7 @@ from workbench.gap.prediction.random_force import RandomForceFit
 from workbench.gap.prediction.residuals import FitData
 from workbench.gap.prediction.unmodelled_force import ForceFilter
 from workbench.gap.prediction.workers import Workers
-from workbench.gap.search.fit import HOPELESS, Fit, cost_of, sensitivity
+from workbench.gap.search.fit import HOPELESS, Fit, cost_of, finite_residual, sensitivity
 from workbench.gap.search.settings import SEARCH
 from workbench.rig.rig import Rig
 from workbench.structure.domain import Domain, NamedPoints
@@ -200,7 +200,9 @@ class Search:
 
     def _ahead(self, data: FitData) -> FitData:
         data = data.following(self.rig)
-        return data.giving_way(sensitivity(self.rig, self.held, data, self.workers)) if self.held else data
+        if not self.held or finite_residual(self.rig, self.held, data) is None:  # predictions run away beside errors
+            return data
+        return data.giving_way(sensitivity(self.rig, self.held, data, self.workers))
 
     def side_by_side(self, function: Callable[..., Fit], candidates: Sequence[Fit]) -> list[Fit]:
         """`function(search, candidate)` of each, in their order."""
