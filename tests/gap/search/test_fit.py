@@ -165,7 +165,7 @@ def test_a_set_must_hold_on_records_it_has_not_seen():
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_own_readings(rig, measured, swapped):
-    """Slopes are those of one number at a time, to the last digit."""
+    """Slopes are those of one number at a time, but for the last digit of what is divided by a step."""
     data = measured(rig)
     prior = NominalPrior(frequency=0.005, delay=0.1, gain=0.01, shape=0.01, sample_time=DT)
     exchange = Effect(kind_named("swapped_outputs"), ("d1", "d3"), {})
@@ -176,7 +176,7 @@ def test_numbers_of_different_sensors_are_moved_at_once_where_each_alters_its_ow
     assert bool(together._of_sensors_alone(range(20))) != swapped
     start = together.residual(together.start)
     one, other = (each.jacobian(each.start, start, False) for each in (together, alone))
-    np.testing.assert_allclose(one, other, atol=1e-12 * np.abs(other).max())
+    np.testing.assert_allclose(one, other, atol=1e-12 / min(together.steps) * np.abs(start).max())
 
 
 def test_slopes_along_believed_numbers_are_kept_and_others_taken_anew(rig, measured):
