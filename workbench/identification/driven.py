@@ -312,19 +312,15 @@ def _checked_delays(records: Sequence[Record], delays: ArrayLike | None) -> np.n
 def _selected(
     data: KnownInputs, budget: Budget, strongest: Selected | None = None, **how: Any
 ) -> tuple[KnownInputs, Selected]:
-    """The modes, in noise of their residual's spectrum; the strongest first, for coloured noise passes for modes.
-
-    A false mode explains its lines, so that their noise is underestimated and the mode seems true. The noise is thus
-    estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
-    """
+    """The modes, the strongest first; in combinations of the outputs that share no noise where these share some."""
     how["budget"] = budget
     strongest = _strongest(data, **how) if strongest is None else strongest
     apart = data.apart(strongest.fit)
     if apart is None:
-        return _in_noise(data, strongest, how, budget)
+        return _in_noise(data, strongest, how)
     # noise that outputs share makes peaks in all of them; what was not found yet may have looked like it
     for _ in range(DRIVEN.apart):
-        apart, found = _in_noise(apart, _strongest(apart, strongest.fit, **how), how, budget)
+        apart, found = _in_noise(apart, _strongest(apart, strongest.fit, **how), how)
         again = apart.apart(found.fit)
         if again is None or budget.spent("search beside noise that outputs share"):
             break
@@ -336,11 +332,13 @@ def _selected(
     return data, found.refitted(fit)
 
 
-def _in_noise(
-    data: KnownInputs, strongest: Selected, how: dict[str, Any], budget: Budget
-) -> tuple[KnownInputs, Selected]:
-    """The same where outputs share no noise."""
-    few = _few(how)
+def _in_noise(data: KnownInputs, strongest: Selected, how: dict[str, Any]) -> tuple[KnownInputs, Selected]:
+    """The modes of outputs that share no noise, in that of their residual's spectrum: coloured noise passes for modes.
+
+    A false mode explains its lines, so that their noise is underestimated and the mode seems true. The noise is thus
+    estimated anew without all doubtful modes; they stay if that makes modes and noise together less likely.
+    """
+    budget, few = how["budget"], _few(how)
     few["most_modes"] = max(few["most_modes"], strongest.fit.poles.size)
     data, selected = _with_noise(data, strongest, few, how, budget)
     doubtful = (selected.evidence < SELECTION.weak * selected.limit) | ~_oscillate(data, selected)
