@@ -84,3 +84,17 @@ def test_a_sensor_late_by_whole_samples_is_shifted(rig):
     late = replace(rig, sensors=tuple(replace(s, delay=0.02) for s in rig.sensors))
     read, prompt = (simulate(r, inputs, sample_time=0.01).outputs for r in (late, rig))
     np.testing.assert_allclose(read[:, 2:], prompt[:, :-2], atol=1e-12 * np.abs(prompt).max())
+
+
+@pytest.mark.parametrize("share", [-0.4, 0.3, 2.6])
+def test_a_logger_s_channel_is_late_by_straight_lines_between_its_samples(rig, share):
+    """Truth: a weighted sum of the two samples about the time that is read."""
+    dt = 2 * np.pi / rig.modes.omega[3] / 8.0
+    inputs = np.random.default_rng(1).standard_normal((1, 200))
+    prompt = simulate(rig, inputs, sample_time=dt).outputs
+    logged = replace(rig, sensors=tuple(replace(s, delay=share * dt, interpolated=True) for s in rig.sensors))
+    back = int(np.ceil(share))
+    within = back - share  # of a sample, after the earlier of the two
+    at = np.arange(back + 1, inputs.size - 2)
+    expected = (1.0 - within) * prompt[:, at - back] + within * prompt[:, at - back + 1]
+    np.testing.assert_allclose(simulate(logged, inputs, sample_time=dt).outputs[:, at], expected, rtol=1e-9, atol=1e-12)

@@ -30,6 +30,8 @@ class Sensor:
         drift: offset gained over a record, from 0 at its first sample.
         crosstalk: (name, share) of other sensors whose truth it reads too, delay and lag of its own.
         delay: s; negative, by less than a sample, where its clock is ahead of that of the inputs.
+        interpolated: whether it is late by straight lines between its samples, as where a logger puts channels on one
+            clock, and not by reading the motion between them.
         time_constant: of a first-order lag, s.
         limit: readings stop at ± this.
         step: readings are multiples of this; 0 for none.
@@ -51,6 +53,7 @@ class Sensor:
     crosstalk: tuple[tuple[str, float], ...] = ()
     direction: str | None = None
     shape_error: tuple[float, ...] = ()
+    interpolated: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "at", same_place(self.at))

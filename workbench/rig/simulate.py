@@ -151,16 +151,20 @@ def read(rig: Rig, motion: Motion, *, sample_time: float) -> np.ndarray:
     """What the sensors read of a motion, noise apart: (n_sensors, n_samples); clipped and rounded in the mean."""
     outputs = np.empty((len(rig.sensors), motion.displacement.shape[1]))
     late, every = None, 1
-    if any(sensor.delay for sensor in rig.sensors):
+    if any(sensor.delay and not sensor.interpolated for sensor in rig.sensors):
         every, finer = (1, motion) if motion.finer is None else (motion.finer[0], motion.finer[1]())
         late = finer.between_samples(sample_time / every)
     for order, here, shapes in _shapes_at_sensors(rig):
-        delays = np.array([rig.sensors[j].delay for j in here])
+        delays = np.array([0.0 if rig.sensors[j].interpolated else rig.sensors[j].delay for j in here])
         if late is None or not delays.all():
             outputs[here] = shapes @ getattr(motion, QUANTITIES[order])
         if late is not None and delays.any():
             behind = np.flatnonzero(delays)
             outputs[np.array(here)[behind]] = late.earlier(order, shapes[behind], delays[behind])[:, ::every]
+    for j, sensor in enumerate(rig.sensors):
+        if sensor.delay and sensor.interpolated:
+            samples = np.arange(outputs.shape[1])
+            outputs[j] = np.interp(samples - sensor.delay / sample_time, samples, outputs[j])
     for row, leak in _leaks(rig, outputs):
         outputs[row] += leak
     for j, sensor in enumerate(rig.sensors):

@@ -53,6 +53,7 @@ class Dirt:
         noise_memory: correlation of that noise over one sample.
         logging_noise: of each logged input, as a share of its rms.
         delays: of each sensor, in samples.
+        interpolated: whether they come of straight lines between samples, as where a logger puts channels on one clock.
         gains: of each actuator, then of each sensor, over those stated.
         moved: of each actuator, then of each sensor, (n_coordinates,) m from the place stated.
     """
@@ -66,6 +67,7 @@ class Dirt:
     noise_memory: float = 0.0
     logging_noise: float = 0.0
     delays: tuple[float, ...] = ()
+    interpolated: bool = False
     gains: tuple[float, ...] = ()
     moved: tuple[tuple[float, ...], ...] = ()
 
@@ -84,6 +86,7 @@ class Dirt:
                 s,
                 noise_std=s.noise_std * self.noise_ratio,
                 delay=s.delay + delay * sample_time,
+                interpolated=self.interpolated,
                 gain=s.gain * gain,
                 at=middle(_moved(s.at, by)),
             )
@@ -144,7 +147,8 @@ def _with_part(dirt: Dirt, name: str, size: float, bench: Bench, rng: np.random.
     if name == "input":
         return replace(dirt, logging_noise=LOGGING_NOISE * size)
     if name == "late":
-        return replace(dirt, delays=tuple(map(float, rng.uniform(0.0, LATE * size, len(bench.rig.sensors)))))
+        delays = tuple(map(float, rng.uniform(0.0, LATE * size, len(bench.rig.sensors))))
+        return replace(dirt, delays=delays, interpolated=bool(rng.random() < 0.5))
     if name == "gain":
         ports = len(bench.rig.actuators) + len(bench.rig.sensors)
         return replace(dirt, gains=tuple(map(float, np.exp(CALIBRATION * size * rng.standard_normal(ports)))))

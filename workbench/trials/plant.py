@@ -204,6 +204,12 @@ class SolvedPlant:
             if sensor.delay == 0:
                 rows.append(moved[order] @ shape)
                 continue
+            if sensor.interpolated:
+                whole, share = divmod(sensor.delay / sample_time, 1.0)
+                each = moved[order] @ shape
+                older = np.r_[np.full(int(whole) + 1, each[0]), each]
+                rows.append((1.0 - share) * older[1 : each.size + 1] + share * older[: each.size])
+                continue
             back = np.round(-sensor.delay / sample_time, 12)
             piece = int(np.argmin(np.abs(moved.starts - back % 1.0)))
             shift = -int(np.floor(back))

@@ -46,6 +46,7 @@ class NominalPrior:
         sample_time: s.
         late, early: names of the sensors whose delay is positive, or at most zero: where inputs are held, acceleration
             jumps at each sample, and no small step leads from one side to the other.
+        interpolated: whether sensors are late by straight lines between their samples: then nothing jumps.
         waves: cosines of a smooth variation along the structure, the constant among them.
         records, figure: names of the records between which a figure differs, and which.
         by_mode: whether modes are off one by one.
@@ -63,6 +64,7 @@ class NominalPrior:
     sample_time: float = 1.0
     late: tuple[str, ...] = ()
     early: tuple[str, ...] = ()
+    interpolated: bool = False
     waves: int = 9
     records: tuple[str, ...] = ()
     figure: str = STIFFNESS
@@ -270,6 +272,7 @@ def _off_port(port: Any, units: Floats, prior: NominalPrior, values: dict[str, f
         changes["shape_error"] = tuple((units * errors).tolist())
     if delay := values.get(f"delay_{port.name}", 0.0) if isinstance(port, Sensor) else 0.0:
         changes["delay"] = port.delay + delay * prior.sample_time
+        changes["interpolated"] = port.interpolated or prior.interpolated
     return replace(port, **changes) if changes else port
 
 

@@ -291,7 +291,7 @@ def on_their_sides(search: Search, errors: Effect, effects: Sequence[Effect] = (
     """
     known = errors.target.late
     jumping = tuple(s.name for s in search.rig.sensors if s.quantity == "acceleration" and s.name not in known)
-    if not jumping or not errors.target.delay:
+    if not jumping or not errors.target.delay or errors.target.interpolated:
         return errors
     none = {**errors.values, **{f"delay_{name}": 0.0 for name in jumping}}
 
