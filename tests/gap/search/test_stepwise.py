@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 
 from workbench.gap.diagnose import diagnose
-from workbench.gap.effects.effect import apply_all
+from workbench.gap.effects.catalogue import CATALOGUE, kind_named
+from workbench.gap.effects.effect import Effect, apply_all
 from workbench.gap.effects.nominal import NOMINAL_ERRORS, NominalPrior, nominal_errors
 from workbench.gap.prediction.noise import noise_found
 from workbench.gap.prediction.residuals import FitData
+from workbench.gap.prediction.workers import ALONE
 from workbench.gap.search.fit import cost_of, fit, sensitivity
+from workbench.gap.search.search import Search
+from workbench.gap.search.stepwise import Stepwise
 from workbench.rig.elements import CoulombFriction
 from workbench.rig.rig import Rig
 from workbench.structure.damping import ModalDamping
@@ -19,6 +23,7 @@ from workbench.trials.make import make_trial
 from workbench.trials.scoring import score_dirty
 
 NOISE = 1e-5
+DT = 0.01  # of the records
 DAMPING = np.array([1.1, 0.95, 1.08, 0.9])
 
 
@@ -185,3 +190,24 @@ def test_trials_that_were_told_wrongly_once(seed, dirt, size, kinds):
 def test_trials_on_plates_and_frames_that_were_told_wrongly_once(structure, seed, kinds):
     (told,) = hold_trials(1, seed, kinds=[kinds], structure=structure).scores.values()
     assert told["kinds"] and all(error < 0.02 for error in told["position_errors"])
+
+
+@pytest.mark.parametrize("interpolated", [False, True])
+def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
+    """A logger that puts channels on one clock by straight lines weakens what is quick; a late sensor does not."""
+    quick = rig.modes.omega[-1] * DT
+    assert 0.5 < quick < 1.0  # rad a sample: straight lines take a twentieth of that mode
+    spring = Effect(kind_named("cubic_spring"), None, {"at": 0.7, "stiffness": 40.0})
+    late = (0.3, 0.05, 0.25, 0.0)
+    sensors = tuple(
+        replace(s, delay=share * DT, interpolated=interpolated) for s, share in zip(rig.sensors, late, strict=True)
+    )
+    real = replace(apply_all(rig, (spring,)), sensors=sensors)
+    data = FitData((measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE))
+    nominal = data.by_channel(data.residual(rig))
+    beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
+    found = beside.afresh((spring,))
+    delays = [found.errors.values[f"delay_{sensor.name}"] for sensor in rig.sensors]
+    assert found.errors.target.interpolated is interpolated
+    np.testing.assert_allclose(delays, late, atol=0.01)
+    assert beside.explains(found)

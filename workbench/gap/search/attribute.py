@@ -427,11 +427,13 @@ def _with_a_second(
     if alone is not None:
         return alone
     near = min(f.cost for f in (start, *singles)) < 1.0 + STEPWISE.no_gap
-    if not (beside.is_enough or near or search.is_over):
-        random = random_beside(search, singles) or random_beside_errors(search, beside.last)
+    # damping is hardly known: where its errors alone are large, an effect that makes them smaller is asked for, no more
+    enough = beside.is_enough or beside.without_errors() or beside.by_singles()
+    enough = enough or (beside.is_quiet and beside.is_believed)
+    if not (enough or near or search.is_over):
+        random = random_beside(search, singles) or random_beside_errors(search, beside.steps[0])
         if random is not None:
             return random
-    enough = beside.is_enough or beside.by_singles()
     if enough:
         beside.run()
     by_mode = None if search.is_over or (enough and beside.is_believed) else beside_modes(beside)

@@ -36,6 +36,7 @@ def beside_modes(before: Stepwise) -> Stepwise | None:
         left = nearest.excess(nearest.noise_power)
         if before.is_believed and again.excess(again.noise_power) > STEPWISE.halved * left:
             return None
+        beside.known = [again] if len(again.effects) == 1 else []
     if not beside.by_singles():
         return None
     beside.run()

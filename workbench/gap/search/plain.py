@@ -15,7 +15,7 @@ from workbench.gap.search.finish import finished
 from workbench.gap.search.fit import Fit, cost_of, fit
 from workbench.gap.search.jointly import Step, on_their_sides, surely_late
 from workbench.gap.search.screening import Screening
-from workbench.gap.search.search import Search
+from workbench.gap.search.search import Search, promise
 from workbench.gap.search.settings import JOINT, PLAIN, SEARCH, SELECTION, STEPWISE
 from workbench.rig.rig import Rig
 from workbench.structure.domain import middle
@@ -134,7 +134,8 @@ def _one_common(
 def _at_ports(errors: Effect) -> Iterator[tuple[Effect, ...]]:
     """What the errors say of the timing of the sensors, then of gains and places too, where they say anything of it."""
     prior = errors.target
-    timing = NominalPrior(sample_time=prior.sample_time, late=prior.late, early=prior.early, waves=prior.waves)
+    sides = {"late": prior.late, "early": prior.early, "interpolated": prior.interpolated}
+    timing = NominalPrior(sample_time=prior.sample_time, waves=prior.waves, **sides)
     if prior.delay > PLAIN.punctual:
         timing = replace(timing, delay=prior.delay)
     for kept in dict.fromkeys((timing, replace(timing, gain=prior.gain, place=prior.place))):
@@ -147,7 +148,15 @@ def _explaining(search: Search, sets: Sequence[tuple[Effect, ...]], step: Step) 
 
     None that the records surely prefer the errors of the step to.
     """
-    quickly = search.workers.map(lambda s: fit(search.rig, s, search.quick, iterations=PLAIN.plainly), list(sets))
+
+    def briefly(effects: Sequence[Effect]) -> Fit:
+        found = fit(search.rig, effects, search.quick, iterations=PLAIN.briefly)
+        more = PLAIN.plainly - PLAIN.briefly
+        if not found.falling or promise(found, more) > PLAIN.near:
+            return found
+        return fit(search.rig, found.effects, search.quick, iterations=more)
+
+    quickly = search.workers.map(briefly, list(sets))
     near = [f for f in quickly if f.cost < PLAIN.near and not _is_worse(search, f, step, search.quick)]
     whole, best = search.data.finely(SELECTION.fine), None
     for candidate in sorted(near, key=lambda f: f.n_parameters):

@@ -143,6 +143,7 @@ class PlainSettings:
     # likewise, where only one of them is there
     most_alone: tuple[tuple[str, float], ...] = (("modulus_error", 0.015), ("modal_damping", 0.25))
     plainly: int = 8  # iterations without errors
+    briefly: int = 3  # likewise, after which those go on that may come near
     punctual: float = 0.01  # of a sample: sensors that are late by less are not
     near: float = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
     needless: float = 6.0  # twice the log-likelihood that one number more may gain by chance

@@ -21,7 +21,7 @@ from workbench.gap.effects.structural import MODAL_DAMPING, MODULUS_ERROR
 from workbench.gap.localisation.evidence import Evidence
 from workbench.gap.prediction.logged_inputs import LEAST_LOGGED
 from workbench.gap.search.beside_inputs import beside_inputs, likeliest_loss
-from workbench.gap.search.fit import Fit, fit, parameters_of, slopes
+from workbench.gap.search.fit import Fit, cost_of, fit, parameters_of, slopes
 from workbench.gap.search.jointly import Step, are_plausible, fit_jointly, measured, on_their_sides, opened, size_of
 from workbench.gap.search.plain import COMMON, in_place_of_errors, is_slight, one_late
 from workbench.gap.search.search import Decision, Search, most_informative, spread_over_kinds
@@ -48,11 +48,13 @@ class Stepwise:
         is_finer: whether it goes on by finer substeps than it began with.
         is_run: whether effects have been added as long as that pays.
         singles: effects alone that are tried as the first; None for the likeliest one sample ahead.
+        known: sets of one effect that were fitted afresh already; none of their kind is again.
     """
 
     def __init__(self, search: Search, tolerance: float = 0.0, ahead: Sequence[Fit] = ()) -> None:
         self.ahead = ahead
         self.singles: Sequence[tuple[Effect, ...]] | None = None
+        self.known: Sequence[Step] = ()
         catalogue = tuple(kind for kind in search.catalogue if kind not in COMMON)
         self.search, self.tolerance = replace(search, catalogue=catalogue or search.catalogue), tolerance
         self.at_first = self.search
@@ -79,7 +81,9 @@ class Stepwise:
     def alone(self) -> list[Step]:
         """The likeliest single effects beside errors that start from none, best first."""
         sets = [f.effects for f in self._likeliest_alone()] if self.singles is None else self.singles
-        found = [s for s in self.search.workers.map(self.afresh, list(sets)) if not self._may_be_errors(s)]
+        keys = {key_of(step.effects) for step in self.known}
+        fresh = self.search.workers.map(self.afresh, [effects for effects in sets if key_of(effects) not in keys])
+        found = [s for s in (*self.known, *fresh) if not self._may_be_errors(s)]
         best = sorted(found, key=lambda s: s.fit.cost)
         if not (self.search.by_mode and best and self.explains(best[0])):
             return best
@@ -90,7 +94,9 @@ class Stepwise:
         """The likeliest single effects one sample ahead, beside errors that give way; none that a simpler equals."""
         search = self.search
         sets = [f.effects for f in self.ahead if f.effects[0].kind not in COMMON]
-        found = fitted_ahead(replace(search, held=(self.last.errors,)), sets)
+        beside = replace(search, held=(self.last.errors,))
+        without = cost_of(search.rig, beside.held, beside.ahead)
+        found = [f for f in fitted_ahead(beside, sets) if beside.surely_better(f, without, f.n_parameters)]
         chosen: list[Fit] = []
         for single in spread_over_kinds(found, 1):
             comes_to = contained(single.effects, search.rig)
@@ -98,6 +104,12 @@ class Stepwise:
             if not comes_to & as_likely:
                 chosen.append(single)
         return [f for f in chosen[: STEPWISE.singles] if f.cost < STEPWISE.near * chosen[0].cost]
+
+    def without_errors(self) -> bool:
+        """Whether few effects explain the records as well as errors of the nominal model that no model has."""
+        if not (self.last.effects or self.last.is_plausible or self.search.logged):
+            self.plain = self._without_errors(self.last)
+        return self.plain is not None
 
     def by_singles(self) -> bool:
         """Whether a likeliest single effect beside errors leaves next to nothing: then it is the first step."""
@@ -127,7 +139,7 @@ class Stepwise:
             return
         self.is_run = True
         first = self.last
-        if first.effects:  # where two hide, the errors may stand for one
+        if first.effects and self.plain is None:  # where two hide, the errors may stand for one
             self.plain = self._without_errors(first)
         if self.plain is not None:
             return
@@ -365,7 +377,7 @@ class Stepwise:
         """The step with an accelerometer late that the likeliest set has late; no small delay leads past its jumps."""
         best = min(tried, key=lambda s: s.fit.cost)
         prior, late = step.errors.target, best.effects[-1]
-        if late.kind.name not in TIMING or not self._is_timing(best, TIMING):
+        if late.kind.name not in TIMING or prior.interpolated or not self._is_timing(best, TIMING):
             return None
         jumping = {sensor.name for sensor in self.search.rig.sensors if sensor.quantity == "acceleration"}
         if late.target not in jumping.difference(prior.late):
@@ -490,10 +502,23 @@ class Stepwise:
         again = on_their_sides(search, replace(errors, target=replace(errors.target, late=(), early=())), others)
         if again.target.late != none.target.late:
             ahead = min(ahead, self._ahead(others, again), key=lambda each: each.cost)
+        straight = self._interpolated(ahead)
+        if straight is not ahead:
+            ahead, none = straight, nominal_errors(search.rig, replace(search.prior, interpolated=True))
         found = fit_jointly(search, ahead.effects[:-1], ahead.effects[-1])
         if search.by_mode or found.excess(found.noise_power) < STEPWISE.astray * float(search.nominal.mean()):
             return found
         return min(found, fit_jointly(search, effects, none), key=lambda s: s.fit.cost)
+
+    def _interpolated(self, ahead: Fit) -> Fit:
+        """The fit one sample ahead, or that of sensors which are late by straight lines, where it leaves less."""
+        *effects, errors = ahead.effects
+        delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
+        if max(map(abs, delays.values()), default=0.0) < JOINT.surely_late:
+            return ahead
+        prior = replace(self.search.prior, interpolated=True)
+        straight = self._ahead(effects, nominal_errors(self.search.rig, prior, delays))
+        return min(ahead, straight, key=lambda each: each.cost)
 
     def _ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
         """Effects and errors fitted to predictions one sample ahead."""
