@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from workbench.identification.free_decay.backbone import POWERS, _Backbone, _envelopes, left_by_backbone
+from workbench.identification.free_decay.backbone import (
+    POWERS,
+    _Backbone,
+    _envelopes,
+    left_by_backbone,
+    left_by_common_backbone,
+)
 from workbench.identification.free_decay.order import identify
 from workbench.records.record import Channel, Record
 
@@ -116,3 +122,36 @@ def test_random_beats_and_backbones_are_told_apart(level):
         omega = identify(noisy(one, level, seed)).modes.omega
         false += (omega < 1.5 * omega[0]).sum() > 1
     assert missed <= 1 and false <= 1
+
+
+def in_records(make, level=0.01):
+    """Three records of one sensor, each struck elsewhere and by another force."""
+    return [noisy(make(k), level, k) for k in range(3)]
+
+
+def test_one_mode_of_several_records_is_one_whatever_their_levels():
+    """Records of different levels see different frequencies of one mode: these are no modes of their own."""
+    found = identify(in_records(lambda k: (1.0, 0.6, 0.3)[k] * bent(rise=0.5 * (1.0, 0.6, 0.3)[k] ** 2)))
+    assert found.modes.n_modes == 1
+    assert 20.0 < found.modes.omega[0] < 20.5
+
+
+def test_two_modes_of_several_records_are_two():
+    """Each record sees them in another proportion, and a curve of its own would fit each as well."""
+
+    def beat(k):
+        poles = np.array([-0.15 + 20.0j, -0.2 + 20.2j])
+        return ((1.0, (0.5, -1.2, 0.8j)[k]) @ np.exp(np.outer(poles, TIME))).real
+
+    found = identify(in_records(beat))
+    assert found.modes.n_modes == 2
+    assert (np.abs(found.modes.poles.imag - [20.0, 20.2]) < 4.0 * found.refined.omega_std).all()
+
+
+def test_the_amplitude_of_each_record_is_found_on_the_common_backbone():
+    """Least squares of three records by one law: noise and no more is left of each."""
+    records = in_records(lambda k: (1.0, 0.6, 0.3)[k] * bent(rise=0.5 * (1.0, 0.6, 0.3)[k] ** 2))
+    noise = 0.01 * np.array([record.outputs.std() for record in records])
+    pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
+    left = left_by_common_backbone(records, 1.0 / noise, pair, np.zeros(0), offset=True)
+    np.testing.assert_allclose(left / (TIME.size * noise**2), 1.0, atol=0.1)

@@ -9,16 +9,16 @@ which is chi-square with two degrees of freedom an output where only white noise
 the strongest candidate is no stronger than the strongest of so many in noise.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Complexes, Floats
-from workbench.identification.free_decay.backbone import left_by_backbone
+from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors
@@ -51,6 +51,7 @@ class OrderSettings:
     # times the frequency step of the transform, by which rates of decay go on that need no step finer than a quarter
     # of theirs: what they leave after the shorter transform is e^-25
     coarser: float = 4.0
+    decided: float = 0.1  # χ² that a step promises, below which a fit that only decides has decided
     least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
@@ -58,6 +59,8 @@ class OrderSettings:
 
 
 ORDER = OrderSettings()
+DECIDES: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER.decided}
+FULLY: Mapping[str, Any] = {}
 
 
 @one_blas_thread
@@ -172,6 +175,7 @@ class _FreeDecay:
         # A mode is two amplitudes a signal and its pole, chosen among all cells of the grid.
         self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
         self.distinct: dict[bytes, bool] = {}
+        self.halves: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
         self.nothing = self._fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
 
@@ -212,7 +216,7 @@ class _FreeDecay:
         return candidate
 
     def extended(self, model: _Model, candidate: complex) -> _Model:
-        return self._fitted(np.append(model.poles, candidate), model.weights, SELECTION.few_steps)
+        return self._fitted(np.append(model.poles, candidate), model.weights, DECIDES)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
         """Noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
@@ -233,10 +237,30 @@ class _FreeDecay:
         stays = np.abs(old - model.poles) < band
         away = np.abs(old.imag - new.imag) > band + abs(new.real)
         after[:-1] &= before | ~(stays & away)
-        return bool(after.sum() > before.sum())
+        splits = bool(after.sum() > before.sum())
+        if splits:
+            self.halves.append((complex(new), self.gain(model, trial)))
+        return splits
 
     def settled(self, model: _Model) -> _Model:
-        return self._fitted(model.poles, model.weights)
+        return self._fitted(self._reconsidered(model).poles, model.weights)
+
+    def _reconsidered(self, model: _Model) -> _Model:
+        """With what seemed to split a mode while others were missing, each judged beside all the others of its kind."""
+        taken: list[int] = []
+        found: list[complex] = []
+        for pole, _ in sorted(self.halves, key=lambda half: -half[1]):
+            splits = int(np.argmin(np.abs(model.poles.imag - pole.imag)))
+            if splits not in taken:
+                taken, found = [*taken, splits], [*found, pole]
+        self.halves.clear()
+        n, trial = model.poles.size, model
+        with suppress(np.linalg.LinAlgError):
+            spurious = np.zeros(0, bool)
+            trial = self._fitted(np.append(model.poles, found), model.weights, DECIDES)
+            while trial.poles.size > n and (spurious := self._spurious(trial.poles, trial)).any():
+                trial = self._fitted(trial.poles[~spurious], trial.weights, DECIDES)
+        return trial if trial.poles.size > n else model
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
         """The weakest that is spurious, or else the modes whose amplitudes are weak or that stand close to another."""
@@ -290,49 +314,47 @@ class _FreeDecay:
         away = away.min(axis=1)
         return np.asarray(damped | (away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width)))
 
-    def _fitted(self, poles: np.ndarray, weights: np.ndarray, most_steps: int = FIT.most_steps) -> _Model:
+    def _fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = FULLY) -> _Model:
         """Poles after a search, sensors then weighted by the noise found in each record."""
         if poles.size == 0:
             residuals = [grid.nothing for grid in self.grids]
         else:
-            poles, fits, *_ = search(self.records, poles, weights, True, most_steps, budget=self.budget)
+            poles, fits, *_ = search(self.records, poles, weights, True, budget=self.budget, **how)
             residuals = [fit.residual for fit in fits]
         n = np.array([r.shape[0] for r in residuals])
         return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(_squares(residuals), self.round_off), n)), residuals)
 
     def _without(self, model: _Model, r: int) -> _Model:
-        return self._fitted(np.delete(model.poles, r), model.weights, SELECTION.few_steps)
+        return self._fitted(np.delete(model.poles, r), model.weights, DECIDES)
 
     def _spurious(self, poles: np.ndarray, model: _Model) -> np.ndarray:
         """Which of some poles are spurious, in the noise that a model leaves."""
         fits = [project(record, poles, True) for record in self.records]
         shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(fits, model.weights, strict=True)])
+        strength = np.linalg.norm(shapes, axis=0)
+        if self.records[0].n_outputs == 1:  # the modes of one sensor have no shape, in however many records
+            shapes = strength[None]
 
         def distinct(r: int, s: int) -> bool:
             return self._distinct(model, poles, r, s)
 
-        return spurious_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width, distinct)
+        return spurious_modes(poles, shapes, strength, self.grids[0].bin_width, distinct)
 
     def _distinct(self, model: _Model, poles: np.ndarray, r: int, s: int) -> bool:
-        """Whether one sensor that sees a beat of modes r and s is likelier to see both than a single nonlinear mode."""
-        asked = np.round(np.r_[poles[r], poles[s], np.delete(poles, [r, s])] / self.grids[0].bin_width, 1).tobytes()
+        """Whether one sensor that sees a beat of modes r and s is likelier to see both than a single nonlinear mode.
+
+        In the records as measured: a filter that whitens the residual of one mode removes most of its evidence.
+        """
+        width = self.grids[0].bin_width
+        middle, half = band_about(poles[[r, s]], width)
+        beside = np.delete(poles, [r, s])
+        beside = beside[np.abs(beside.imag - middle) < half]
+        asked = np.round(np.r_[poles[r], poles[s], beside] / width, 1).tobytes()
         if asked not in self.distinct:
             self.distinct[asked] = False
             with suppress(np.linalg.LinAlgError):
-                self.distinct[asked] = self._gain_of_two(poles, r, s) > self.threshold(model, poles[r])
+                self.distinct[asked] = are_two(self.measured, poles, r, s, self.limit)
         return self.distinct[asked]
-
-    def _gain_of_two(self, poles: np.ndarray, r: int, s: int) -> float:
-        """Twice the log likelihood ratio of both modes over one on a backbone.
-
-        In the record as measured: a filter that whitens the residual of one mode removes most of its evidence.
-        """
-        [record] = self.measured
-        poles, [fit], *_ = search([record], poles, np.ones((1, 1)), True, SELECTION.few_steps, budget=self.budget)
-        both, pair, others = float(fit.squares.sum()), poles[[r, s]], np.delete(poles, [r, s])
-        one = left_by_backbone(record, pair, others, offset=True, enough=both)
-        floor = FIT.round_off * float((record.outputs**2).sum()) + 1e-300
-        return record.n_samples * float(np.log((one + floor) / (both + floor)))
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the residual's spectrum, 1 if white."""
