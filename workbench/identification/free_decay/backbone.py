@@ -73,16 +73,16 @@ def are_two(records: Sequence[Record], poles: Complexes, r: int, s: int, thresho
         return np.asarray(size * np.log((one + floor) / (both + floor)))
 
     # Of more parameters: two modes have 4 + 4 n of n records, one with poles of each 4 n, on a backbone of each 8 n.
-    price, needed = (float(np.log(size.sum())), 0.0) if len(records) > 1 else (0.0, threshold)
+    price = float(np.log(size.sum())) if len(records) > 1 else 0.0
     own = np.array([_left_by_modes([band], pair[[np.argmax(np.abs(band.amplitudes))]])[0] for band in bands])
     gain = gains(own) - 4.0 * price / len(records)
-    enough = both * np.exp((needed - 4.0 * price * (1.0 - 1.0 / len(records))) / size)
+    enough = both * np.exp((threshold - 4.0 * price * (1.0 - 1.0 / len(records))) / size)
     for i in np.argsort(-gain):
-        if gain.sum() <= needed:
+        if gain.sum() <= threshold:
             return False
         own[i] = left_by_backbone(bands[i], pair, enough=float(enough[i]))
         gain[i] = min(gain[i], gains(own)[i] + 4.0 * price * (1.0 - 1.0 / len(records)))
-    if gain.sum() <= needed:
+    if gain.sum() <= threshold:
         return False
     if len(records) == 1:
         return True

@@ -56,9 +56,12 @@ class OrderSettings:
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
+    same: float = 0.05  # bandwidths that poles may move before it is asked anew whether they are two
 
 
 ORDER = OrderSettings()
+# Poles of two modes and of those beside them, and whether the two are two; of records as measured.
+Verdicts = list[tuple[Complexes, bool]]
 DECIDES: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER.decided}
 FULLY: Mapping[str, Any] = {}
 
@@ -109,7 +112,8 @@ def identify_within(
         return found if found is not None else _refuse(records)
     most = min(most_modes or ORDER.most_modes, fit_in)
     search_time = budget.share(SELECTION.search_share)
-    problem, model = _selected(records, most, false_alarm, search_time)
+    verdicts: Verdicts = []
+    problem, model = _selected(records, most, false_alarm, search_time, records, verdicts)
     for _ in range(ORDER.whitened):
         # While modes are left the residual is no noise.
         if search_time.unfinished or search_time.spent("whitening of the noise"):
@@ -117,7 +121,7 @@ def identify_within(
         white = whitened(records, problem.oscillating(model))
         if white is None:
             break
-        problem, model = _selected(white, most, false_alarm, search_time, records)
+        problem, model = _selected(white, most, false_alarm, search_time, records, verdicts)
     problem.budget = budget
     return problem.report(model, records) if model.poles.size else _refuse(records)
 
@@ -127,9 +131,10 @@ def _selected(
     most_modes: int,
     false_alarm: float,
     budget: Budget,
-    measured: Sequence[Record] | None = None,
+    measured: Sequence[Record],
+    verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
-    problem = _FreeDecay(records, false_alarm, measured or records, budget)
+    problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
     selection = Stepwise(problem, most_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
     model = selection.select(problem.nothing)
     problem.rejected = selection.rejected
@@ -162,7 +167,12 @@ class _FreeDecay:
     """The `searches.Selection` of free decays."""
 
     def __init__(
-        self, records: Sequence[Record], false_alarm: float, measured: Sequence[Record], budget: Budget
+        self,
+        records: Sequence[Record],
+        false_alarm: float,
+        measured: Sequence[Record],
+        budget: Budget,
+        verdicts: "Verdicts",
     ) -> None:
         longest = max(record.n_samples for record in records)
         self.records, self.measured, self.budget = records, measured, budget
@@ -174,7 +184,9 @@ class _FreeDecay:
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
         # A mode is two amplitudes a signal and its pole, chosen among all cells of the grid.
         self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
-        self.distinct: dict[bytes, bool] = {}
+        # Of several records, where two are asked about they are not chosen any more.
+        self.two = self.limit if len(records) == 1 else float(chi2.isf(false_alarm, signals + 2))
+        self.verdicts = verdicts
         self.halves: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
         self.nothing = self._fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
@@ -346,15 +358,17 @@ class _FreeDecay:
         In the records as measured: a filter that whitens the residual of one mode removes most of its evidence.
         """
         width = self.grids[0].bin_width
-        middle, half = band_about(poles[[r, s]], width)
-        beside = np.delete(poles, [r, s])
-        beside = beside[np.abs(beside.imag - middle) < half]
-        asked = np.round(np.r_[poles[r], poles[s], beside] / width, 1).tobytes()
-        if asked not in self.distinct:
-            self.distinct[asked] = False
-            with suppress(np.linalg.LinAlgError):
-                self.distinct[asked] = are_two(self.measured, poles, r, s, self.limit)
-        return self.distinct[asked]
+        pair, others = poles[[r, s]], np.delete(poles, [r, s])
+        middle, half = band_about(pair, width)
+        asked = np.r_[pair, np.sort_complex(others[np.abs(others.imag - middle) < half])]
+        for known, verdict in self.verdicts:
+            if known.size == asked.size and (np.abs(known - asked) < ORDER.same * (np.abs(asked.real) + width)).all():
+                return verdict
+        verdict = False
+        with suppress(np.linalg.LinAlgError):
+            verdict = are_two(self.measured, poles, r, s, self.two)
+        self.verdicts.append((asked, verdict))
+        return verdict
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the residual's spectrum, 1 if white."""
