@@ -7,9 +7,9 @@ The envelope r and phase θ of the one follow a backbone, smooth and one for eac
 with powers p of 0, 1, 2 (stiffness and damping that rise or fall), 0, ½, 1 (joints that slip) or -1, 0, 1 (friction):
 eight parameters with A, as many as two linear modes have, so that the likelier model is preferred.
 
-Of several records two linear modes have the same poles in all. One mode has a backbone of all, λ_k a_i^p_k in the record
-that begins with amplitude a_i; or each record has its own, as clamping, warmth and what was loaded before differ from
-test to test. The more parameters are paid for by Schwarz's criterion.
+Of several records two linear modes have the same poles in all. One mode has a backbone of all, λ_k a_i^p_k in the
+record that begins with amplitude a_i; or each record has a pole or a backbone of its own, as clamping, warmth and what
+was loaded before differ from test to test. The more parameters are paid for by Schwarz's criterion.
 
 The models are compared in the lines of the transform about the two. There modes elsewhere, found or not, leave but a
 polynomial of low degree, as z in Σ_t z^t e^-iωt = (1 - z^n) / (1 - z e^-iω) is far from e^iω.
@@ -37,7 +37,7 @@ class BackboneSettings:
     steps: int = 150  # of the envelope in time
     faded: float = 7.0  # nepers from which on the backbone stays as it is
     died: float = 60.0  # nepers to which the envelope is followed
-    first_tries: int = 8  # evaluations of the fit from each start
+    first_tries: int = 20  # evaluations of the fit from each start
     most_tries: int = 40  # and of the best of them
     settled: float = 1e-4  # of the sum of squares: a lesser decrease ends it
     lasts: float = 14.0  # nepers of the slower of two modes, after which a record tells nothing of them: e^-14 is 1e-6
@@ -72,7 +72,8 @@ def are_two(records: Sequence[Record], poles: Complexes, r: int, s: int, thresho
     def gains(one: Floats) -> Floats:
         return np.asarray(size * np.log((one + floor) / (both + floor)))
 
-    # Of more parameters: two modes have 4 + 4 n of n records, one with poles of each 4 n, on a backbone of each 8 n.
+    # Of n records two modes have 4 + 4 n parameters; one has 4 n by a pole of each, 8 n by a backbone of each, and
+    # 5 + 3 n by one of all.
     price = float(np.log(size.sum())) if len(records) > 1 else 0.0
     own = np.array([_left_by_modes([band], pair[[np.argmax(np.abs(band.amplitudes))]])[0] for band in bands])
     gain = gains(own) - 4.0 * price / len(records)
@@ -131,7 +132,8 @@ class _Band:
         """The lines, (2 n_lines, n_motions), of the real and the imaginary parts of motions (n_motions, n_samples)."""
         found = fft(motions, axis=1) / np.sqrt(0.5 * self.time.size)
         one, other = found[:, self.lines].T, found[:, -self.lines].conj().T
-        return tuple(np.vstack([z.real, z.imag]) for z in (0.5 * (one + other), -0.5j * (one - other)))
+        real, imaginary = 0.5 * (one + other), -0.5j * (one - other)
+        return np.vstack([real.real, real.imag]), np.vstack([imaginary.real, imaginary.imag])
 
     def apart(self, columns: Floats) -> Floats:
         return np.asarray(columns - self.beside @ (self.beside.T @ columns))
@@ -198,7 +200,7 @@ class _Modes:
             with np.errstate(over="ignore", invalid="ignore"):
                 motions = np.exp(np.outer(poles, band.time))
                 slopes = band.time * motions
-            found.append(band.left(motions, np.vstack([slopes, 1j * slopes]), [*range(poles.size)] * 2))
+                found.append(band.left(motions, np.vstack([slopes, 1j * slopes]), [*range(poles.size)] * 2))
         return found
 
     def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]:
@@ -228,16 +230,15 @@ def left_by_backbone(band: _Band, pair: Complexes, *, enough: float = 0.0) -> fl
         pair: (2,) poles of the two, rad/s.
         enough: what need not be gone below.
     """
-    best: tuple[float, _Backbone, Floats] | None = None
+    tried: list[tuple[float, _Backbone, Floats]] = []
     for powers in POWERS:
         model = _Backbone(band, np.array(powers))
         for start in model.starts(pair):
             at = model.once.least(start, BACKBONE.first_tries)
-            left = float((model.once(at)[0] ** 2).sum())
-            if left <= enough:
-                return left
-            best = min(best or (np.inf, model, at), (left, model, at), key=lambda each: each[0])
-    _, model, at = best
+            tried.append((float((model.once(at)[0] ** 2).sum()), model, at))
+            if tried[-1][0] <= enough:
+                return tried[-1][0]
+    _, model, at = min(tried, key=lambda each: each[0])
     return float((model.once(model.once.least(at))[0] ** 2).sum())
 
 
@@ -358,7 +359,7 @@ class _Common:
         scaled = [w * c * np.exp(a * self.powers) for w, c, a in zip(self.weights, columns, level, strict=True)]
         known = np.concatenate([w * slope for w, slope in zip(self.weights, slopes, strict=True)])
         start = np.linalg.lstsq(np.vstack(scaled), known, rcond=None)[0]
-        return np.r_[start.real, start.imag, level[self.free]]
+        return np.concatenate([start.real, start.imag, level[self.free]])
 
     def left(self, unknowns: Floats) -> Floats:
         """Sum of squares of each record, (n_records,)."""

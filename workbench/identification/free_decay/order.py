@@ -56,6 +56,7 @@ class OrderSettings:
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
+    most_left: float = 0.5  # share of a record beside modes that explain it
     same: float = 0.05  # bandwidths that poles may move before it is asked anew whether they are two
 
 
@@ -114,6 +115,7 @@ def identify_within(
     search_time = budget.share(SELECTION.search_share)
     verdicts: Verdicts = []
     problem, model = _selected(records, most, false_alarm, search_time, records, verdicts)
+    explained = problem.explains(model)
     for _ in range(ORDER.whitened):
         # While modes are left the residual is no noise.
         if search_time.unfinished or search_time.spent("whitening of the noise"):
@@ -121,7 +123,11 @@ def identify_within(
         white = whitened(records, problem.oscillating(model))
         if white is None:
             break
-        problem, model = _selected(white, most, false_alarm, search_time, records, verdicts)
+        again, fewer = _selected(white, most, false_alarm, search_time, records, verdicts)
+        # What a mode that depends on amplitude leaves is no noise either, and whitens the mode away.
+        if not fewer.poles.size and explained:
+            break
+        problem, model = again, fewer
     problem.budget = budget
     return problem.report(model, records) if model.poles.size else _refuse(records)
 
@@ -172,7 +178,7 @@ class _FreeDecay:
         false_alarm: float,
         measured: Sequence[Record],
         budget: Budget,
-        verdicts: "Verdicts",
+        verdicts: "Verdicts | None" = None,
     ) -> None:
         longest = max(record.n_samples for record in records)
         self.records, self.measured, self.budget = records, measured, budget
@@ -186,7 +192,7 @@ class _FreeDecay:
         self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
         # Of several records, where two are asked about they are not chosen any more.
         self.two = self.limit if len(records) == 1 else float(chi2.isf(false_alarm, signals + 2))
-        self.verdicts = verdicts
+        self.verdicts = [] if verdicts is None else verdicts
         self.halves: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
         self.nothing = self._fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
@@ -285,6 +291,11 @@ class _FreeDecay:
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
             if strength < SELECTION.weak * self.threshold(model, pole) or near < SELECTION.close * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
+
+    def explains(self, model: _Model) -> bool:
+        """Whether the modes are most of every record."""
+        left = _squares(model.residuals).sum(axis=1)
+        return bool((left < ORDER.most_left * _squares([grid.nothing for grid in self.grids]).sum(axis=1)).all())
 
     def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and hardly grow; others may be noise that is not white."""
