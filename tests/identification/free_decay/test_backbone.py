@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from workbench.identification.free_decay.backbone import POWERS, _Backbone, _envelopes, left_by_backbone
+from workbench.identification.free_decay.backbone import (
+    POWERS,
+    _Backbone,
+    _Band,
+    _envelopes,
+    are_two,
+    left_by_backbone,
+    left_by_common_backbone,
+)
 from workbench.identification.free_decay.order import identify
+from workbench.identification.ring_down import ring_down
 from workbench.records.record import Channel, Record
 
 DT = 0.02
@@ -35,9 +44,8 @@ def test_a_mode_on_a_backbone_leaves_noise_and_no_more():
     record = noisy(bent(), 0.01, 0)
     record = Record(DT, record.outputs + beside, record.output_channels)
     pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
-    enough = 1.1 * TIME.size * noise**2  # squares of the noise stray by 4 % (one sigma)
-    left = left_by_backbone(record, pair, np.array([-0.1 + 50.0j]), offset=True, enough=enough)
-    assert 0.9 * TIME.size * noise**2 < left < enough
+    band = _Band(record, pair, np.array([-0.1 + 50.0j]))
+    assert left_by_backbone(band, pair) == pytest.approx(band.y.size * noise**2, rel=0.4)
 
 
 @pytest.mark.parametrize("powers", POWERS)
@@ -53,14 +61,15 @@ def test_the_envelope_follows_its_differential_equation(powers):
 
 
 def test_each_backbone_that_is_tried_is_followed_once(monkeypatch):
-    asked, fitted = [], _Backbone._fitted
+    asked, fitted = [], _Backbone.fitted
 
     def counted(self, unknowns):
         asked.append(unknowns.tobytes())
         return fitted(self, unknowns)
 
-    monkeypatch.setattr(_Backbone, "_fitted", counted)
-    left_by_backbone(noisy(bent(), 0.01, 0), np.array([-0.15 + 20.3j, -0.3 + 20.05j]), np.zeros(0), offset=True)
+    monkeypatch.setattr(_Backbone, "fitted", counted)
+    pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
+    left_by_backbone(_Band(noisy(bent(), 0.01, 0), pair, np.zeros(0, complex)), pair)
     assert asked and all(one != after for one, after in zip(asked, asked[1:]))
 
 
@@ -116,3 +125,69 @@ def test_random_beats_and_backbones_are_told_apart(level):
         omega = identify(noisy(one, level, seed)).modes.omega
         false += (omega < 1.5 * omega[0]).sum() > 1
     assert missed <= 1 and false <= 1
+
+
+def in_records(make, level=0.01):
+    """Three records of one sensor, each struck elsewhere and by another force."""
+    return [noisy(make(k), level, k) for k in range(3)]
+
+
+def test_one_mode_of_several_records_is_one_whatever_their_levels():
+    """Records of different levels see different frequencies of one mode: these are no modes of their own."""
+    found = ring_down(in_records(lambda k: (1.0, 0.6, 0.3)[k] * bent(rise=0.5 * (1.0, 0.6, 0.3)[k] ** 2)), start=0.0)
+    assert found.modes.n_modes == 1
+    assert 20.0 < found.modes.omega[0] < 20.5
+    assert found.by_amplitude.depends.all()
+
+
+def test_one_mode_that_differs_from_record_to_record_is_one():
+    """Linear in each: clamped anew, or warmer."""
+    found = ring_down(in_records(lambda k: bent(omega=20.0 + 0.12 * k, rise=0.0)), start=0.0)
+    assert found.modes.n_modes == 1
+    assert 20.0 < found.modes.omega[0] < 20.24
+    assert found.by_amplitude.depends.all()
+
+
+def beat(k):
+    """In another proportion in each record, and a curve of its own would fit each as well."""
+    poles = np.array([-0.15 + 20.0j, -0.2 + 20.2j])
+    return ((1.0, (0.5, -1.2, 0.8j)[k]) @ np.exp(np.outer(poles, TIME))).real
+
+
+def test_two_modes_of_several_records_are_two():
+    found = identify(in_records(beat))
+    assert found.modes.n_modes == 2
+    assert (np.abs(found.modes.poles.imag - [20.0, 20.2]) < 4.0 * found.refined.omega_std).all()
+
+
+def test_what_is_elsewhere_and_not_found_yet_does_not_make_two_modes_one():
+    """It is six times as strong as the weaker of the two."""
+
+    def beside(k):
+        return beat(k) + 3.0 * (1j**k * np.exp((-0.3 + 60.0j) * TIME)).real
+
+    records, poles = in_records(beside), np.array([-0.15 + 20.0j, -0.2 + 20.2j])
+    assert are_two(records, poles, 1, 0, 30.0)
+
+
+def test_pairs_beside_each_other_are_found_while_either_hides_the_other():
+    """Half of one is missing while the other is judged, and the other way round."""
+    poles = np.array([-0.39 + 37.6j, -0.23 + 38.14j, -0.29 + 42.38j, -0.37 + 42.71j])
+
+    def pairs(k):
+        rng = np.random.default_rng([k, 5])
+        return ((rng.standard_normal(4) + 1j * rng.standard_normal(4)) @ np.exp(np.outer(poles, TIME))).real
+
+    found = identify(in_records(pairs, level=0.001))
+    assert found.modes.n_modes == 4
+    assert (np.abs(found.modes.poles - poles) < 0.02).all()
+
+
+def test_the_amplitude_of_each_record_is_found_on_the_common_backbone():
+    """Least squares of three records by one law: noise and no more is left of each."""
+    records = in_records(lambda k: (1.0, 0.6, 0.3)[k] * bent(rise=0.5 * (1.0, 0.6, 0.3)[k] ** 2))
+    noise = 0.01 * np.array([record.outputs.std() for record in records])
+    pair = np.array([-0.15 + 20.3j, -0.3 + 20.05j])
+    bands = [_Band(record, pair, np.zeros(0, complex)) for record in records]
+    left = left_by_common_backbone(bands, 1.0 / noise, pair)
+    np.testing.assert_allclose(left / (bands[0].y.size * noise**2), 1.0, atol=0.4)

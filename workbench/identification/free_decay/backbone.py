@@ -1,63 +1,259 @@
-"""One mode whose frequency and damping depend on amplitude: the alternative model of a beat in one sensor.
+"""Two linear modes that overlap in one sensor, or one whose frequency and damping depend on amplitude?
 
-Its envelope r and phase θ follow a backbone, smooth and one for each amplitude (Nayfeh & Mook 1979, 2.3),
+The envelope r and phase θ of the one follow a backbone, smooth and one for each amplitude (Nayfeh & Mook 1979, 2.3),
 
     r' = -σ(r) r,   θ' = ω(r),   -σ + iω = Σ_k λ_k r^p_k,      y = Re A exp(Σ_k λ_k ∫ r^p_k dt),   r(0) = 1
 
 with powers p of 0, 1, 2 (stiffness and damping that rise or fall), 0, ½, 1 (joints that slip) or -1, 0, 1 (friction):
 eight parameters with A, as many as two linear modes have, so that the likelier model is preferred.
+
+Of several records two linear modes have the same poles in all. One mode has a backbone of all, λ_k a_i^p_k in the
+record that begins with amplitude a_i; or each record has a pole or a backbone of its own, as clamping, warmth and what
+was loaded before differ from test to test. The more parameters are paid for by Schwarz's criterion.
+
+The models are compared in the lines of the transform about the two. There modes elsewhere, found or not, leave but a
+polynomial of low degree, as z in Σ_t z^t e^-iωt = (1 - z^n) / (1 - z e^-iω) is far from e^iω.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
-from scipy.interpolate import CubicHermiteSpline
+from scipy.fft import fft
 from scipy.optimize import least_squares
 
-from workbench.arrays import Floats
+from workbench.arrays import Complexes, Floats
 from workbench.identification.signal.projection import project
+from workbench.identification.signal.searches import FIT
 from workbench.records.record import Record
 
 
 @dataclass(frozen=True)
 class BackboneSettings:
-    """Constants of the fit of a backbone."""
+    """Constants of the comparison."""
 
     steps: int = 150  # of the envelope in time
     faded: float = 7.0  # nepers from which on the backbone stays as it is
     died: float = 60.0  # nepers to which the envelope is followed
-    most_tries: int = 40  # evaluations of the fit
+    first_tries: int = 20  # evaluations of the fit from each start
+    most_tries: int = 40  # and of the best of them
+    settled: float = 1e-4  # of the sum of squares: a lesser decrease ends it
+    lasts: float = 14.0  # nepers of the slower of two modes, after which a record tells nothing of them: e^-14 is 1e-6
+    samples_each: int = 20  # for each mode, that such a record holds at least
     slightly: float = 1e-5  # of the decay rate: step of differences
     largest: float = 1e100  # beyond this a motion diverges
     beyond: float = 10.0  # times the record: what its residual is then taken for
+    lines: float = 10.0  # and
+    bandwidths: float = 4.0  # about the two, in which they are compared
+    smooth: int = 4  # coefficients of the polynomial that modes elsewhere leave there
 
 
 BACKBONE = BackboneSettings()
 POWERS = ((0.0, 1.0, 2.0), (0.0, 0.5, 1.0), (0.0, -1.0, 1.0))
 
 
-def left_by_backbone(
-    record: Record, pair: np.ndarray, others: np.ndarray, *, offset: bool, enough: float = 0.0
-) -> float:
-    """Least sum of squares that one mode on a backbone leaves of a record of one output, in place of two linear ones.
+def are_two(records: Sequence[Record], poles: Complexes, r: int, s: int, threshold: float) -> bool:
+    """Whether modes r and s are likelier than one on a backbone of each record, or of all.
 
     Args:
-        record: free decay.
+        records: free decay, of one output.
+        poles: (n_modes,) of a fit with both, rad/s.
+        r, s: which may be one.
+        threshold: of twice the logarithm of the likelihood ratio, for a model of no more parameters.
+    """
+    pair, others = poles[[r, s]], np.delete(poles, [r, s])
+    bands = [_Band(record, pair, others) for record in records]
+    size = np.array([band.size for band in bands])
+    floor = np.array([band.round_off for band in bands])
+    both = _left_by_modes(bands, pair)
+
+    def gains(one: Floats) -> Floats:
+        return np.asarray(size * np.log((one + floor) / (both + floor)))
+
+    # Of n records two modes have 4 + 4 n parameters; one has 4 n by a pole of each, 8 n by a backbone of each, and
+    # 5 + 3 n by one of all.
+    price = float(np.log(size.sum())) if len(records) > 1 else 0.0
+    own = np.array([_left_by_modes([band], pair[[np.argmax(np.abs(band.amplitudes))]])[0] for band in bands])
+    gain = gains(own) - 4.0 * price / len(records)
+    enough = both * np.exp((threshold - 4.0 * price * (1.0 - 1.0 / len(records))) / size)
+    for i in np.argsort(-gain):
+        if gain.sum() <= threshold:
+            return False
+        own[i] = left_by_backbone(bands[i], pair, enough=float(enough[i]))
+        gain[i] = min(gain[i], gains(own)[i] + 4.0 * price * (1.0 - 1.0 / len(records)))
+    if gain.sum() <= threshold:
+        return False
+    if len(records) == 1:
+        return True
+    common = left_by_common_backbone(bands, np.sqrt(size / (both + floor)), pair)
+    return float(gains(common).sum()) > (len(records) - 1) * price
+
+
+def band_about(pair: Complexes, bin_width: float) -> tuple[float, float]:
+    """Centre and half width of the band in which two modes are compared, rad/s."""
+    low, high = float(pair.imag.min()), float(pair.imag.max())
+    wide = BACKBONE.bandwidths * float(np.abs(pair.real).sum()) + BACKBONE.lines * bin_width
+    return 0.5 * (low + high), 0.5 * (high - low) + wide
+
+
+class _Band:
+    """The lines of a record about two modes, for as long as these last; without what is elsewhere.
+
+    Attributes:
+        time: (n_samples,) s.
+        y: (2 n_lines,) real and imaginary parts of the lines, each of the noise that a sample has.
+        amplitudes: (2,) complex, of the two.
+        size: degrees of freedom of y.
+        round_off: of a sum of squares.
+    """
+
+    def __init__(self, record: Record, pair: Complexes, others: Complexes) -> None:
+        record = while_it_lasts(record, pair, pair.size + others.size)
+        n, dt, y = record.n_samples, record.sample_time, record.outputs[0]
+        self.time: Floats = dt * np.arange(n, dtype=float)
+        middle, half = band_about(pair, 2.0 * np.pi / (n * dt))
+        first, last = (int(np.ceil((middle + side * half) * n * dt / (2.0 * np.pi))) for side in (-1.0, 1.0))
+        self.lines = np.arange(max(first, 1), max(min(last, (n + 1) // 2), 2))
+        amplitudes = project(record, np.append(pair, others), True).complex_amplitudes[0]
+        self.amplitudes = amplitudes[:2]
+        within = np.abs(others.imag - middle) < half + np.abs(others.real)
+        elsewhere = (amplitudes[2:][~within] @ np.exp(np.outer(others[~within], self.time))).real
+        beside = np.hstack(self.seen(np.exp(np.outer(others[within], self.time))))
+        smooth = np.linspace(-1.0, 1.0, self.lines.size)[:, None] ** np.arange(BACKBONE.smooth)
+        beside = np.hstack([beside, np.kron(np.eye(2), smooth)])
+        self.beside = np.linalg.qr(beside / np.maximum(np.linalg.norm(beside, axis=0), 1e-300))[0]
+        self.y = self.apart(self.seen((y - elsewhere)[None])[0])[:, 0]
+        self.size = max(self.y.size - beside.shape[1], 1)
+        self.round_off = FIT.round_off * float(y @ y) + 1e-300
+
+    def seen(self, motions: np.ndarray) -> tuple[Floats, Floats]:
+        """The lines, (2 n_lines, n_motions), of the real and the imaginary parts of motions (n_motions, n_samples)."""
+        found = fft(motions, axis=1) / np.sqrt(0.5 * self.time.size)
+        one, other = found[:, self.lines].T, found[:, -self.lines].conj().T
+        real, imaginary = 0.5 * (one + other), -0.5j * (one - other)
+        return np.vstack([real.real, real.imag]), np.vstack([imaginary.real, imaginary.imag])
+
+    def apart(self, columns: Floats) -> Floats:
+        return np.asarray(columns - self.beside @ (self.beside.T @ columns))
+
+    def left(self, motions: Complexes, slopes: Complexes, which: Sequence[int]) -> tuple[Floats, Floats]:
+        """What motions (n_motions, n_samples) leave, A projected out (Kaufman 1975), and how that goes with unknowns.
+
+        Args:
+            motions: complex, of free amplitudes A.
+            slopes: (n_unknowns, n_samples) of a motion by each unknown.
+            which: motion that each unknown is of.
+        """
+        if not (np.abs(slopes) < BACKBONE.largest).all():
+            return BACKBONE.beyond * np.abs(self.y), np.zeros((self.y.size, len(slopes)))
+        real, imaginary = self.seen(np.vstack([motions, slopes]))
+        p = len(motions)
+        q, r = np.linalg.qr(self.apart(np.hstack([real[:, :p], imaginary[:, :p]])))
+        along = q.T @ self.y
+        a, b = np.linalg.lstsq(r, along, rcond=1e-12)[0].reshape(2, p)[:, list(which)]
+        columns = self.apart(real[:, p:] * a + imaginary[:, p:] * b)
+        return self.y - q @ along, -(columns - q @ (q.T @ columns))
+
+
+def while_it_lasts(record: Record, pair: np.ndarray, n_modes: int) -> Record:
+    """The part of a free decay that tells of two of its modes, poles in rad/s."""
+    last = BACKBONE.lasts / max(float(-pair.real.max()) * record.sample_time, 1e-300)
+    last = max(last, BACKBONE.samples_each * n_modes)
+    if last >= record.n_samples - 1:
+        return record
+    return record.between(record.start_time, record.start_time + int(last) * record.sample_time)
+
+
+class _Fitted(Protocol):
+    """What is left of a record, and its slopes, at some unknowns."""
+
+    def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]: ...
+
+
+class _Once:
+    """The same, kept for the slopes that are asked for where what is left was."""
+
+    def __init__(self, of: _Fitted) -> None:
+        self.of, self.at, self.found = of, np.zeros(0), (np.zeros(0), np.zeros(0))
+
+    def __call__(self, unknowns: Floats) -> tuple[Floats, Floats]:
+        if not np.array_equal(self.at, unknowns):
+            self.at, self.found = unknowns.copy(), self.of.fitted(unknowns)
+        return self.found
+
+    def least(self, start: Floats, most_tries: int = BACKBONE.most_tries) -> Floats:
+        how = {"x_scale": "jac", "max_nfev": most_tries, "ftol": BACKBONE.settled}
+        return np.asarray(least_squares(lambda x: self(x)[0], start, lambda x: self(x)[1], **how).x)
+
+
+class _Modes:
+    """Linear modes of the same poles in all records."""
+
+    def __init__(self, bands: Sequence[_Band], weights: Floats) -> None:
+        self.bands, self.weights = bands, weights
+
+    def each(self, unknowns: Floats) -> list[tuple[Floats, Floats]]:
+        poles, found = unknowns[: unknowns.size // 2] + 1j * unknowns[unknowns.size // 2 :], []
+        for band in self.bands:
+            with np.errstate(over="ignore", invalid="ignore"):
+                motions = np.exp(np.outer(poles, band.time))
+                slopes = band.time * motions
+                found.append(band.left(motions, np.vstack([slopes, 1j * slopes]), [*range(poles.size)] * 2))
+        return found
+
+    def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]:
+        each = self.each(unknowns)
+        return (
+            np.concatenate([w * left for w, (left, _) in zip(self.weights, each, strict=True)]),
+            np.vstack([w * slopes for w, (_, slopes) in zip(self.weights, each, strict=True)]),
+        )
+
+
+def _left_by_modes(bands: Sequence[_Band], poles: Complexes) -> Floats:
+    """Sums of squares of each record, (n_records,), that modes near some poles leave where they are likeliest."""
+    at = np.r_[poles.real, poles.imag]
+    model = _Modes(bands, np.ones(len(bands)))
+    if len(bands) > 1:
+        left = np.array([float(e @ e) for e, _ in model.each(at)])
+        model.weights = np.sqrt([band.size for band in bands] / (left + [band.round_off for band in bands]))
+    at = _Once(model).least(at)
+    return np.array([float(left @ left) for left, _ in model.each(at)])
+
+
+def left_by_backbone(band: _Band, pair: Complexes, *, enough: float = 0.0) -> float:
+    """Least sum of squares that one mode on a backbone leaves, in place of two linear ones.
+
+    Args:
+        band: about the two.
         pair: (2,) poles of the two, rad/s.
-        others: (n_others,) of linear modes beside them, which are held.
-        offset: whether the output may also hold a constant.
         enough: what need not be gone below.
     """
-    amplitudes = project(record, np.append(pair, others), offset).complex_amplitudes[0, :2]
-    least = np.inf
+    tried: list[tuple[float, _Backbone, Floats]] = []
     for powers in POWERS:
-        for left in _Backbone(record, np.array(powers), others, offset).fits(pair, amplitudes):
-            least = min(least, left)
-            if least <= enough:
-                return least
-    return least
+        model = _Backbone(band, np.array(powers))
+        for start in model.starts(pair):
+            at = model.once.least(start, BACKBONE.first_tries)
+            tried.append((float((model.once(at)[0] ** 2).sum()), model, at))
+            if tried[-1][0] <= enough:
+                return tried[-1][0]
+    _, model, at = min(tried, key=lambda each: each[0])
+    return float((model.once(model.once.least(at))[0] ** 2).sum())
+
+
+def left_by_common_backbone(bands: Sequence[_Band], weights: Floats, pair: Complexes) -> Floats:
+    """The same of each of several records, (n_records,), one backbone for all: where their weighted sum is least.
+
+    Args:
+        bands: one a record.
+        weights: (n_records,) 1 / noise.
+        pair: as for one.
+    """
+    models = [_Common([_Backbone(band, np.array(powers)) for band in bands], weights) for powers in POWERS]
+    first = [model.once.least(model.start(pair), BACKBONE.first_tries) for model in models]
+    best = int(np.argmin([(model.once(at)[0] ** 2).sum() for model, at in zip(models, first, strict=True)]))
+    return models[best].left(models[best].once.least(first[best]))
 
 
 @njit(cache=True, nogil=True)
@@ -83,59 +279,105 @@ def _envelopes(real: Floats, powers: Floats, t: Floats, faded: float, died: floa
     return u, rates
 
 
+@njit(cache=True, nogil=True)
+def _integrals(u: Floats, rates: Floats, powers: Floats, time: Floats, h: float, faded: float) -> Floats:
+    """∫ r^p_k dt at samples, (n_rows, n, 3), of u and u' (n_rows, n_times): cubic between these, as Hermite has it."""
+    n_rows, n_times = u.shape
+    found = np.empty((n_rows, time.size, powers.size))
+    value, slope, until = np.empty(n_times), np.empty(n_times), np.empty(n_times)
+    for i in range(n_rows):
+        for k in range(powers.size):
+            for j in range(n_times):
+                value[j] = np.exp(-min(max(u[i, j], -1.0), faded) * powers[k])
+                slope[j] = -powers[k] * value[j] * rates[i, j] * h if u[i, j] < faded else 0.0
+            until[0] = 0.0
+            for j in range(n_times - 1):
+                until[j + 1] = until[j] + h * (0.5 * (value[j] + value[j + 1]) + (slope[j] - slope[j + 1]) / 12.0)
+            for m in range(time.size):
+                j = min(int(time[m] / h), n_times - 2)
+                x = time[m] / h - j
+                rise = value[j + 1] - value[j]
+                square, cube = 3.0 * rise - 2.0 * slope[j] - slope[j + 1], slope[j] + slope[j + 1] - 2.0 * rise
+                found[i, m, k] = until[j] + h * x * (
+                    value[j] + x * (slope[j] / 2.0 + x * (square / 3.0 + x * cube / 4.0))
+                )
+    return found
+
+
 class _Backbone:
     """The fit of one law of powers; what is linear in the record drops out."""
 
-    def __init__(self, record: Record, powers: np.ndarray, others: np.ndarray, offset: bool) -> None:
-        self.time, self.powers = record.sample_time * np.arange(record.n_samples), powers
-        exponentials = np.exp(np.outer(self.time, others))
-        columns = np.hstack([exponentials.real, exponentials.imag, np.ones((self.time.size, int(offset)))])
-        self.beside = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
-        self.y = self._apart(record.outputs[0])
-        self.last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
+    def __init__(self, band: _Band, powers: np.ndarray) -> None:
+        self.band, self.time, self.powers = band, band.time, powers
+        self.once = _Once(self)
 
-    def fits(self, pair: np.ndarray, amplitudes: np.ndarray) -> Iterator[float]:
-        """What is left, from what the two look like, z: their own z'/z by |z|; and from the stronger of them."""
-        each = amplitudes * np.exp(np.outer(self.time, pair))
+    def starts(self, pair: np.ndarray) -> Iterator[Floats]:
+        """From what the two look like, z: their own z'/z by |z|; and from the stronger of them."""
+        columns, slope, _ = self.alike(pair)
+        alike = np.linalg.lstsq(columns, slope, rcond=None)[0]
+        for start in (alike, np.array([pair[np.argmax(np.abs(self.band.amplitudes))], 0.0, 0.0])):
+            yield np.r_[start.real, start.imag]
+
+    def alike(self, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Columns |z|^p_k z, z' and |z(0)|, of what the two look like; |z| in units of its beginning."""
+        each = self.band.amplitudes * np.exp(np.outer(self.time, pair))
         z, slope = each.sum(axis=1), (each * pair).sum(axis=1)
-        size = np.abs(z) / max(abs(z[0]), 1e-3 * np.abs(z).max())
-        by_power = np.maximum(size, np.exp(-BACKBONE.faded))[:, None] ** self.powers
-        alike = np.linalg.lstsq(z[:, None] * by_power, slope, rcond=None)[0]
-        left, slopes = (lambda p, k=k: self._once(p)[k] for k in (0, 1))
-        for start in (alike, np.array([pair[np.argmax(np.abs(amplitudes))], 0.0, 0.0])):
-            at = np.r_[start.real, start.imag]
-            yield 2.0 * float(least_squares(left, at, slopes, x_scale="jac", max_nfev=BACKBONE.most_tries).cost)
+        begun = max(abs(z[0]), 1e-3 * np.abs(z).max())
+        by_power = np.maximum(np.abs(z) / begun, np.exp(-BACKBONE.faded))[:, None] ** self.powers
+        return z[:, None] * by_power, slope, float(begun)
 
-    def _once(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """`_fitted`, kept for the slopes that are asked for where what is left was."""
-        if self.last is None or not np.array_equal(self.last[0], unknowns):
-            self.last = unknowns.copy(), self._fitted(unknowns)
-        return self.last[1]
-
-    def _fitted(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What is left (n,) and its slopes by Re λ and Im λ (n, 6), A projected out (Kaufman 1975)."""
+    def fitted(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What is left and its slopes by Re λ and Im λ, (2 n_lines, 6)."""
         real, turn = unknowns[:3], 1j * unknowns[3:]
         step = BACKBONE.slightly * max(abs(real[0]), 1e-3 / self.time[-1])
         held, *moved = self._held(np.vstack([real, real + step * np.eye(3)]))
         with np.errstate(over="ignore", invalid="ignore"):
             motion = np.exp(held @ (real + turn))
-            by_real = [(np.exp(h @ (r + turn)) - motion) / step for h, r in zip(moved, real + step * np.eye(3))]
-        if not (np.abs(by_real) < BACKBONE.largest).all():
-            return BACKBONE.beyond * np.abs(self.y), np.zeros((self.y.size, 6))
-        q, r = np.linalg.qr(self._apart(np.column_stack([motion.real, motion.imag])))
-        seen = q.T @ self.y
-        a, b = np.linalg.lstsq(r, seen, rcond=1e-12)[0]
-        slopes = np.column_stack([*by_real, 1j * motion[:, None] * held])
-        slopes = self._apart(slopes.real * a + slopes.imag * b)
-        return self.y - q @ seen, -(slopes - q @ (q.T @ slopes))
-
-    def _apart(self, columns: np.ndarray) -> np.ndarray:
-        return np.asarray(columns - self.beside @ (self.beside.T @ columns))
+            by_real = [motion * ((h - held) @ (real + turn) / step + h[:, k]) for k, h in enumerate(moved)]
+            return self.band.left(motion[None], np.vstack([by_real, 1j * motion * held.T]), [0] * 6)
 
     def _held(self, real: np.ndarray) -> list[np.ndarray]:
         """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
         t = np.linspace(0.0, self.time[-1], BACKBONE.steps + 1)
         u, rates = _envelopes(real, self.powers, t, BACKBONE.faded, BACKBONE.died)
-        powers = np.exp(-np.clip(u, -1.0, BACKBONE.faded)[:, :, None] * self.powers)
-        slopes = -self.powers * powers * np.where(u < BACKBONE.faded, rates, 0.0)[:, :, None]
-        return list(CubicHermiteSpline(t, powers, slopes).antiderivative()(self.time).swapaxes(0, 1))
+        return list(_integrals(u.T.copy(), rates.T.copy(), self.powers, self.time, t[1], BACKBONE.faded))
+
+
+class _Common:
+    """The fit of one law of powers to several records at once: λ, and ln a_i of all but the strongest record."""
+
+    def __init__(self, each: Sequence[_Backbone], weights: Floats) -> None:
+        self.each, self.weights, self.powers = each, weights, each[0].powers
+        self.once = _Once(self)
+
+    def start(self, pair: np.ndarray) -> Floats:
+        """From what the two look like in all of them."""
+        columns, slopes, begun = zip(*(one.alike(pair) for one in self.each), strict=True)
+        level = np.log(np.maximum(begun, 1e-9 * max(begun) + 1e-300))
+        self.free = np.delete(np.arange(level.size), np.argmax(level))
+        level -= level.max()
+        scaled = [w * c * np.exp(a * self.powers) for w, c, a in zip(self.weights, columns, level, strict=True)]
+        known = np.concatenate([w * slope for w, slope in zip(self.weights, slopes, strict=True)])
+        start = np.linalg.lstsq(np.vstack(scaled), known, rcond=None)[0]
+        return np.concatenate([start.real, start.imag, level[self.free]])
+
+    def left(self, unknowns: Floats) -> Floats:
+        """Sum of squares of each record, (n_records,)."""
+        return np.array([float(left @ left) for left, *_ in self._parts(unknowns)])
+
+    def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]:
+        """What is left of all and its slopes by the unknowns."""
+        lefts, columns = [], []
+        for i, (w, (left, slopes, own, by)) in enumerate(zip(self.weights, self._parts(unknowns), strict=True)):
+            along = slopes @ (np.tile(self.powers, 2) * own)
+            lefts.append(w * left)
+            columns.append(w * np.column_stack([slopes * by, np.outer(along, self.free == i)]))
+        return np.concatenate(lefts), np.vstack(columns)
+
+    def _parts(self, unknowns: Floats) -> Iterator[tuple[Floats, Floats, Floats, Floats]]:
+        """Of each record: what is left, its slopes, its own six unknowns and what these are those of all times."""
+        level = np.zeros(len(self.each))
+        level[self.free] = np.clip(unknowns[6:], -BACKBONE.died, BACKBONE.died)
+        for one, a in zip(self.each, level, strict=True):
+            by = np.tile(np.exp(a * self.powers), 2)
+            yield *one.once(by * unknowns[:6]), by * unknowns[:6], by

@@ -9,16 +9,16 @@ which is chi-square with two degrees of freedom an output where only white noise
 the strongest candidate is no stronger than the strongest of so many in noise.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 from scipy.stats import chi2
 
 from workbench.arrays import Complexes, Floats
-from workbench.identification.free_decay.backbone import left_by_backbone
+from workbench.identification.free_decay.backbone import are_two, band_about
 from workbench.identification.free_decay.long_records import identify_long
 from workbench.identification.free_decay.refinement import identified, in_coloured_noise, refine, search, unshaped
 from workbench.identification.signal.data_quality import check_data_quality, of_same_sensors
@@ -51,13 +51,20 @@ class OrderSettings:
     # times the frequency step of the transform, by which rates of decay go on that need no step finer than a quarter
     # of theirs: what they leave after the shorter transform is e^-25
     coarser: float = 4.0
+    decided: float = 0.1  # χ² that a step promises, below which a fit that only decides has decided
     least_independent: float = 1e-7  # share of a candidate outside the modes so far, to be told from them
     resolved: float = 1e-13  # share of the largest eigenvalue of a Gram matrix, below which a direction is round-off
     # bandwidths that a mode selected in whitened records may move when refined in the records as measured
     lost: float = 5.0
+    most_left: float = 0.5  # share of a record beside modes that explain it
+    same: float = 0.05  # bandwidths that poles may move before it is asked anew whether they are two
 
 
 ORDER = OrderSettings()
+# Poles of two modes and of those beside them, and whether the two are two; of records as measured.
+Verdicts = list[tuple[Complexes, bool]]
+DECIDES: Mapping[str, Any] = {"most_steps": SELECTION.few_steps, "enough": ORDER.decided}
+FULLY: Mapping[str, Any] = {}
 
 
 @one_blas_thread
@@ -106,7 +113,9 @@ def identify_within(
         return found if found is not None else _refuse(records)
     most = min(most_modes or ORDER.most_modes, fit_in)
     search_time = budget.share(SELECTION.search_share)
-    problem, model = _selected(records, most, false_alarm, search_time)
+    verdicts: Verdicts = []
+    problem, model = _selected(records, most, false_alarm, search_time, records, verdicts)
+    explained = problem.explains(model)
     for _ in range(ORDER.whitened):
         # While modes are left the residual is no noise.
         if search_time.unfinished or search_time.spent("whitening of the noise"):
@@ -114,7 +123,11 @@ def identify_within(
         white = whitened(records, problem.oscillating(model))
         if white is None:
             break
-        problem, model = _selected(white, most, false_alarm, search_time, records)
+        again, fewer = _selected(white, most, false_alarm, search_time, records, verdicts)
+        # What a mode that depends on amplitude leaves is no noise either, and whitens the mode away.
+        if not fewer.poles.size and explained:
+            break
+        problem, model = again, fewer
     problem.budget = budget
     return problem.report(model, records) if model.poles.size else _refuse(records)
 
@@ -124,9 +137,10 @@ def _selected(
     most_modes: int,
     false_alarm: float,
     budget: Budget,
-    measured: Sequence[Record] | None = None,
+    measured: Sequence[Record],
+    verdicts: "Verdicts",
 ) -> tuple["_FreeDecay", "_Model"]:
-    problem = _FreeDecay(records, false_alarm, measured or records, budget)
+    problem = _FreeDecay(records, false_alarm, measured, budget, verdicts)
     selection = Stepwise(problem, most_modes, ORDER.most_weak, ORDER.most_splits, forgets=False, budget=budget)
     model = selection.select(problem.nothing)
     problem.rejected = selection.rejected
@@ -159,7 +173,12 @@ class _FreeDecay:
     """The `searches.Selection` of free decays."""
 
     def __init__(
-        self, records: Sequence[Record], false_alarm: float, measured: Sequence[Record], budget: Budget
+        self,
+        records: Sequence[Record],
+        false_alarm: float,
+        measured: Sequence[Record],
+        budget: Budget,
+        verdicts: "Verdicts | None" = None,
     ) -> None:
         longest = max(record.n_samples for record in records)
         self.records, self.measured, self.budget = records, measured, budget
@@ -171,7 +190,10 @@ class _FreeDecay:
         self.enter = float(chi2.isf(min(20.0 * false_alarm, 0.5) / cells, signals))
         # A mode is two amplitudes a signal and its pole, chosen among all cells of the grid.
         self.limit = float(chi2.isf(false_alarm / cells, signals + 2))
-        self.distinct: dict[bytes, bool] = {}
+        # Of several records, where two are asked about they are not chosen any more.
+        self.two = self.limit if len(records) == 1 else float(chi2.isf(false_alarm, signals + 2))
+        self.verdicts = [] if verdicts is None else verdicts
+        self.halves: list[tuple[complex, float]] = []
         self.rejected: list[tuple[complex, float]] = []
         self.nothing = self._fitted(np.zeros(0, complex), np.ones((len(records), records[0].n_outputs)))
 
@@ -212,7 +234,7 @@ class _FreeDecay:
         return candidate
 
     def extended(self, model: _Model, candidate: complex) -> _Model:
-        return self._fitted(np.append(model.poles, candidate), model.weights, SELECTION.few_steps)
+        return self._fitted(np.append(model.poles, candidate), model.weights, DECIDES)
 
     def gain(self, smaller: _Model, larger: _Model) -> float:
         """Noise unknown: Σ_ij N_i log(s²_smaller / s²_larger), records i, sensors j."""
@@ -233,10 +255,30 @@ class _FreeDecay:
         stays = np.abs(old - model.poles) < band
         away = np.abs(old.imag - new.imag) > band + abs(new.real)
         after[:-1] &= before | ~(stays & away)
-        return bool(after.sum() > before.sum())
+        splits = bool(after.sum() > before.sum())
+        if splits:
+            self.halves.append((complex(new), self.gain(model, trial)))
+        return splits
 
     def settled(self, model: _Model) -> _Model:
-        return self._fitted(model.poles, model.weights)
+        return self._fitted(self._reconsidered(model).poles, model.weights)
+
+    def _reconsidered(self, model: _Model) -> _Model:
+        """With what seemed to split a mode while others were missing, each judged beside all the others of its kind."""
+        taken: list[int] = []
+        found: list[complex] = []
+        for pole, _ in sorted(self.halves, key=lambda half: -half[1]):
+            splits = int(np.argmin(np.abs(model.poles.imag - pole.imag)))
+            if splits not in taken:
+                taken, found = [*taken, splits], [*found, pole]
+        self.halves.clear()
+        n, trial = model.poles.size, model
+        with suppress(np.linalg.LinAlgError):
+            spurious = np.zeros(0, bool)
+            trial = self._fitted(np.append(model.poles, found), model.weights, DECIDES)
+            while trial.poles.size > n and (spurious := self._spurious(trial.poles, trial)).any():
+                trial = self._fitted(trial.poles[~spurious], trial.weights, DECIDES)
+        return trial if trial.poles.size > n else model
 
     def suspects(self, model: _Model) -> Iterator[tuple[complex, _Model, bool]]:
         """The weakest that is spurious, or else the modes whose amplitudes are weak or that stand close to another."""
@@ -249,6 +291,11 @@ class _FreeDecay:
             near = np.abs(np.delete(model.poles, r) - pole).min(initial=np.inf)
             if strength < SELECTION.weak * self.threshold(model, pole) or near < SELECTION.close * abs(pole.real):
                 yield complex(pole), self._without(model, r), False
+
+    def explains(self, model: _Model) -> bool:
+        """Whether the modes are most of every record."""
+        left = _squares(model.residuals).sum(axis=1)
+        return bool((left < ORDER.most_left * _squares([grid.nothing for grid in self.grids]).sum(axis=1)).all())
 
     def oscillating(self, model: _Model) -> Complexes:
         """The poles that oscillate within a record and hardly grow; others may be noise that is not white."""
@@ -290,49 +337,49 @@ class _FreeDecay:
         away = away.min(axis=1)
         return np.asarray(damped | (away > ORDER.lost * (np.abs(poles.real) + self.grids[0].bin_width)))
 
-    def _fitted(self, poles: np.ndarray, weights: np.ndarray, most_steps: int = FIT.most_steps) -> _Model:
+    def _fitted(self, poles: np.ndarray, weights: np.ndarray, how: Mapping[str, Any] = FULLY) -> _Model:
         """Poles after a search, sensors then weighted by the noise found in each record."""
         if poles.size == 0:
             residuals = [grid.nothing for grid in self.grids]
         else:
-            poles, fits, *_ = search(self.records, poles, weights, True, most_steps, budget=self.budget)
+            poles, fits, *_ = search(self.records, poles, weights, True, budget=self.budget, **how)
             residuals = [fit.residual for fit in fits]
         n = np.array([r.shape[0] for r in residuals])
         return _Model(poles, 1.0 / np.sqrt(variances(np.maximum(_squares(residuals), self.round_off), n)), residuals)
 
     def _without(self, model: _Model, r: int) -> _Model:
-        return self._fitted(np.delete(model.poles, r), model.weights, SELECTION.few_steps)
+        return self._fitted(np.delete(model.poles, r), model.weights, DECIDES)
 
     def _spurious(self, poles: np.ndarray, model: _Model) -> np.ndarray:
         """Which of some poles are spurious, in the noise that a model leaves."""
         fits = [project(record, poles, True) for record in self.records]
         shapes = np.vstack([f.complex_amplitudes * w[:, None] for f, w in zip(fits, model.weights, strict=True)])
+        strength = np.linalg.norm(shapes, axis=0)
+        if self.records[0].n_outputs == 1:  # the modes of one sensor have no shape, in however many records
+            shapes = strength[None]
 
         def distinct(r: int, s: int) -> bool:
             return self._distinct(model, poles, r, s)
 
-        return spurious_modes(poles, shapes, np.linalg.norm(shapes, axis=0), self.grids[0].bin_width, distinct)
+        return spurious_modes(poles, shapes, strength, self.grids[0].bin_width, distinct)
 
     def _distinct(self, model: _Model, poles: np.ndarray, r: int, s: int) -> bool:
-        """Whether one sensor that sees a beat of modes r and s is likelier to see both than a single nonlinear mode."""
-        asked = np.round(np.r_[poles[r], poles[s], np.delete(poles, [r, s])] / self.grids[0].bin_width, 1).tobytes()
-        if asked not in self.distinct:
-            self.distinct[asked] = False
-            with suppress(np.linalg.LinAlgError):
-                self.distinct[asked] = self._gain_of_two(poles, r, s) > self.threshold(model, poles[r])
-        return self.distinct[asked]
+        """Whether one sensor that sees a beat of modes r and s is likelier to see both than a single nonlinear mode.
 
-    def _gain_of_two(self, poles: np.ndarray, r: int, s: int) -> float:
-        """Twice the log likelihood ratio of both modes over one on a backbone.
-
-        In the record as measured: a filter that whitens the residual of one mode removes most of its evidence.
+        In the records as measured: a filter that whitens the residual of one mode removes most of its evidence.
         """
-        [record] = self.measured
-        poles, [fit], *_ = search([record], poles, np.ones((1, 1)), True, SELECTION.few_steps, budget=self.budget)
-        both, pair, others = float(fit.squares.sum()), poles[[r, s]], np.delete(poles, [r, s])
-        one = left_by_backbone(record, pair, others, offset=True, enough=both)
-        floor = FIT.round_off * float((record.outputs**2).sum()) + 1e-300
-        return record.n_samples * float(np.log((one + floor) / (both + floor)))
+        width = self.grids[0].bin_width
+        pair, others = poles[[r, s]], np.delete(poles, [r, s])
+        middle, half = band_about(pair, width)
+        asked = np.r_[pair, np.sort_complex(others[np.abs(others.imag - middle) < half])]
+        for known, verdict in self.verdicts:
+            if known.size == asked.size and (np.abs(known - asked) < ORDER.same * (np.abs(asked.real) + width)).all():
+                return verdict
+        verdict = False
+        with suppress(np.linalg.LinAlgError):
+            verdict = are_two(self.measured, poles, r, s, self.two)
+        self.verdicts.append((asked, verdict))
+        return verdict
 
     def _noise_ratio(self, model: _Model, pole: complex) -> float:
         """Noise about a frequency over its mean, where it is larger: median of the residual's spectrum, 1 if white."""

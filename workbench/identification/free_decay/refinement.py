@@ -300,14 +300,16 @@ def search(
     most_steps: int = FIT.most_steps,
     *,
     hold: bool = False,
+    enough: float = FIT.negligible,
     budget: Budget | None = None,
 ) -> tuple[np.ndarray, list[Projection], bool, int]:
     """Least squares over (σ, ω_d): poles, projections, whether it converged, steps taken.
 
     Where a pole would leave what is admissible the step is made shorter; or, with `hold`, that pole stays for this step
     and keeps no other from moving, unless it comes back as the mirror image that samples cannot distinguish from it.
+    A step that promises no more of χ² than `enough` is the last.
     """
-    problem = _Poles(records, weights, offset, hold)
+    problem = _Poles(records, weights, offset, hold, enough)
     start = _Fitted(poles, [project(record, poles, offset) for record in records])
     found = minimise(problem, start, most_steps=most_steps, round_off=problem.start_from(start), budget=budget)
     return found.state.poles, found.state.fits, found.converged, found.steps
@@ -322,8 +324,8 @@ class _Fitted:
 class _Poles:
     """The `searches.LeastSquares` of free decays."""
 
-    def __init__(self, records: Sequence[Record], weights: np.ndarray, offset: bool, hold: bool) -> None:
-        self.records, self.weights, self.offset, self.hold = records, weights, offset, hold
+    def __init__(self, records: Sequence[Record], weights: np.ndarray, offset: bool, hold: bool, enough: float) -> None:
+        self.records, self.weights, self.offset, self.hold, self.enough = records, weights, offset, hold, enough
 
     def start_from(self, start: _Fitted) -> float:
         """Round-off of the cost."""
@@ -355,7 +357,7 @@ class _Poles:
             return None, step
 
     def negligible(self, decrease: float, cost: float) -> bool:
-        return decrease <= max(FIT.negligible * cost / self.free, FIT.round_off * self.signal, 1e-4 * self.round_off)
+        return decrease <= max(self.enough * cost / self.free, FIT.round_off * self.signal, 1e-4 * self.round_off)
 
 
 def _folded(poles: np.ndarray, sample_time: float) -> np.ndarray:
