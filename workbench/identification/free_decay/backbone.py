@@ -83,6 +83,15 @@ def _envelopes(real: Floats, powers: Floats, t: Floats, faded: float, died: floa
     return u, rates
 
 
+def backbone_integrals(real: Floats, powers: Floats, time: Floats) -> list[Floats]:
+    """∫ r^p_k dt from 0 to each time, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
+    t = np.linspace(0.0, time[-1], BACKBONE.steps + 1)
+    u, rates = _envelopes(real, powers, t, BACKBONE.faded, BACKBONE.died)
+    raised = np.exp(-np.clip(u, -1.0, BACKBONE.faded)[:, :, None] * powers)
+    slopes = -powers * raised * np.where(u < BACKBONE.faded, rates, 0.0)[:, :, None]
+    return list(CubicHermiteSpline(t, raised, slopes).antiderivative()(time).swapaxes(0, 1))
+
+
 class _Backbone:
     """The fit of one law of powers; what is linear in the record drops out."""
 
@@ -116,7 +125,7 @@ class _Backbone:
         """What is left (n,) and its slopes by Re λ and Im λ (n, 6), A projected out (Kaufman 1975)."""
         real, turn = unknowns[:3], 1j * unknowns[3:]
         step = BACKBONE.slightly * max(abs(real[0]), 1e-3 / self.time[-1])
-        held, *moved = self._held(np.vstack([real, real + step * np.eye(3)]))
+        held, *moved = backbone_integrals(np.vstack([real, real + step * np.eye(3)]), self.powers, self.time)
         with np.errstate(over="ignore", invalid="ignore"):
             motion = np.exp(held @ (real + turn))
             by_real = [(np.exp(h @ (r + turn)) - motion) / step for h, r in zip(moved, real + step * np.eye(3))]
@@ -131,11 +140,3 @@ class _Backbone:
 
     def _apart(self, columns: np.ndarray) -> np.ndarray:
         return np.asarray(columns - self.beside @ (self.beside.T @ columns))
-
-    def _held(self, real: np.ndarray) -> list[np.ndarray]:
-        """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
-        t = np.linspace(0.0, self.time[-1], BACKBONE.steps + 1)
-        u, rates = _envelopes(real, self.powers, t, BACKBONE.faded, BACKBONE.died)
-        powers = np.exp(-np.clip(u, -1.0, BACKBONE.faded)[:, :, None] * self.powers)
-        slopes = -self.powers * powers * np.where(u < BACKBONE.faded, rates, 0.0)[:, :, None]
-        return list(CubicHermiteSpline(t, powers, slopes).antiderivative()(self.time).swapaxes(0, 1))
