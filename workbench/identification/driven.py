@@ -404,7 +404,7 @@ def _with_noise(
 ) -> tuple[KnownInputs, Selected]:
     """Modes and noise estimated in turn until both stay the same; `once` is how `selected` was selected."""
     for _ in range(DRIVEN.learnt):
-        changing = beside_changing(data, selected.fit, budget)
+        changing = beside_changing(data, selected.fit, selected.limit, budget)
         if changing is not None:
             fewer = select_modes(changing[0], start=changing[1], **once)
             # Modes that are truly close fit better than one that changes.

@@ -34,6 +34,7 @@ class Measurement(Protocol):
         weights: (n_rows, n_outputs) inverse relative noise, or None where it is the same in all rows of an output.
         resolution: rad/s, of a measurement of this length.
         highest: rad/s, beyond which no pole is searched.
+        n_inputs: of the excitations, that are no initial states.
         cells: number of poles that could be distinguished, for the chance of a false alarm.
     """
 
@@ -42,6 +43,7 @@ class Measurement(Protocol):
     weights: np.ndarray | None
     resolution: float
     highest: float
+    n_inputs: int
     cells: int
 
     def responses(self, pole: complex) -> Pair:

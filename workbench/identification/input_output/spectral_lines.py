@@ -55,6 +55,7 @@ class Lines:
         self.h, self.powers, self.stated = h, powers, noise
         self.guessed, self.beside, self.changing = guessed, beside, changing
         self.omega, (_, self.refs, self.lines) = omega, h.shape
+        self.n_inputs = self.refs
         self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
         self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
         s = 1j * omega / omega[-1]
