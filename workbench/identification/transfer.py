@@ -18,7 +18,7 @@ from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
-from workbench.identification.input_output.peak_shape import PEAKS, one_uneven_for_two, overlap_remarks, parts_of, peaks
+from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of

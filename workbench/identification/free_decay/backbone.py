@@ -83,7 +83,7 @@ def _envelopes(real: Floats, powers: Floats, t: Floats, faded: float, died: floa
     return u, rates
 
 
-def backbone_integrals(real: Floats, powers: Floats, time: Floats) -> list[Floats]:
+def backbone_integrals(real: np.ndarray, powers: np.ndarray, time: np.ndarray) -> list[Floats]:
     """∫ r^p_k dt from 0 to each time, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
     t = np.linspace(0.0, time[-1], BACKBONE.steps + 1)
     u, rates = _envelopes(real, powers, t, BACKBONE.faded, BACKBONE.died)

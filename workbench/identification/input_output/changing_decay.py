@@ -7,7 +7,7 @@ between averages, is
                                  or  m = e^{ct + dt³} sinh(wt) / wt: the mean over poles evenly from λ - w to λ + w.
 
 m is smooth, so its cubic spline through some times stands for it; that is linear in its values, and transforms exactly.
-n linear modes have m = Σ_k a_k e^{(λ_k - λ)t}: of two, as many numbers as each law has, so that the likelier is preferred.
+Linear modes have m = Σ_k a_k e^{(λ_k - λ)t}: two have as many numbers as each law, so that the likelier is preferred.
 All are compared in lines about the peak, beside a parabola for what the modes elsewhere leave there.
 """
 
@@ -21,7 +21,7 @@ from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import Fit, columns, modal_coordinate, projected
+from workbench.identification.input_output.modal_fit import Fit, columns, modal_coordinate, nearest_pole, projected
 from workbench.identification.input_output.model_order import evidence_of_each
 from workbench.identification.input_output.spectral_lines import Lines
 from workbench.identification.signal.searches import Budget
@@ -57,8 +57,8 @@ class Motion:
 
     Attributes:
         moved: (n_rows, n_columns) what it moves along, beside a linear mode.
-        pole: of that linear mode, the mean over the decay, rad/s.
-        scatter: rms of its frequency about that, over the decay, rad/s.
+        pole: of that linear mode, rad/s.
+        scatter: rms of its frequency about its mean over the decay, rad/s.
     """
 
     moved: Floats
@@ -129,10 +129,10 @@ def _motion(lines: Lines, decays: "_Decays", motions: np.ndarray) -> Motion:
     frequency = np.gradient(np.unwrap(np.angle(m)), time)
     mean = float(np.average(frequency, weights=power))
     scatter = float(np.sqrt(np.average((frequency - mean) ** 2, weights=power)))
-    pole = complex(-0.5 * power[0] / np.trapezoid(power, time), decays.pole.imag + mean)
+    moved = np.hstack(_Decays(lines, decays.pole, l_r).rows(motions))
+    pole = nearest_pole(lines, moved[:, 0], decays.pole, l_r)
     constant = np.column_stack([*modal_coordinate(lines.responses(pole), l_r), *lines.slopes(pole, l_r)])
     constant = _independent(constant, DECAY.hardly)
-    moved = np.hstack(_Decays(lines, decays.pole, l_r).rows(motions))
     moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
     moved = moved - constant @ (constant.T @ moved)
     u, s, _ = np.linalg.svd(moved, full_matrices=False)
@@ -158,7 +158,7 @@ class _Decays:
 
         def ended(exponent: np.ndarray, at: float) -> np.ndarray:
             """∫ of the spline by parts, at one end; its third derivative is constant between knots."""
-            return sum((-1) ** k * spline(at, k)[None] / exponent ** (k + 1) for k in range(3))
+            return np.asarray(sum((-1) ** k * spline(at, k)[None] / exponent ** (k + 1) for k in range(3)))
 
         self.above = turned[:, -1:] * ended(a, end) - ended(a, 0.0) - (turned / a**4) @ jumps
         self.below = -ended(b, 0.0)

@@ -3,7 +3,7 @@
     z' = (λ + Σ_k c_k g_k) z + l u,      g = t, t², t³,  or  r^p, r = |z| over its largest,
 
 with a few powers p as those of a free decay (`backbone`). l u is what drives the constant mode from sample to sample;
-what remains of a step is Heun's. The rival has no more numbers than the linear modes, so that the likelier is preferred.
+what remains of a step is Heun's. The rival has no more numbers than the linear modes: the likelier is preferred.
 All are compared in the lines of the cosine transform about the modes.
 """
 
@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, columns, modal_coordinate
+from workbench.identification.input_output.modal_fit import Fit, columns, modal_coordinate, nearest_pole
 from workbench.identification.input_output.noise_spectrum import lines_of
 
 
@@ -80,8 +80,8 @@ def _squares(left: Floats, n_outputs: int) -> Floats:
 
 @njit(cache=True, nogil=True)
 def _moved(
-    start: np.ndarray, drive: np.ndarray, change: np.ndarray, powers: Floats, by_time: bool, step: complex, scale: float,
-    least: float, largest: float, dt: float, middle: float, width: float, faded: float,
+    start: np.ndarray, drive: np.ndarray, change: np.ndarray, powers: Floats, by_time: bool, step: complex,
+    scale: float, least: float, largest: float, dt: float, middle: float, width: float, faded: float,
 ) -> np.ndarray:  # fmt: skip
     """z of a mode at the samples, (n, n_cases), for each row of changes c_0, c_1, ... (n_cases, 1 + n_powers).
 
@@ -99,7 +99,9 @@ def _moved(
         for k in range(n - 1):
             rate, guess = 0j, at
             for stage in range(2):
-                size = min(((k + stage) / (n - 1) - middle) / width, faded) if by_time else max(abs(guess) / scale, least)
+                size = (
+                    min(((k + stage) / (n - 1) - middle) / width, faded) if by_time else max(abs(guess) / scale, least)
+                )
                 now = change[i, 0]
                 for p in range(powers.size):
                     now += change[i, p + 1] * size ** powers[p]
@@ -173,9 +175,9 @@ class _Response:
             return None
 
         def whole(x: Floats) -> Floats:
-            found = at.copy()
-            found[active] = x
-            return found
+            moved = at.copy()
+            moved[active] = x
+            return np.asarray(moved)
 
         found = least_squares(
             lambda x: once(whole(x))[0], at[active], lambda x: once(whole(x))[1][:, active], x_scale="jac",
@@ -209,7 +211,7 @@ class _Response:
             y.append((carried * np.exp(-self.pole * dt) - z[:-1]) / dt / self.rate)
         found = np.linalg.lstsq(np.vstack(x), np.concatenate(y), rcond=None)[0]
         own = self.participation[self.others]
-        return np.r_[found, (participation[self.others] / unit - own) / self.units]
+        return np.asarray(np.r_[found, (participation[self.others] / unit - own) / self.units])
 
     def _motions(self, unknowns: Floats, by_time: bool, powers: Floats) -> list[np.ndarray]:
         """z of each record, and how it moves with each unknown, (n_samples, 1 + n_unknowns)."""
@@ -249,18 +251,8 @@ class _Response:
         return np.concatenate(left), np.vstack(slopes)
 
     def _motion(self, motions: list[np.ndarray]) -> Motion:
-        step = np.exp(self.pole * self.data.dt)
-        turned = growth = 0.0
-        for z, driven in zip(motions, self.coordinates, strict=True):
-            constant = driven @ self.participation
-            drive = constant[1:] - step * constant[:-1]
-            before = z[:-1, 0]
-            power = np.abs(before) ** 2
-            ratio = (z[1:, 0] - drive) / np.where(power > 0, before, 1.0) / step
-            turned += float((power * np.angle(ratio)).sum())
-            growth += float(power.sum())
-        mean = turned / max(growth, 1e-300) / self.data.dt
-        pole = complex(self.pole.real, self.pole.imag + mean)
+        moved = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
+        pole = nearest_pole(self.data, moved[:, 0], self.pole, self.participation)
         constant = np.column_stack(
             [
                 *modal_coordinate(self.data.responses(pole), self.participation),
@@ -268,7 +260,6 @@ class _Response:
             ]
         )
         constant = _independent(np.hstack([constant, self.data.fixed]), RESPONSE.hardly)
-        moved = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
         moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
         u, s, _ = np.linalg.svd(moved - constant @ (constant.T @ moved), full_matrices=False)
         return Motion(u[:, s > RESPONSE.collinear], pole)

@@ -22,7 +22,15 @@ from scipy.signal import lfilter
 from workbench.arrays import Floats, scaled_inverse
 from workbench.identification.input_output.changing_response import in_place_of
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, Measurement, added_misfit, columns, only, projected, settled
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    Measurement,
+    added_misfit,
+    columns,
+    only,
+    projected,
+    settled,
+)
 from workbench.identification.input_output.model_order import evidence_of, evidence_of_each
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
@@ -89,7 +97,12 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
 
 
 def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
-    """The fit with one mode for two that are alike, where a change of the one within the record explains the other."""
+    """The fit with one mode for two that are alike, where a change of the one within the record explains the other.
+
+    Of one input and one output all are alike: there rivals were compared already (`beside_changing`).
+    """
+    if fit.noise.size * data.n_inputs == 1:
+        return fit
 
     def evidence(one: Fit, at: int) -> float:
         change = changes_in_time(data, one)
