@@ -523,13 +523,20 @@ def struck(hz, change, seed, n=1500, snr=50.0):
     return Record(dt, y[None], (channel,), u[None], (Channel("F", "force"),), name="struck")
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)])
-def test_after_a_blow_one_sensor_tells_two_close_modes_from_one_that_changes(seed):
-    """How a record begins was taken for a shape: of two close modes one was left out, and no change was seen."""
-    found = identify_driven(struck((21.0, 37.0, 37.4), 0.0, seed))
+SEEDS = [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_after_a_blow_one_sensor_tells_two_close_modes(seed):
+    """How a record begins was taken for a shape, so that one of the two was left out."""
+    found = identify_driven(struck((21.0, 37.0, 37.4), 0.0, seed, n=1000))
     assert found.modes.frequencies_hz == pytest.approx([21.0, 37.0, 37.4], rel=1e-3)
     assert not any("change within the record" in remark for remark in found.remarks)
-    found = identify_driven(struck((21.0, 37.0, 95.0), 0.02, seed))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_after_a_blow_one_sensor_tells_a_mode_that_changes(seed):
+    found = identify_driven(struck((21.0, 37.0, 95.0), 0.02, seed, n=1000))
     assert found.modes.frequencies_hz == pytest.approx([21.0, 37.0, 95.0], rel=1e-2)
     (said,) = [remark for remark in found.remarks if "change within the record" in remark]
     assert "mode 2" in said and "mode 1" not in said and "mode 3" not in said
