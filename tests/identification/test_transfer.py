@@ -265,3 +265,57 @@ def test_the_measured_ruler():
     assert np.abs(rings.frequencies_hz / seen - 1).max() < 0.005
     free = Beam(length=1.0, mass_per_length=1.0, bending_stiffness=1.0, left="free", right="free").modes(6)
     assert np.diag(mac(rings.shapes[:, :4], free.phi(places)[:, 2:6])).min() > 0.95
+
+
+def struck(rng, hz, law, n_outputs=1):
+    """Transform of the decay of modes after a blow, in noise of 60 dB; the second mode follows a law of time and size.
+
+    Args:
+        law: relative change of the frequency by time (s) and by amplitude, which is 1 at first.
+    """
+    dt, span = 2.5e-4, 4.0
+    t = dt * np.arange(round(span / dt))
+    h = np.zeros((n_outputs, t.size))
+    shapes = rng.choice([-1, 1], (n_outputs, len(hz))) * rng.uniform(0.5, 1.0, (n_outputs, len(hz)))
+    for r, each in enumerate(hz):
+        size = np.exp(-0.006 * 2 * np.pi * each * t)
+        rate = 2 * np.pi * each * (1.0 + (law(t, size) if r == 1 else 0.0 * t))
+        phase = np.concatenate([[0.0], np.cumsum(0.5 * dt * (rate[1:] + rate[:-1]))])
+        h += np.outer(shapes[:, r], size * np.sin(phase))
+    lines, whole = np.fft.rfftfreq(t.size, dt), dt * np.fft.rfft(h)
+    band = (lines > 8.0) & (lines < 150.0)
+    found = whole[:, band]
+    noise = rng.standard_normal(found.shape) + 1j * rng.standard_normal(found.shape)
+    return lines[band], found + 1e-3 * np.abs(found).max(axis=1, keepdims=True) * noise
+
+
+def steady(t, size):
+    return 0.0 * t
+
+
+LAWS = {
+    "time": lambda t, size: 0.02 * (t / 4.0),
+    "stiffening": lambda t, size: 0.02 * size**2,
+    "slipping": lambda t, size: -0.03 * size / (0.3 + size),
+}
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 8))])
+def test_one_sensor_tells_a_mode_that_changes_after_a_blow_from_two(law, seed):
+    """It made two to four modes of the one."""
+    hz, channels = [21.0, 57.0, 96.0], (Channel("p", "displacement"),)
+    lines, h = struck(np.random.default_rng(seed), hz, LAWS[law])
+    found = identify_transfer(h, lines, channels=channels)
+    assert found.modes.frequencies_hz == pytest.approx(hz, rel=0.025)
+    assert (found.scatter_hz > 0).tolist() == [False, True, False]
+    assert any("peaks of mode 2 (" in remark for remark in found.remarks)
+
+
+@pytest.mark.parametrize("apart", [0.008, 0.02])
+def test_one_sensor_tells_two_close_modes_as_two(apart):
+    hz = [21.0, 57.0, 57.0 * (1.0 + apart)]
+    lines, h = struck(np.random.default_rng(3), hz, steady)
+    found = identify_transfer(h, lines, channels=(Channel("p", "displacement"),))
+    assert found.modes.frequencies_hz == pytest.approx(hz, rel=1e-3)
+    assert not found.scatter_hz.any()

@@ -404,12 +404,17 @@ def _with_noise(
 ) -> tuple[KnownInputs, Selected]:
     """Modes and noise estimated in turn until both stay the same; `once` is how `selected` was selected."""
     for _ in range(DRIVEN.learnt):
-        changing = beside_changing(data, selected.fit, budget)
-        if changing is not None:
+        for _ in range(DRIVEN.learnt):
+            changing = beside_changing(data, selected.fit, selected.limit, budget)
+            if changing is None:
+                break
             fewer = select_modes(changing[0], start=changing[1], **once)
-            # Modes that are truly close fit better than one that changes.
-            if changing[0].cost(fewer.fit) < data.cost(selected.fit):
-                data, selected = changing[0], fewer
+            # Modes that are truly close fit better than one that changes; rivals of one output were compared before.
+            rivals = data.values.shape[1] * data.n_inputs == 1
+            worth = selected.limit * max(selected.fit.poles.size - fewer.fit.poles.size, 0) if rivals else 0.0
+            if changing[0].cost(fewer.fit) >= data.cost(selected.fit) + worth:
+                break
+            data, selected = changing[0], fewer
         line_std = data.noise_spectrum(selected.fit)
         if alike(line_std, data.line_std) and not (selected.full and once["most_modes"] < how["most_modes"]):
             break

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import block_diag
 
+from workbench.identification.input_output.changing_decay import beside_changing
 from workbench.identification.input_output.fit_errors import pole_covariance, vector_covariance
 from workbench.identification.input_output.modal_fit import Fit, projected, scaled_vectors, settled
 from workbench.identification.input_output.model_order import Selected, evidence_of, select_modes
-from workbench.identification.input_output.peak_shape import PEAKS, one_uneven_for_two, overlap_remarks, parts_of, peaks
+from workbench.identification.input_output.peak_shape import PEAKS, overlap_remarks, parts_of, peaks
 from workbench.identification.input_output.spectral_lines import Lines, noise_with_size
 from workbench.identification.signal.modal_estimates import SURE, ParticipatingModes, time_derivatives
 from workbench.identification.signal.projection import correlation_of_lines, disturbed, mixing_of
@@ -177,30 +178,37 @@ def _selected(
     """The modes of a band; where no noise is stated, it is estimated from the residual of the strongest modes."""
     lines, how = Lines(h, omega, powers, noise), {**how, "budget": budget}
     if noise is not None:
-        return lines, select_modes(lines, **how)
+        return _beside_changing(lines, how)
     few = how | {"most_modes": min(TRANSFER.strongest, how["most_modes"])}
-    selected = select_modes(lines, **few)
+    lines, selected = _beside_changing(lines, few)
     left = lines.left(selected.fit).reshape(len(h), -1)
     mixing = mixing_of(correlation_of_lines([left]))
     if mixing is None:
-        return _in_noise(lines, selected, h, powers, how)
+        return _in_noise(lines, selected, how)
     # noise that outputs share makes peaks in all of them
     mixed = np.tensordot(mixing / np.sqrt((np.abs(left) ** 2).mean(axis=1)), h, 1)
-    start = Lines(mixed, omega, powers, None)
-    _, selected = _in_noise(start, select_modes(start, **few), mixed, powers, how)
+    apart, selected = _in_noise(*_beside_changing(lines.of(mixed), few), how)
+    lines = apart.of(h)
     fit = settled(lines, projected(lines, selected.fit.poles, selected.fit.participation), budget=budget)
     guessed = noise_with_size(lines.left(fit), lines.fitted(fit))
     if guessed is not None:
-        lines = Lines(h, omega, powers, guessed, guessed=True)
+        lines = lines.weighted_by(guessed)
         fit = settled(lines, projected(lines, fit.poles, fit.participation), budget=budget)
     return lines, selected.refitted(fit)
 
 
-def _in_noise(
-    lines: Lines, selected: Selected, h: np.ndarray, powers: list[int], how: dict[str, Any]
-) -> tuple[Lines, Selected]:
+def _beside_changing(lines: Lines, how: dict[str, Any]) -> tuple[Lines, Selected]:
+    """The modes, one for each that changes, and the lines with what such modes move."""
+    selected = select_modes(lines, **how)
+    while (found := beside_changing(lines, selected.fit, selected.limit, how["budget"])) is not None:
+        lines, start = found
+        selected = select_modes(lines, start=start, **how)
+    return lines, selected
+
+
+def _in_noise(lines: Lines, selected: Selected, how: dict[str, Any]) -> tuple[Lines, Selected]:
     """The modes, and their noise estimated in turn, from the strongest; where outputs share no noise."""
-    budget, omega = how["budget"], lines.omega
+    budget = how["budget"]
     before: np.ndarray | None = None
     for _ in range(TRANSFER.reweighted):
         guessed = noise_with_size(lines.left(selected.fit), lines.fitted(selected.fit))
@@ -210,12 +218,12 @@ def _in_noise(
             break
         if budget.spent("estimation of the noise"):
             return lines, selected
-        before, weighted = guessed, Lines(h, omega, powers, guessed, guessed=True)
-        anew = select_modes(weighted, **how)
+        before = guessed
+        weighted, anew = _beside_changing(lines.weighted_by(guessed), how)
         if budget.spent("estimation of the noise") and anew.fit.poles.size < selected.fit.poles.size:
             return lines, selected
         lines, selected = weighted, anew
-    return (lines, selected) if lines.guessed else (lines, select_modes(lines, **how))
+    return (lines, selected) if lines.guessed else _beside_changing(lines, how)
 
 
 def _modes_of(
@@ -228,9 +236,11 @@ def _modes_of(
 ) -> TransferModes:
     """The modes of a band between its edges; the fit at the lines shown."""
     fit, parts_hz = _clustered(lines, selected, channels)
-    fit, kept = one_uneven_for_two(lines, fit, budget)
-    parts_hz = [parts_hz[r] for r in kept]
     found = peaks(lines, fit)
+    scatter = np.where(found.uneven, found.scatter, 0.0)
+    for pole, by in lines.changing:
+        r = int(np.argmin(np.abs(fit.poles - pole)))
+        scatter[r] = max(scatter[r], by)
     damped_hz = fit.poles.imag / (2.0 * np.pi)
     noise_ratio = np.tile(lines.noise_ratio_near(fit), (len(channels), 1))
     stated = lines.weights is not None and not lines.guessed
@@ -256,7 +266,7 @@ def _modes_of(
         evidence=frozen([evidence_of(fit, int(r)) for r in inside]),
         converged=fit.converged,
         parts_hz=tuple(parts_hz[r] for r in inside),
-        scatter_hz=frozen(np.where(found.uneven, found.scatter, 0.0)[inside] / (2.0 * np.pi)),
+        scatter_hz=frozen(scatter[inside] / (2.0 * np.pi)),
         full_hz=((float(shown_hz[0]), float(shown_hz[-1])),) if selected.full else (),
         fitted=frozen(lines.fitted(fit)[..., at : at + shown_hz.size], complex),
         frequencies_hz=frozen(shown_hz),

@@ -304,6 +304,13 @@ def _integrals(u: Floats, rates: Floats, powers: Floats, time: Floats, h: float,
     return found
 
 
+def backbone_integrals(real: np.ndarray, powers: np.ndarray, time: np.ndarray) -> list[Floats]:
+    """∫ r^p_k dt from 0 to each time, (n, n_powers), for each row of Re λ (n_rows, n_powers): u = -ln r by Runge-Kutta."""
+    t = np.linspace(0.0, time[-1], BACKBONE.steps + 1)
+    u, rates = _envelopes(real, powers, t, BACKBONE.faded, BACKBONE.died)
+    return list(_integrals(u.T.copy(), rates.T.copy(), powers, time, t[1], BACKBONE.faded))
+
+
 class _Backbone:
     """The fit of one law of powers; what is linear in the record drops out."""
 
@@ -330,17 +337,11 @@ class _Backbone:
         """What is left and its slopes by Re λ and Im λ, (2 n_lines, 6)."""
         real, turn = unknowns[:3], 1j * unknowns[3:]
         step = BACKBONE.slightly * max(abs(real[0]), 1e-3 / self.time[-1])
-        held, *moved = self._held(np.vstack([real, real + step * np.eye(3)]))
+        held, *moved = backbone_integrals(np.vstack([real, real + step * np.eye(3)]), self.powers, self.time)
         with np.errstate(over="ignore", invalid="ignore"):
             motion = np.exp(held @ (real + turn))
             by_real = [motion * ((h - held) @ (real + turn) / step + h[:, k]) for k, h in enumerate(moved)]
             return self.band.left(motion[None], np.vstack([by_real, 1j * motion * held.T]), [0] * 6)
-
-    def _held(self, real: np.ndarray) -> list[np.ndarray]:
-        """∫ r^p_k dt at the samples, (n, 3), for each row of Re λ (n_rows, 3): u = -ln r by Runge and Kutta's rule."""
-        t = np.linspace(0.0, self.time[-1], BACKBONE.steps + 1)
-        u, rates = _envelopes(real, self.powers, t, BACKBONE.faded, BACKBONE.died)
-        return list(_integrals(u.T.copy(), rates.T.copy(), self.powers, self.time, t[1], BACKBONE.faded))
 
 
 class _Common:

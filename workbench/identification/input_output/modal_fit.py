@@ -34,6 +34,7 @@ class Measurement(Protocol):
         weights: (n_rows, n_outputs) inverse relative noise, or None where it is the same in all rows of an output.
         resolution: rad/s, of a measurement of this length.
         highest: rad/s, beyond which no pole is searched.
+        n_inputs: of the excitations, that are no initial states.
         cells: number of poles that could be distinguished, for the chance of a false alarm.
     """
 
@@ -42,6 +43,7 @@ class Measurement(Protocol):
     weights: np.ndarray | None
     resolution: float
     highest: float
+    n_inputs: int
     cells: int
 
     def responses(self, pole: complex) -> Pair:
@@ -143,6 +145,30 @@ def columns(data: Measurement, poles: np.ndarray, participation: np.ndarray) -> 
 def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
     """χ² that one fit leaves beyond what another does, outputs in units of `noise`."""
     return float((((fewer.residual**2).sum(axis=0) - (more.residual**2).sum(axis=0)) / noise**2).sum())
+
+
+def nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
+    """Of the constant mode of given participation whose rows are nearest to those of a motion, (n_rows,)."""
+    rate, best, step, least = abs(pole.real), pole, 0j, np.inf
+    for _ in range(FIT.few_poles):
+        trial = best + step
+        z = np.column_stack(modal_coordinate(data.responses(trial), l_r))
+        size = np.maximum(np.linalg.norm(z, axis=0), 1e-300)
+        p, q = np.linalg.lstsq(z / size, motion, rcond=None)[0] / size
+        left = float(((motion - z @ np.array([p, q])) ** 2).sum())
+        if left < least:
+            best, least = complex(trial), left
+            both = np.hstack([z, rate * np.column_stack(data.slopes(trial, l_r))])
+            size = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
+            p, q, u, v = np.linalg.lstsq(both / size, motion, rcond=None)[0] / size
+            step = rate * (u - 1j * v) / (p - 1j * q if abs(p - 1j * q) > 0 else 1e-300)
+            step /= max(1.0, abs(step) / rate)
+        else:
+            step *= 0.25
+        step = min(step.real, -0.5 * best.real) + 1j * step.imag  # it stays a decay
+        if abs(step) < FIT.same_pole * rate:
+            break
+    return best
 
 
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:

@@ -290,7 +290,7 @@ def _spurious(data: Measurement, fit: Fit) -> np.ndarray:
     band = np.abs(poles.real)[:, None] + np.abs(poles.real) + data.resolution
     near = np.abs(np.subtract.outer(poles.imag, poles.imag)) < band
     alike = mac(shapes, shapes) * mac(fit.participation.T, fit.participation.T)
-    one = shapes.shape[0] * fit.participation.shape[1] == 1
+    one = shapes.shape[0] * data.n_inputs == 1  # which has no shape; how a record begins is none
     split = near & (alike > SELECTION.same_shape) & (strength[:, None] < strength) & (not one)
     return np.asarray(split.any(axis=1) | (-poles.real > SELECTION.most_damped * np.abs(poles)))
 

@@ -6,8 +6,8 @@ The transfer function of a mode that drifts while it is measured is the mean of 
 
 and a free decay of λ + δ t / T has the same term: t² e^{λt} / 2 has the transform 1 / (s - λ)³. A mode that depends on
 its amplitude, and one blurred by a window, have it too. No mode of a linear structure has it, so it is fitted to what
-the modes leave, with the shape and the participation of each mode. Where the term of one mode explains what a second
-one beside it does, of the same shape, it is one mode.
+the modes leave, with the shape and the participation of each mode. Where several linear modes stand for one that
+changes far, `changing_decay` fits that one in their place.
 
 Points measured one after another are inconsistent: a roving sensor loads the structure elsewhere, a harder hit rings
 lower. A linear model fits such a mode only by a cluster: three and more modes within each other's half-power bands,
@@ -23,8 +23,6 @@ from scipy.stats import chi2
 from workbench.arrays import Floats
 from workbench.identification.input_output.modal_fit import Fit, columns
 from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.input_output.time_variance import one_for_two
-from workbench.identification.signal.searches import Budget
 
 
 @dataclass(frozen=True)
@@ -95,20 +93,6 @@ def peaks(lines: Lines, fit: Fit) -> Peaks:
         sure = evidence[r] > noise_ratio * chi2.isf(PEAKS.false_alarm, 2)
         uneven[r] = sure and scatter[r] > PEAKS.matters * abs(pole.real)
     return Peaks(uneven, scatter, evidence)
-
-
-def one_uneven_for_two(lines: Lines, fit: Fit, budget: Budget) -> tuple[Fit, np.ndarray]:
-    """The fit with one mode for two that are alike, where the further term of the one explains the other.
-
-    Returns:
-        The fit, and which modes of the first are left in it.
-    """
-
-    def evidence(one: Fit, at: int) -> float:
-        found = peaks(lines, one)
-        return float(found.evidence[at]) if found.uneven[at] else -np.inf
-
-    return one_for_two(lines, fit, budget, evidence, "check of modes that change")
 
 
 def _third(lines: Lines, pole: complex, participation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,23 +30,71 @@ SHARES = np.geomspace(1e-3, 1e3, 61)  # b |H| / a at the median line, from nothi
 
 
 class Lines:
-    """Rows are real, then imaginary parts, reference by reference."""
+    """Rows are real, then imaginary parts, reference by reference.
+
+    Args:
+        h: (n_outputs, n_references, n_lines).
+        omega: (n_lines,) rad/s.
+        powers: of s, in the residual terms.
+        noise: of each line, as `h`; the same for all unless given.
+        guessed: whether it is known but for its size.
+        beside: (n_rows, n_columns) fixed columns beside those of the residual terms.
+        changing: of the modes that move along these, their pole and by how much their frequency scatters, rad/s.
+    """
 
     def __init__(
-        self, h: np.ndarray, omega: np.ndarray, powers: list[int], noise: np.ndarray | None, guessed: bool = False
+        self,
+        h: np.ndarray,
+        omega: np.ndarray,
+        powers: list[int],
+        noise: np.ndarray | None,
+        guessed: bool = False,
+        beside: np.ndarray | None = None,
+        changing: tuple[tuple[complex, float], ...] = (),
     ) -> None:
-        self.guessed = guessed
+        self.h, self.powers, self.stated = h, powers, noise
+        self.guessed, self.beside, self.changing = guessed, beside, changing
         self.omega, (_, self.refs, self.lines) = omega, h.shape
+        self.n_inputs = self.refs
         self.weights = None if noise is None else 1.0 / self._stacked(noise * (1 + 1j))
         self.values = self._stacked(h) * (1.0 if self.weights is None else self.weights)
         s = 1j * omega / omega[-1]
         self.fixed = self._stacked(np.array([self._of(i, s**p) for i in range(self.refs) for p in powers]))
+        if beside is not None:
+            self.fixed = np.hstack([self.fixed, beside])
         self.resolution = float(np.diff(omega).min())
         # A pole may leave the band: one close beyond it is no constant there. Such poles are residual terms.
         self.highest = 2.0 * float(omega[-1])
         span = omega[-1] - omega[0]
         self.rates = np.geomspace(0.3 * self.resolution, max(0.03 * span, self.resolution), LINES.rates)
         self.cells = LINES.rates * self.lines
+
+    def of(self, h: np.ndarray) -> "Lines":
+        """The same lines of other outputs, their noise not known."""
+        return Lines(h, self.omega, self.powers, None, False, self.beside, self.changing)
+
+    def weighted_by(self, guessed: np.ndarray) -> "Lines":
+        """The same lines with their noise known but for its size."""
+        return Lines(self.h, self.omega, self.powers, guessed, True, self.beside, self.changing)
+
+    def with_columns(self, columns: np.ndarray, changing: tuple[complex, float]) -> "Lines":
+        """The same lines with further fixed columns, those of a mode that changes."""
+        beside = columns if self.beside is None else np.hstack([self.beside, columns])
+        changed = (*self.changing, changing)
+        return Lines(self.h, self.omega, self.powers, self.stated, self.guessed, beside, changed)
+
+    def only(self, which: np.ndarray, smooth: int) -> "Lines":
+        """Some lines (n_lines,), beside polynomials up to a degree as well."""
+        omega = self.omega[which]
+        middle = 0.5 * (omega[0] + omega[-1])
+        at = (omega - middle) / max(omega[-1] - middle, 1e-300)
+        noise = None if self.stated is None else self.stated[..., which]
+        found = Lines(self.h[..., which], omega, self.powers, noise, self.guessed)
+        further = [factor * at**k for k in range(smooth + 1) for factor in (1.0, 1j)]
+        polynomials = found._stacked(np.array([found._of(i, x) for i in range(self.refs) for x in further]))
+        beside = [] if self.beside is None else [self.beside[np.tile(which, 2 * self.refs)]]
+        found.fixed = np.hstack([found.fixed, polynomials, *beside])
+        return found
 
     def _stacked(self, values: np.ndarray) -> np.ndarray:
         rows = values.reshape(values.shape[0], -1).T

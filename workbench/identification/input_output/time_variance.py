@@ -20,8 +20,17 @@ import numpy as np
 from scipy.signal import lfilter
 
 from workbench.arrays import Floats, scaled_inverse
+from workbench.identification.input_output.changing_response import in_place_of
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, Measurement, added_misfit, columns, only, settled
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    Measurement,
+    added_misfit,
+    columns,
+    only,
+    projected,
+    settled,
+)
 from workbench.identification.input_output.model_order import evidence_of, evidence_of_each
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
@@ -38,6 +47,8 @@ class ChangingSettings:
     matters: float = 0.1  # of the half-power bandwidth: a smaller change harms no model
     reach: float = 0.15  # of the frequency of a mode, within which another may stand for its change
     faint: float = 0.2  # of its evidence, likewise
+    rival: float = 6.0  # half-power bandwidths apart, of modes of one input and output that may be one
+    most_clusters: int = 3  # about a mode: all that are near it, then without the farthest
     collinear: float = 1e-4  # singular value over which columns of unit length count
     faded: float = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
 
@@ -86,7 +97,12 @@ def changes_in_time(data: KnownInputs, fit: Fit) -> Change:
 
 
 def joined(data: KnownInputs, fit: Fit, budget: Budget) -> Fit:
-    """The fit with one mode for two that are alike, where a change of the one within the record explains the other."""
+    """The fit with one mode for two that are alike, where a change of the one within the record explains the other.
+
+    Of one input and one output all are alike: there rivals were compared already (`beside_changing`).
+    """
+    if fit.noise.size * data.n_inputs == 1:
+        return fit
 
     def evidence(one: Fit, at: int) -> float:
         change = changes_in_time(data, one)
@@ -120,12 +136,14 @@ def one_for_two(
     return fit, kept
 
 
-def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownInputs, Fit] | None:
+def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -> tuple[KnownInputs, Fit] | None:
     """The records with what changing modes move as further columns, and the fit without the modes that stood for it.
 
     A change that is not small makes many modes beside one. Where they go, and the one is found to change, its motion
     follows the change with time or amplitude. None where no mode is so.
     """
+    if fit.noise.size * data.n_inputs == 1:
+        return _beside_rivals(data, fit, limit, budget)
     strength = evidence_of_each(fit)
     participation = fit.participation[:, : data.n_inputs].T
     alike = mac(fit.amplitudes, fit.amplitudes) * mac(participation, participation) > CHANGING.alike
@@ -152,6 +170,26 @@ def beside_changing(data: KnownInputs, fit: Fit, budget: Budget) -> tuple[KnownI
         return None
     data = data.with_columns(_independent(np.hstack(beside)), tuple(changing))
     return data, only(data, fit, ~out)
+
+
+def _beside_rivals(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -> tuple[KnownInputs, Fit] | None:
+    """`beside_changing` of one input and one output, where every two near modes are alike: the likelier model stays."""
+    strength, poles, out = evidence_of_each(fit), fit.poles.copy(), np.zeros(fit.poles.size, bool)
+    rates = np.maximum(-poles.real, 0.5 * data.resolution)
+    apart = np.abs(np.subtract.outer(poles.imag, poles.imag))
+    near = apart < CHANGING.rival * np.add.outer(rates, rates)
+    for r in np.argsort(-strength):
+        others = np.flatnonzero(near[r] & (strength < strength[r]) & ~out)
+        others = others[np.argsort(apart[r, others])] if not out[r] else others[:0]
+        for k in range(others.size, max(others.size - CHANGING.most_clusters, 0), -1):
+            if budget.spent("check of modes that change within the record"):
+                break
+            one = in_place_of(data, fit, np.r_[r, others[:k]], limit)
+            if one is not None:
+                data = data.with_columns(one.moved, (one.pole,))
+                out[others[:k]], poles[r] = True, one.pole
+                break
+    return (data, projected(data, poles[~out], fit.participation[~out])) if out.any() else None
 
 
 def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:
