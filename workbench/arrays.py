@@ -19,8 +19,11 @@ def scaled_inverse(matrix: np.ndarray, rcond: float = 1e-15) -> Floats:
     """Pseudo-inverse of normal equations, a symmetric matrix, each unknown in units of its own diagonal entry's root.
 
     Args:
-        rcond: singular values of the scaled matrix below this share of the largest count as zero.
+        rcond: eigenvalues of the scaled matrix below this share of the largest, those that rounding makes negative
+            among them, count as zero.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    units = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(matrix * units, rcond=rcond, hermitian=True) * units)
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    kept = values > rcond * np.abs(values).max(initial=0.0)
+    found = scale[:, None] * vectors[:, kept]
+    return np.asarray(found / values[kept] @ found.T)

@@ -305,7 +305,7 @@ def _integrals(u: Floats, rates: Floats, powers: Floats, time: Floats, h: float,
 
 
 def backbone_integrals(real: np.ndarray, powers: np.ndarray, time: np.ndarray) -> list[Floats]:
-    """∫ r^p_k dt from 0 to each time, (n, n_powers), for each row of Re λ (n_rows, n_powers): u = -ln r by Runge-Kutta."""
+    """∫ r^p_k dt from 0 to each time, (n, n_powers), for each row of Re λ (n_rows, n_powers), after Runge and Kutta."""
     t = np.linspace(0.0, time[-1], BACKBONE.steps + 1)
     u, rates = _envelopes(real, powers, t, BACKBONE.faded, BACKBONE.died)
     return list(_integrals(u.T.copy(), rates.T.copy(), powers, time, t[1], BACKBONE.faded))
