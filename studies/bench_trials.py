@@ -11,7 +11,7 @@ from workbench.trials.hold import hold_one, processor_times
 from workbench.trials.make import OUTSIDE_KINDS, draw_kinds
 from workbench.trials.scoring import tally
 
-SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 977103  # of each structure
+SINGLES, PAIRS, QUIET, SEED = 13, 4, 4, 985311  # of each structure
 
 
 def cases_on(structure, seed):
