@@ -139,3 +139,9 @@ def test_one_sensor_late_alone_is_an_effect(hinged_rig, late, alone):
     found = one_late(errors)
     assert (found and found.target) == alone
     assert found is None or found.values["delay"] == pytest.approx(0.005)
+
+
+@pytest.mark.parametrize(("deviation", "is_late"), [(0.02, True), (0.2, False)])
+def test_a_sensor_is_late_where_it_is_surely_so(hinged_rig, deviation, is_late):
+    errors = nominal_errors(hinged_rig(n_modes=4), NominalPrior(delay=0.3, sample_time=0.01), {"delay_d2": 0.5})
+    assert (one_late(replace(errors, deviations={"delay_d2": deviation})) is not None) is is_late

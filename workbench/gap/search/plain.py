@@ -205,7 +205,8 @@ def _with_one_late(search: Search, found: Fit) -> Fit:
 def one_late(errors: Effect) -> Effect | None:
     """The delay of one of several sensors, where errors of the nominal model say that it alone is late."""
     delays = {name.removeprefix("delay_"): float(v) for name, v in errors.values.items() if group_of(name) == "delay"}
-    off = [name for name, delay in delays.items() if abs(delay) > PLAIN.punctual]
+    least = {name: max(PLAIN.punctual, PLAIN.sure * errors.deviations.get(f"delay_{name}", 0.0)) for name in delays}
+    off = [name for name, delay in delays.items() if abs(delay) > least[name]]
     if len(delays) < PLAIN.several or len(off) != 1 or delays[off[0]] < 0:
         return None
     return Effect(SENSOR_DELAY, off[0], {"delay": delays[off[0]] * errors.target.sample_time})

@@ -145,6 +145,7 @@ class PlainSettings:
     plainly: int = 8  # iterations without errors
     briefly: int = 3  # likewise, after which those go on that may come near
     punctual: float = 0.01  # of a sample: sensors that are late by less are not
+    sure: float = 4.0  # standard deviations that a sensor must be late by to be so
     near: float = 2.0  # times the noise power that a fit may leave of the quick records, to be fitted to all
     needless: float = 6.0  # twice the log-likelihood that one number more may gain by chance
     several: int = 3  # sensors, of which one alone is hardly late by chance

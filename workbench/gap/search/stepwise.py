@@ -679,7 +679,7 @@ class Stepwise:
             added.append(Effect(MODULUS_ERROR, None, {"factor": float(np.exp(stiffness))}))
             reset.update({"stiffness_0": 0.0, "mass_0": 0.0})
         late = one_late(step.errors)
-        if late is not None and late.kind not in named:
+        if late is not None and late.kind not in named and self._matter([late], [*step.effects, late]):
             added.append(late)
             reset.update({n: 0.0 for n in values if group_of(n) == "delay"})
         if not added:
