@@ -21,10 +21,18 @@ from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import Fit, columns, modal_coordinate, nearest_pole, projected
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    beside_constant,
+    columns,
+    independent,
+    nearest_pole,
+    of_unit_length,
+    projected,
+)
 from workbench.identification.input_output.model_order import evidence_of_each
 from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.signal.searches import Budget
+from workbench.identification.signal.searches import FIT, Budget
 from workbench.structure.modes import mac
 
 
@@ -44,8 +52,6 @@ class ChangingDecaySettings:
     most_tries: int = 25  # evaluations of a fit
     slightly: float = 1e-5  # of the decay rate: step of differences
     largest: float = 1e6  # times its first value: beyond this a motion diverges
-    hardly: float = 1e-9  # singular value under which columns of unit length are no more than round-off
-    collinear: float = 1e-4  # singular value over which what a mode moves along counts
 
 
 DECAY = ChangingDecaySettings()
@@ -131,12 +137,7 @@ def _motion(lines: Lines, decays: "_Decays", motions: np.ndarray) -> Motion:
     scatter = float(np.sqrt(np.average((frequency - mean) ** 2, weights=power)))
     moved = np.hstack(_Decays(lines, decays.pole, l_r).rows(motions))
     pole = nearest_pole(lines, moved[:, 0], decays.pole, l_r)
-    constant = np.column_stack([*modal_coordinate(lines.responses(pole), l_r), *lines.slopes(pole, l_r)])
-    constant = _independent(constant, DECAY.hardly)
-    moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
-    moved = moved - constant @ (constant.T @ moved)
-    u, s, _ = np.linalg.svd(moved, full_matrices=False)
-    return Motion(u[:, s > DECAY.collinear], pole, scatter)
+    return Motion(beside_constant(lines, moved, pole, l_r), pole, scatter)
 
 
 class _Decays:
@@ -234,7 +235,8 @@ class _Peak:
         self.weights = np.ones((1, self.noise.size)) if lines.weights is None else lines.weights
         for j, a in enumerate(fit.amplitudes[:, others]):
             moved = [a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary]
-            basis = _independent(self.weights[:, j : j + 1] * np.hstack([phi, *moved]), DECAY.hardly)
+            seen = self.weights[:, j : j + 1] * np.hstack([phi, *moved])
+            basis = independent(of_unit_length(seen), FIT.hardly)
             y = lines.values[:, j]
             self.bases.append(basis)
             self.values.append((y - basis @ (basis.T @ y)) / self.noise[j])
@@ -304,9 +306,3 @@ class _Peak:
             left.append(y - q @ seen)
             slopes.append(-(moved - q @ (q.T @ moved)))
         return np.concatenate(left), np.vstack(slopes)
-
-
-def _independent(rows: Floats, least: float) -> Floats:
-    """Orthonormal columns that span those of a matrix but for what is collinear."""
-    u, s, _ = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300), full_matrices=False)
-    return np.asarray(u[:, s > least])

@@ -15,8 +15,16 @@ from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import Fit, columns, modal_coordinate, nearest_pole
+from workbench.identification.input_output.modal_fit import (
+    Fit,
+    beside_constant,
+    columns,
+    independent,
+    nearest_pole,
+    of_unit_length,
+)
 from workbench.identification.input_output.noise_spectrum import lines_of
+from workbench.identification.signal.searches import FIT
 
 
 @dataclass(frozen=True)
@@ -32,8 +40,6 @@ class ChangingResponseSettings:
     faded: float = 16.0  # standard deviations of the time of its energy, from which on a mode stays as it is
     least: float = 1e-3  # of the largest amplitude: below it a mode changes no more
     largest: float = 1e3  # times that of the constant mode: beyond this a motion diverges
-    hardly: float = 1e-9  # singular value under which columns of unit length are no more than round-off
-    collinear: float = 1e-4  # singular value over which what a mode moves along counts
 
 
 RESPONSE = ChangingResponseSettings()
@@ -253,16 +259,7 @@ class _Response:
     def _motion(self, motions: list[np.ndarray]) -> Motion:
         moved = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
         pole = nearest_pole(self.data, moved[:, 0], self.pole, self.participation)
-        constant = np.column_stack(
-            [
-                *modal_coordinate(self.data.responses(pole), self.participation),
-                *self.data.slopes(pole, self.participation),
-            ]
-        )
-        constant = _independent(np.hstack([constant, self.data.fixed]), RESPONSE.hardly)
-        moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
-        u, s, _ = np.linalg.svd(moved - constant @ (constant.T @ moved), full_matrices=False)
-        return Motion(u[:, s > RESPONSE.collinear], pole)
+        return Motion(beside_constant(self.data, moved, pole, self.participation), pole)
 
     def _bases(self, modes: np.ndarray, poles_only: bool) -> list[Floats]:
         """Orthonormal, of modes, fixed columns and tangents, for each output."""
@@ -276,7 +273,8 @@ class _Response:
         for weight, a in zip(self.weights, fit.amplitudes[:, modes], strict=True):
             a = a if poles_only else np.repeat(a, each)
             moved = [a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary]
-            found.append(_independent(weight[:, None] * np.hstack([phi, *moved]), RESPONSE.hardly))
+            seen = weight[:, None] * np.hstack([phi, *moved])
+            found.append(independent(of_unit_length(seen), FIT.hardly))
         return found
 
     def _which(self, n: int) -> np.ndarray:
@@ -297,9 +295,3 @@ class _Response:
             n = sum(self._which(part.stop - part.start).size for part in data.rows)
             return [np.ones(n)] * self.fit.noise.size
         return list(np.vstack([data.weights[part][self._which(part.stop - part.start)] for part in data.rows]).T)
-
-
-def _independent(rows: Floats, least: float) -> Floats:
-    """Orthonormal columns that span those of a matrix but for what is collinear."""
-    u, s, _ = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300), full_matrices=False)
-    return np.asarray(u[:, s > least])

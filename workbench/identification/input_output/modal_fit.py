@@ -147,6 +147,24 @@ def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
     return float((((fewer.residual**2).sum(axis=0) - (more.residual**2).sum(axis=0)) / noise**2).sum())
 
 
+def independent(rows: np.ndarray, least: float) -> np.ndarray:
+    """Orthonormal columns that span those of a matrix, but for what singular values of at most `least` stand for."""
+    u, s, _ = np.linalg.svd(rows, full_matrices=False)
+    return np.asarray(u[:, s > least])
+
+
+def of_unit_length(rows: np.ndarray) -> np.ndarray:
+    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))
+
+
+def beside_constant(data: Measurement, moved: np.ndarray, pole: complex, l_r: np.ndarray) -> np.ndarray:
+    """Orthonormal columns that a mode moves along, (n_rows, n_columns), beside a constant one and what is fixed."""
+    constant = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
+    constant = independent(of_unit_length(np.hstack([constant, data.fixed])), FIT.hardly)
+    moved = of_unit_length(moved)
+    return independent(moved - constant @ (constant.T @ moved), FIT.moves)
+
+
 def nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
     """Of the constant mode of given participation whose rows are nearest to those of a motion, (n_rows,)."""
     rate, best, step, least = abs(pole.real), pole, 0j, np.inf

@@ -27,6 +27,8 @@ from workbench.identification.input_output.modal_fit import (
     Measurement,
     added_misfit,
     columns,
+    independent,
+    of_unit_length,
     only,
     projected,
     settled,
@@ -168,7 +170,7 @@ def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -
             out[others] = True
     if not beside:
         return None
-    data = data.with_columns(_independent(np.hstack(beside)), tuple(changing))
+    data = data.with_columns(independent(np.hstack(beside), CHANGING.collinear), tuple(changing))
     return data, only(data, fit, ~out)
 
 
@@ -195,9 +197,9 @@ def _beside_rivals(data: KnownInputs, fit: Fit, limit: float, budget: Budget) ->
 def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:
     """Orthonormal columns (n_rows, n_columns) that a mode moves along where it changes, beside those there are."""
     moved = data.rows_of([_series(z, pole, data.dt) for z in data.modal_coordinate(pole, participation)])
-    moved = moved / np.maximum(np.linalg.norm(moved, axis=0), 1e-300)
+    moved = of_unit_length(moved)
     q = np.linalg.qr(data.fixed)[0]
-    return _independent(moved - q @ (q.T @ moved))
+    return independent(moved - q @ (q.T @ moved), CHANGING.collinear)
 
 
 def _series(z: np.ndarray, pole: complex, dt: float) -> Floats:
@@ -228,12 +230,6 @@ def _series(z: np.ndarray, pole: complex, dt: float) -> Floats:
     found = [by_time, by_time_twice, driven(time * by_time_twice), first, *second, *third, driven(time * first),
              driven((power**2 - (power**2).mean()) * z)]  # fmt: skip
     return np.column_stack([part for x in found for part in (x.real, x.imag)])
-
-
-def _independent(rows: Floats) -> Floats:
-    """Orthonormal columns that span those of a matrix but for what is collinear."""
-    u, s, _ = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(u[:, s > CHANGING.collinear])
 
 
 def _explained(data: KnownInputs, fit: Fit, phi: Floats, further: Floats, noise: Floats) -> float:

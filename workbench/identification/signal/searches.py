@@ -37,6 +37,8 @@ class FitSettings:
     # of χ², each value: a step is negligible once it moves the estimate by less than a thousandth of its standard error
     negligible: float = 1e-6
     few_poles: int = 20  # steps towards the constant mode nearest to one that changes
+    hardly: float = 1e-9  # singular value under which columns of unit length are no more than round-off
+    moves: float = 1e-4  # singular value over which what a mode that changes moves along counts
     same_pole: float = 1e-6  # of the rate of decay: a smaller step ends them
     round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
     most_growth: float = 20.0  # nepers over a record: no pole is searched that grows faster
