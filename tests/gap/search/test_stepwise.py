@@ -211,3 +211,17 @@ def test_sensors_are_late_as_the_records_show(rig, measured, interpolated):
     assert found.errors.target.interpolated is interpolated
     np.testing.assert_allclose(delays, late, atol=0.01)
     assert beside.explains(found)
+
+
+def test_one_sensor_is_late_by_straight_lines_too(rig, measured):
+    """More than a sample late, so that no error of the model says so."""
+    late = Effect(kind_named("sensor_delay"), "d2", {"delay": 1.4 * DT})
+    sensors = tuple(replace(s, interpolated=s.name == "d2") for s in rig.sensors)
+    real = apply_all(replace(rig, sensors=sensors), (late,))
+    data = FitData((measured(real, "low", 0.3, 0), measured(real, "high", 3.0, 1)), np.full(4, NOISE))
+    nominal = data.by_channel(data.residual(rig))
+    beside = Stepwise(Search(rig, data, data, data, CATALOGUE, lambda *_: None, ALONE, nominal))
+    found = beside.afresh((replace(late, values={"delay": 1.2 * DT}),))
+    assert found.errors.target.interpolated
+    assert found.effects[0].values["delay"] == pytest.approx(1.4 * DT, rel=1e-3)
+    assert beside.explains(found)

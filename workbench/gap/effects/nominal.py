@@ -272,7 +272,8 @@ def _off_port(port: Any, units: Floats, prior: NominalPrior, values: dict[str, f
         changes["shape_error"] = tuple((units * errors).tolist())
     if delay := values.get(f"delay_{port.name}", 0.0) if isinstance(port, Sensor) else 0.0:
         changes["delay"] = port.delay + delay * prior.sample_time
-        changes["interpolated"] = port.interpolated or prior.interpolated
+    if prior.interpolated and isinstance(port, Sensor):
+        changes["interpolated"] = True
     return replace(port, **changes) if changes else port
 
 

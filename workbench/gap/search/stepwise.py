@@ -514,7 +514,8 @@ class Stepwise:
         """The fit one sample ahead, or that of sensors which are late by straight lines, where it leaves less."""
         *effects, errors = ahead.effects
         delays = {name: value for name, value in errors.values.items() if group_of(name) == "delay"}
-        if max(map(abs, delays.values()), default=0.0) < JOINT.surely_late:
+        is_late = any(effect.kind.name in TIMING for effect in effects)
+        if not is_late and max(map(abs, delays.values()), default=0.0) < JOINT.surely_late:
             return ahead
         prior = replace(self.search.prior, interpolated=True)
         straight = self._ahead(effects, nominal_errors(self.search.rig, prior, delays))
