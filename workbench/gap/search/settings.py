@@ -203,6 +203,10 @@ class JointSettings:
     # settled, last_settled: share of what is left that a round must have taken away for another; in the last fit
     settled: float = 0.02
     last_settled: float = 1e-3
+    # anew, still: fits one sample ahead, at most, and share of the cost that the last iteration of one must have taken
+    # away for another
+    anew: int = 4
+    still: float = 0.1
     near: float = 1.0  # times the noise: where more is left above it, sizes are not led to rest
     rests: int = 3  # fits to where sizes come to rest, at most
     sized: float = 0.2  # logarithm of a size: what it must change by for another of these

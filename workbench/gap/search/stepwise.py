@@ -522,9 +522,15 @@ class Stepwise:
         return min(ahead, straight, key=lambda each: each.cost)
 
     def _ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
-        """Effects and errors fitted to predictions one sample ahead."""
-        search = self.search
-        return fit(search.rig, (*effects, errors), search.ahead, iterations=JOINT.iterations, chord=True)
+        """Effects and errors fitted to predictions one sample ahead, by slopes taken anew as long as the cost falls."""
+        search, found = self.search, None
+        for _ in range(JOINT.anew):
+            found = fit(search.rig, (*effects, errors), search.ahead, iterations=JOINT.iterations, chord=True)
+            *effects, errors = found.effects
+            if found.falling < JOINT.still:
+                break
+        assert found is not None
+        return found
 
     def _whole(self, step: Step) -> Step:
         """The step fitted to all records.
