@@ -17,16 +17,14 @@ polynomial of low degree, as z in Σ_t z^t e^-iωt = (1 - z^n) / (1 - z e^-iω) 
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numba import njit
 from scipy.fft import fft
-from scipy.optimize import least_squares
 
 from workbench.arrays import Complexes, Floats
 from workbench.identification.signal.projection import project
-from workbench.identification.signal.searches import FIT
+from workbench.identification.signal.searches import FIT, Once
 from workbench.records.record import Record
 
 
@@ -166,26 +164,8 @@ def while_it_lasts(record: Record, pair: np.ndarray, n_modes: int) -> Record:
     return record.between(record.start_time, record.start_time + int(last) * record.sample_time)
 
 
-class _Fitted(Protocol):
-    """What is left of a record, and its slopes, at some unknowns."""
-
-    def fitted(self, unknowns: Floats) -> tuple[Floats, Floats]: ...
-
-
-class _Once:
-    """The same, kept for the slopes that are asked for where what is left was."""
-
-    def __init__(self, of: _Fitted) -> None:
-        self.of, self.at, self.found = of, np.zeros(0), (np.zeros(0), np.zeros(0))
-
-    def __call__(self, unknowns: Floats) -> tuple[Floats, Floats]:
-        if not np.array_equal(self.at, unknowns):
-            self.at, self.found = unknowns.copy(), self.of.fitted(unknowns)
-        return self.found
-
-    def least(self, start: Floats, most_tries: int = BACKBONE.most_tries) -> Floats:
-        how = {"x_scale": "jac", "max_nfev": most_tries, "ftol": BACKBONE.settled}
-        return np.asarray(least_squares(lambda x: self(x)[0], start, lambda x: self(x)[1], **how).x)
+def _least(once: Once, start: Floats, most_tries: int = BACKBONE.most_tries) -> Floats:
+    return once.least(start, most_tries, ftol=BACKBONE.settled)
 
 
 class _Modes:
@@ -218,7 +198,7 @@ def _left_by_modes(bands: Sequence[_Band], poles: Complexes) -> Floats:
     if len(bands) > 1:
         left = np.array([float(e @ e) for e, _ in model.each(at)])
         model.weights = np.sqrt([band.size for band in bands] / (left + [band.round_off for band in bands]))
-    at = _Once(model).least(at)
+    at = _least(Once(model.fitted), at)
     return np.array([float(left @ left) for left, _ in model.each(at)])
 
 
@@ -234,12 +214,12 @@ def left_by_backbone(band: _Band, pair: Complexes, *, enough: float = 0.0) -> fl
     for powers in POWERS:
         model = _Backbone(band, np.array(powers))
         for start in model.starts(pair):
-            at = model.once.least(start, BACKBONE.first_tries)
+            at = _least(model.once, start, BACKBONE.first_tries)
             tried.append((float((model.once(at)[0] ** 2).sum()), model, at))
             if tried[-1][0] <= enough:
                 return tried[-1][0]
     _, model, at = min(tried, key=lambda each: each[0])
-    return float((model.once(model.once.least(at))[0] ** 2).sum())
+    return float((model.once(_least(model.once, at))[0] ** 2).sum())
 
 
 def left_by_common_backbone(bands: Sequence[_Band], weights: Floats, pair: Complexes) -> Floats:
@@ -251,9 +231,9 @@ def left_by_common_backbone(bands: Sequence[_Band], weights: Floats, pair: Compl
         pair: as for one.
     """
     models = [_Common([_Backbone(band, np.array(powers)) for band in bands], weights) for powers in POWERS]
-    first = [model.once.least(model.start(pair), BACKBONE.first_tries) for model in models]
+    first = [_least(model.once, model.start(pair), BACKBONE.first_tries) for model in models]
     best = int(np.argmin([(model.once(at)[0] ** 2).sum() for model, at in zip(models, first, strict=True)]))
-    return models[best].left(models[best].once.least(first[best]))
+    return models[best].left(_least(models[best].once, first[best]))
 
 
 @njit(cache=True, nogil=True)
@@ -316,7 +296,7 @@ class _Backbone:
 
     def __init__(self, band: _Band, powers: np.ndarray) -> None:
         self.band, self.time, self.powers = band, band.time, powers
-        self.once = _Once(self)
+        self.once = Once(self.fitted)
 
     def starts(self, pair: np.ndarray) -> Iterator[Floats]:
         """From what the two look like, z: their own z'/z by |z|; and from the stronger of them."""
@@ -349,7 +329,7 @@ class _Common:
 
     def __init__(self, each: Sequence[_Backbone], weights: Floats) -> None:
         self.each, self.weights, self.powers = each, weights, each[0].powers
-        self.once = _Once(self)
+        self.once = Once(self.fitted)
 
     def start(self, pair: np.ndarray) -> Floats:
         """From what the two look like in all of them."""

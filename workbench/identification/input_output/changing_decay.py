@@ -17,22 +17,20 @@ from functools import partial
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.free_decay.backbone import POWERS, backbone_integrals
-from workbench.identification.input_output.modal_fit import (
-    Fit,
+from workbench.identification.input_output.modal_fit import Fit, columns
+from workbench.identification.input_output.rivals import (
+    RIVALS,
     beside_constant,
-    columns,
-    independent,
+    in_place_of_clusters,
+    left_by_motion,
     nearest_pole,
-    of_unit_length,
-    projected,
+    taken_by_others,
 )
-from workbench.identification.input_output.model_order import evidence_of_each
 from workbench.identification.input_output.spectral_lines import Lines
-from workbench.identification.signal.searches import FIT, Budget
+from workbench.identification.signal.searches import Budget, Once
 from workbench.structure.modes import mac
 
 
@@ -40,17 +38,11 @@ from workbench.structure.modes import mac
 class ChangingDecaySettings:
     """Constants of the search for one mode that changes in place of several."""
 
-    near: float = 6.0  # half-power bandwidths apart, of modes that may be one
     alike: float = 0.9  # modal assurance of such modes
-    most_clusters: int = 3  # about a mode: all that are near it, then without the farthest
-    about: float = 12.0  # half-power half-widths beyond the modes, where they are compared
-    fewest: int = 25  # lines beyond the modes, likewise
     smooth: int = 2  # degree of what modes elsewhere leave there
     knots: int = 100  # of the spline in time
     ends: float = 8.0  # time constants, at which a decay ends
-    slowest: float = 0.05  # of the distance of lines: no decay is slower
     most_tries: int = 25  # evaluations of a fit
-    slightly: float = 1e-5  # of the decay rate: step of differences
     largest: float = 1e6  # times its first value: beyond this a motion diverges
 
 
@@ -84,35 +76,26 @@ def beside_changing(lines: Lines, fit: Fit, limit: float, budget: Budget) -> tup
     Returns:
         None where linear modes describe every peak better.
     """
-    strength = evidence_of_each(fit)
     shapes, participation = fit.amplitudes / fit.noise[:, None], fit.participation.T
     alike = mac(shapes, shapes) * mac(participation, participation) > DECAY.alike
-    rates = np.maximum(-fit.poles.real, 0.5 * lines.resolution)
-    apart = np.abs(np.subtract.outer(fit.poles.imag, fit.poles.imag))
-    near = alike & (apart < DECAY.near * np.add.outer(rates, rates))
     within = (fit.poles.imag > lines.omega[0]) & (fit.poles.imag < lines.omega[-1])
-    poles, out = fit.poles.copy(), np.zeros(fit.poles.size, bool)
-    for r in np.argsort(-strength):
-        others = np.flatnonzero(near[r] & (strength < strength[r]) & within & ~out)
-        others = others[np.argsort(apart[r, others])] if within[r] and not out[r] else others[:0]
-        for k in range(others.size, max(others.size - DECAY.most_clusters, 0), -1):
-            if budget.spent("check of modes that change"):
-                break
-            one = _in_place_of(lines, fit, np.r_[r, others[:k]], limit)
-            if one is not None:
-                lines = lines.with_columns(one.moved, (one.pole, one.scatter))
-                out[others[:k]], poles[r] = True, one.pole
-                break
-    return (lines, projected(lines, poles[~out], fit.participation[~out])) if out.any() else None
+    return in_place_of_clusters(
+        lines,
+        fit,
+        alike & within & within[:, None],
+        lambda lines, cluster: _in_place_of(lines, fit, cluster, limit),
+        lambda lines, one: lines.with_columns(one.moved, (one.pole, one.scatter)),
+        budget,
+    )
 
 
 def _in_place_of(lines: Lines, fit: Fit, cluster: np.ndarray, limit: float) -> Motion | None:
     """One mode that changes in place of some of a fit, the strongest first; None where these are likelier."""
     shape, poles = fit.amplitudes[:, cluster[0]] / fit.noise**2, fit.poles[cluster]
     strength = shape.conj() @ fit.amplitudes[:, cluster]
-    rates = np.maximum(-poles.real, DECAY.slowest * lines.resolution)
+    rates = np.maximum(-poles.real, RIVALS.slowest * lines.resolution)
     mean = complex(np.average(-rates + 1j * poles.imag, weights=np.abs(strength) ** 2 / rates))
-    beyond = max(DECAY.about * -mean.real, DECAY.fewest * lines.resolution)
+    beyond = max(RIVALS.about * -mean.real, RIVALS.fewest * lines.resolution)
     about = (lines.omega > poles.imag.min() - beyond) & (lines.omega < poles.imag.max() + beyond)
     peak = _Peak(lines.only(about, DECAY.smooth), fit, cluster, mean)
     linear = peak.fitted(_linear, [np.r_[poles - mean, strength[1:] / strength[0] * -mean.real] / -mean.real])
@@ -234,28 +217,24 @@ class _Peak:
         self.noise, self.values, self.bases = fit.noise, [], []
         self.weights = np.ones((1, self.noise.size)) if lines.weights is None else lines.weights
         for j, a in enumerate(fit.amplitudes[:, others]):
-            moved = [a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary]
-            seen = self.weights[:, j : j + 1] * np.hstack([phi, *moved])
-            basis = independent(of_unit_length(seen), FIT.hardly)
+            basis = taken_by_others(self.weights[:, j : j + 1], phi, (real, imaginary), a)
             y = lines.values[:, j]
             self.bases.append(basis)
             self.values.append((y - basis @ (basis.T @ y)) / self.noise[j])
-        self.last: tuple[Floats, tuple[Floats, Floats]] | None = None
 
     def fitted(self, law: Law, starts: list[np.ndarray]) -> _Fitted | None:
-        best, squares = None, np.inf
+        once, best, squares = Once(lambda x: self._left(self._motions(law, x))), None, np.inf
         for start in starts:
-            self.last = None
             at = np.r_[start.real, start.imag]
-            if not self._once(law, at)[1].any():
+            if not once(at)[1].any():
                 continue
-            left, slopes = (lambda x, k=k: self._once(law, x)[k] for k in (0, 1))
-            found = least_squares(left, at, slopes, x_scale="jac", max_nfev=DECAY.most_tries)
-            if found.cost < squares:
-                best, squares = found.x, found.cost
+            at = once.least(at, DECAY.most_tries)
+            left = float((once(at)[0] ** 2).sum())
+            if left < squares:
+                best, squares = at, left
         if best is None:
             return None
-        left_over = self._once(law, best)[0].reshape(self.noise.size, -1)
+        left_over = once(best)[0].reshape(self.noise.size, -1)
         floor = 1e-24 * (np.array(self.values) ** 2).sum(axis=1) + 1e-300
         logs = np.log((left_over**2).sum(axis=1) + floor).sum()
         return _Fitted(-left_over.shape[1] * float(logs), self._motions(law, best))
@@ -278,31 +257,17 @@ class _Peak:
 
         with np.errstate(over="ignore", invalid="ignore"):
             m = motion(unknowns)
-            steps = DECAY.slightly * np.eye(unknowns.size)
-            return np.column_stack([m, *((motion(unknowns + step) - m) / DECAY.slightly for step in steps)])
-
-    def _once(self, law: Law, unknowns: Floats) -> tuple[Floats, Floats]:
-        """`_left`, kept for the slopes that are asked for where what is left was."""
-        if self.last is None or not np.array_equal(self.last[0], unknowns):
-            self.last = unknowns.copy(), self._left(self._motions(law, unknowns))
-        return self.last[1]
+            steps = RIVALS.slightly * np.eye(unknowns.size)
+            return np.column_stack([m, *((motion(unknowns + step) - m) / RIVALS.slightly for step in steps)])
 
     def _left(self, motions: np.ndarray) -> tuple[Floats, Floats]:
         """What is left (n,) and its slopes (n, n_unknowns), the shape projected out (Kaufman 1975)."""
-        n = motions.shape[1]
         if not (np.abs(motions) < DECAY.largest).all():
             beyond = 10.0 * np.abs(np.concatenate(self.values))
-            return beyond, np.zeros((beyond.size, n - 1))
-        both, left, slopes = np.hstack(self.decays.rows(motions)), [], []
-        for y, basis, weight, noise in zip(
-            self.values, self.bases, self.weights.T[:, :, None], self.noise, strict=True
-        ):
+            return beyond, np.zeros((beyond.size, motions.shape[1] - 1))
+        both, found = np.hstack(self.decays.rows(motions)), []
+        each = zip(self.values, self.bases, self.weights.T[:, :, None], self.noise, strict=True)
+        for y, basis, weight, noise in each:
             x = weight * both
-            x = (x - basis @ (basis.T @ x)) / noise
-            q, r = np.linalg.qr(x[:, [0, n]])
-            seen = q.T @ y
-            a, b = np.linalg.lstsq(r, seen, rcond=1e-12)[0]
-            moved = a * x[:, 1:n] + b * x[:, n + 1 :]
-            left.append(y - q @ seen)
-            slopes.append(-(moved - q @ (q.T @ moved)))
-        return np.concatenate(left), np.vstack(slopes)
+            found.append(left_by_motion(y, (x - basis @ (basis.T @ x)) / noise))
+        return np.concatenate([left for left, _ in found]), np.vstack([slopes for _, slopes in found])

@@ -11,31 +11,26 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.optimize import least_squares
 
 from workbench.arrays import Floats
 from workbench.identification.input_output.known_inputs import KnownInputs
-from workbench.identification.input_output.modal_fit import (
-    Fit,
-    beside_constant,
-    columns,
-    independent,
-    nearest_pole,
-    of_unit_length,
-)
+from workbench.identification.input_output.modal_fit import Fit, columns
 from workbench.identification.input_output.noise_spectrum import lines_of
-from workbench.identification.signal.searches import FIT
+from workbench.identification.input_output.rivals import (
+    RIVALS,
+    beside_constant,
+    left_by_motion,
+    nearest_pole,
+    taken_by_others,
+)
+from workbench.identification.signal.searches import Once
 
 
 @dataclass(frozen=True)
 class ChangingResponseSettings:
     """Constants of the fit of one mode that changes to records with known inputs."""
 
-    about: float = 12.0  # half-power half-widths beyond the modes, where they are compared
-    fewest: int = 25  # lines beyond the modes, likewise
-    slowest: float = 0.05  # of the distance of lines: no decay is slower
     most_tries: int = 40  # evaluations of a fit
-    slightly: float = 1e-5  # of the decay rate: step of differences
     unseen: float = 1e-4  # of the slopes of what is left: a participation that moves less stays as it is
     faded: float = 16.0  # standard deviations of the time of its energy, from which on a mode stays as it is
     least: float = 1e-3  # of the largest amplitude: below it a mode changes no more
@@ -131,12 +126,12 @@ class _Response:
     def __init__(self, data: KnownInputs, fit: Fit, cluster: np.ndarray) -> None:
         self.data, self.fit = data, fit
         poles = fit.poles[cluster]
-        rates = np.maximum(-poles.real, RESPONSE.slowest * data.resolution)
+        rates = np.maximum(-poles.real, RIVALS.slowest * data.resolution)
         power = np.abs(fit.amplitudes[:, cluster] / fit.noise[:, None]).max(axis=0) ** 2 / rates
         self.pole = complex(np.average(-rates + 1j * poles.imag, weights=power))
         self.rate, self.participation = -self.pole.real, fit.participation[cluster[0]]
         self.cluster = cluster
-        beyond = max(RESPONSE.about * self.rate, RESPONSE.fewest * data.resolution)
+        beyond = max(RIVALS.about * self.rate, RIVALS.fewest * data.resolution)
         self.low, self.high = poles.imag.min() - beyond, poles.imag.max() + beyond
         free = np.eye(self.participation.size)
         each = [data.modal_coordinate(self.pole, one) for one in free]
@@ -165,13 +160,7 @@ class _Response:
         return np.concatenate([y - b @ (b.T @ y) for y, b in zip(left, bases, strict=True)])
 
     def fitted(self, by_time: bool, powers: Floats, enough: float) -> Motion | None:
-        last: list[tuple[Floats, tuple[Floats, Floats]]] = []
-
-        def once(x: Floats) -> tuple[Floats, Floats]:
-            if not last or not np.array_equal(last[0][0], x):
-                last[:] = [(x.copy(), self._left(self._motions(x, by_time, powers)))]
-            return last[0][1]
-
+        once = Once(lambda x: self._left(self._motions(x, by_time, powers)))
         best = self._together(by_time, powers)
         at = np.r_[best.real, best.imag]
         seen = np.linalg.norm(once(at)[1], axis=0)
@@ -180,18 +169,15 @@ class _Response:
         if not active.any():
             return None
 
-        def whole(x: Floats) -> Floats:
-            moved = at.copy()
-            moved[active] = x
-            return np.asarray(moved)
+        def among_active(x: Floats) -> tuple[Floats, Floats]:
+            at[active] = x
+            left, slopes = once(at)
+            return left, slopes[:, active]
 
-        found = least_squares(
-            lambda x: once(whole(x))[0], at[active], lambda x: once(whole(x))[1][:, active], x_scale="jac",
-            max_nfev=RESPONSE.most_tries,
-        )  # fmt: skip
-        if np.log(_squares(once(whole(found.x))[0], self.fit.noise.size)).sum() > enough:
+        at[active] = Once(among_active).least(at[active], RESPONSE.most_tries)
+        if np.log(_squares(once(at)[0], self.fit.noise.size)).sum() > enough:
             return None
-        return self._motion(self._motions(whole(found.x), by_time, powers))
+        return self._motion(self._motions(at, by_time, powers))
 
     def _together(self, by_time: bool, powers: Floats) -> np.ndarray:
         """The numbers of a law that suit best how the linear modes move together, from sample to sample."""
@@ -221,7 +207,7 @@ class _Response:
 
     def _motions(self, unknowns: Floats, by_time: bool, powers: Floats) -> list[np.ndarray]:
         """z of each record, and how it moves with each unknown, (n_samples, 1 + n_unknowns)."""
-        cases = np.vstack([unknowns, unknowns + RESPONSE.slightly * np.eye(unknowns.size)])
+        cases = np.vstack([unknowns, unknowns + RIVALS.slightly * np.eye(unknowns.size)])
         numbers = cases[:, : unknowns.size // 2] + 1j * cases[:, unknowns.size // 2 :]
         size = 1 + powers.size
         participation = np.tile(self.participation, (len(cases), 1))
@@ -234,7 +220,7 @@ class _Response:
                 np.ascontiguousarray(all_cases[0]), drive, self.rate * numbers[:, :size], powers, by_time, step,
                 self.scale, RESPONSE.least, RESPONSE.largest, self.data.dt, self.middle, self.width, RESPONSE.faded,
             )  # fmt: skip
-            found.append(np.column_stack([moved[:, 0], (moved[:, 1:] - moved[:, :1]) / RESPONSE.slightly]))
+            found.append(np.column_stack([moved[:, 0], (moved[:, 1:] - moved[:, :1]) / RIVALS.slightly]))
         return found
 
     def _left(self, motions: list[np.ndarray]) -> tuple[Floats, Floats]:
@@ -242,19 +228,12 @@ class _Response:
         if not all(np.isfinite(each).all() for each in motions):
             beyond = 10.0 * np.abs(np.concatenate(self.values))
             return beyond, np.zeros((beyond.size, motions[0].shape[1] - 1))
-        n = motions[0].shape[1]
-        both, left, slopes = self._about_samples([np.hstack([z.real, z.imag]) for z in motions]), [], []
+        both, found = self._about_samples([np.hstack([z.real, z.imag]) for z in motions]), []
         each = zip(self.values, self.bases, self.weights, self.fit.noise, strict=True)
         for y, basis, weight, noise in each:
             x = weight[:, None] * both / noise
-            x -= basis @ (basis.T @ x)
-            q, r = np.linalg.qr(x[:, [0, n]])
-            seen = q.T @ y
-            a, b = np.linalg.lstsq(r, seen, rcond=1e-12)[0]
-            moved = a * x[:, 1:n] + b * x[:, n + 1 :]
-            left.append(y - q @ seen)
-            slopes.append(-(moved - q @ (q.T @ moved)))
-        return np.concatenate(left), np.vstack(slopes)
+            found.append(left_by_motion(y, x - basis @ (basis.T @ x)))
+        return np.concatenate([left for left, _ in found]), np.vstack([slopes for _, slopes in found])
 
     def _motion(self, motions: list[np.ndarray]) -> Motion:
         moved = self.data.rows_of([np.hstack([z.real, z.imag]) for z in motions])
@@ -272,9 +251,7 @@ class _Response:
         found = []
         for weight, a in zip(self.weights, fit.amplitudes[:, modes], strict=True):
             a = a if poles_only else np.repeat(a, each)
-            moved = [a.real * real - a.imag * imaginary, -a.imag * real - a.real * imaginary]
-            seen = weight[:, None] * np.hstack([phi, *moved])
-            found.append(independent(of_unit_length(seen), FIT.hardly))
+            found.append(taken_by_others(weight[:, None], phi, (real, imaginary), a))
         return found
 
     def _which(self, n: int) -> np.ndarray:

@@ -147,48 +147,6 @@ def added_misfit(fewer: Fit, more: Fit, noise: np.ndarray) -> float:
     return float((((fewer.residual**2).sum(axis=0) - (more.residual**2).sum(axis=0)) / noise**2).sum())
 
 
-def independent(rows: np.ndarray, least: float) -> np.ndarray:
-    """Orthonormal columns that span those of a matrix, but for what singular values of at most `least` stand for."""
-    u, s, _ = np.linalg.svd(rows, full_matrices=False)
-    return np.asarray(u[:, s > least])
-
-
-def of_unit_length(rows: np.ndarray) -> np.ndarray:
-    return np.asarray(rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300))
-
-
-def beside_constant(data: Measurement, moved: np.ndarray, pole: complex, l_r: np.ndarray) -> np.ndarray:
-    """Orthonormal columns that a mode moves along, (n_rows, n_columns), beside a constant one and what is fixed."""
-    constant = np.column_stack([*modal_coordinate(data.responses(pole), l_r), *data.slopes(pole, l_r)])
-    constant = independent(of_unit_length(np.hstack([constant, data.fixed])), FIT.hardly)
-    moved = of_unit_length(moved)
-    return independent(moved - constant @ (constant.T @ moved), FIT.moves)
-
-
-def nearest_pole(data: Measurement, motion: np.ndarray, pole: complex, l_r: np.ndarray) -> complex:
-    """Of the constant mode of given participation whose rows are nearest to those of a motion, (n_rows,)."""
-    rate, best, step, least = abs(pole.real), pole, 0j, np.inf
-    for _ in range(FIT.few_poles):
-        trial = best + step
-        z = np.column_stack(modal_coordinate(data.responses(trial), l_r))
-        size = np.maximum(np.linalg.norm(z, axis=0), 1e-300)
-        p, q = np.linalg.lstsq(z / size, motion, rcond=None)[0] / size
-        left = float(((motion - z @ np.array([p, q])) ** 2).sum())
-        if left < least:
-            best, least = complex(trial), left
-            both = np.hstack([z, rate * np.column_stack(data.slopes(trial, l_r))])
-            size = np.maximum(np.linalg.norm(both, axis=0), 1e-300)
-            p, q, u, v = np.linalg.lstsq(both / size, motion, rcond=None)[0] / size
-            step = rate * (u - 1j * v) / (p - 1j * q if abs(p - 1j * q) > 0 else 1e-300)
-            step /= max(1.0, abs(step) / rate)
-        else:
-            step *= 0.25
-        step = min(step.real, -0.5 * best.real) + 1j * step.imag  # it stays a decay
-        if abs(step) < FIT.same_pole * rate:
-            break
-    return best
-
-
 def _part(phi: np.ndarray, t: np.ndarray, y: np.ndarray) -> Part:
     size = np.maximum(np.linalg.norm(phi, axis=0), 1e-300)
     q, r = qr(phi / size, mode="economic", check_finite=False)

@@ -27,13 +27,11 @@ from workbench.identification.input_output.modal_fit import (
     Measurement,
     added_misfit,
     columns,
-    independent,
-    of_unit_length,
     only,
-    projected,
     settled,
 )
 from workbench.identification.input_output.model_order import evidence_of, evidence_of_each
+from workbench.identification.input_output.rivals import in_place_of_clusters, independent, of_unit_length
 from workbench.identification.signal.searches import SELECTION, Budget
 from workbench.structure.modes import mac
 
@@ -49,8 +47,6 @@ class ChangingSettings:
     matters: float = 0.1  # of the half-power bandwidth: a smaller change harms no model
     reach: float = 0.15  # of the frequency of a mode, within which another may stand for its change
     faint: float = 0.2  # of its evidence, likewise
-    rival: float = 6.0  # half-power bandwidths apart, of modes of one input and output that may be one
-    most_clusters: int = 3  # about a mode: all that are near it, then without the farthest
     collinear: float = 1e-4  # singular value over which columns of unit length count
     faded: float = 4.0  # time constants of a mode that a record must hold: of fewer, the change is no small one
 
@@ -176,22 +172,15 @@ def beside_changing(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -
 
 def _beside_rivals(data: KnownInputs, fit: Fit, limit: float, budget: Budget) -> tuple[KnownInputs, Fit] | None:
     """`beside_changing` of one input and one output, where every two near modes are alike: the likelier model stays."""
-    strength, poles, out = evidence_of_each(fit), fit.poles.copy(), np.zeros(fit.poles.size, bool)
-    rates = np.maximum(-poles.real, 0.5 * data.resolution)
-    apart = np.abs(np.subtract.outer(poles.imag, poles.imag))
-    near = apart < CHANGING.rival * np.add.outer(rates, rates)
-    for r in np.argsort(-strength):
-        others = np.flatnonzero(near[r] & (strength < strength[r]) & ~out)
-        others = others[np.argsort(apart[r, others])] if not out[r] else others[:0]
-        for k in range(others.size, max(others.size - CHANGING.most_clusters, 0), -1):
-            if budget.spent("check of modes that change within the record"):
-                break
-            one = in_place_of(data, fit, np.r_[r, others[:k]], limit)
-            if one is not None:
-                data = data.with_columns(one.moved, (one.pole,))
-                out[others[:k]], poles[r] = True, one.pole
-                break
-    return (data, projected(data, poles[~out], fit.participation[~out])) if out.any() else None
+    alike = np.ones((fit.poles.size, fit.poles.size), bool)
+    return in_place_of_clusters(
+        data,
+        fit,
+        alike,
+        lambda data, cluster: in_place_of(data, fit, cluster, limit),
+        lambda data, one: data.with_columns(one.moved, (one.pole,)),
+        budget,
+    )
 
 
 def _motion(data: KnownInputs, pole: complex, participation: np.ndarray) -> Floats:

@@ -19,7 +19,9 @@ from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import least_squares
 
+from workbench.arrays import Floats
 from workbench.deadline import Deadline
 from workbench.structure.modes import mac
 
@@ -36,10 +38,6 @@ class FitSettings:
     most_steps: int = 60
     # of χ², each value: a step is negligible once it moves the estimate by less than a thousandth of its standard error
     negligible: float = 1e-6
-    few_poles: int = 20  # steps towards the constant mode nearest to one that changes
-    hardly: float = 1e-9  # singular value under which columns of unit length are no more than round-off
-    moves: float = 1e-4  # singular value over which what a mode that changes moves along counts
-    same_pole: float = 1e-6  # of the rate of decay: a smaller step ends them
     round_off: float = 1e-26  # of a sum of squares, relative to that of the measurement
     most_growth: float = 20.0  # nepers over a record: no pole is searched that grows faster
     fastest_decay: float = 1.0  # nepers within a sample: no pole is searched beyond
@@ -218,6 +216,26 @@ def minimise(
 
 Model = TypeVar("Model")
 Candidate = TypeVar("Candidate")
+
+
+class Once:
+    """What is left (n,) and its slopes (n, n_unknowns), kept for the slopes asked for where what is left was.
+
+    For fits of a few unknowns, of which SciPy finds the least.
+    """
+
+    def __init__(self, fitted: Callable[[Floats], tuple[Floats, Floats]]) -> None:
+        self.fitted, self.at, self.found = fitted, np.zeros(0), (np.zeros(0), np.zeros(0))
+
+    def __call__(self, unknowns: Floats) -> tuple[Floats, Floats]:
+        if not np.array_equal(self.at, unknowns):
+            self.at, self.found = unknowns.copy(), self.fitted(unknowns)
+        return self.found
+
+    def least(self, start: Floats, most_tries: int, **how: float) -> Floats:
+        """The unknowns of least squares, by at most so many evaluations; `how` as of `scipy.optimize.least_squares`."""
+        left, slopes = (lambda x: self(x)[0]), (lambda x: self(x)[1])
+        return np.asarray(least_squares(left, start, slopes, x_scale="jac", max_nfev=most_tries, **how).x)
 
 
 class Selection(Protocol[Model, Candidate]):
