@@ -139,7 +139,7 @@ class Stepwise:
             return
         self.is_run = True
         first = self.last
-        if first.effects and self.plain is None:  # where two hide, the errors may stand for one
+        if first.effects:  # where two hide, the errors may stand for one
             self.plain = self._without_errors(first)
         if self.plain is not None:
             return
@@ -523,13 +523,12 @@ class Stepwise:
 
     def _ahead(self, effects: Sequence[Effect], errors: Effect) -> Fit:
         """Effects and errors fitted to predictions one sample ahead, by slopes taken anew as long as the cost falls."""
-        search, found = self.search, None
-        for _ in range(JOINT.anew):
-            found = fit(search.rig, (*effects, errors), search.ahead, iterations=JOINT.iterations, chord=True)
-            *effects, errors = found.effects
+        search = self.search
+        found = fit(search.rig, (*effects, errors), search.ahead, iterations=JOINT.iterations, chord=True)
+        for _ in range(JOINT.anew - 1):
             if found.falling < JOINT.still:
                 break
-        assert found is not None
+            found = fit(search.rig, found.effects, search.ahead, iterations=JOINT.iterations, chord=True)
         return found
 
     def _whole(self, step: Step) -> Step:
