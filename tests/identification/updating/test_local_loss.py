@@ -1,3 +1,6 @@
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 import skfem
@@ -114,6 +117,20 @@ def test_what_of_a_loss_passes_the_end_is_not_told(centre, beside_the_end):
     low, high = found.interval().T
     assert (low < [truth.share, truth.centre, truth.width]).all() and (high > [0.2, truth.centre, truth.width]).all()
     assert high[2] - low[2] > 0.01  # the edge near the end is all but unknown
+
+
+@pytest.mark.slow
+def test_a_loss_is_found_where_few_terms_lead_to_a_false_place():
+    """A bar recorded as loud as the noise: with three terms each, the likeliest loss is a sliver near an end."""
+    root = Path(__file__).parents[3]
+    spec = importlib.util.spec_from_file_location("local_loss", root / "studies/local_loss.py")
+    study = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(study)
+    hidden, found = study.tried("bar", study.FIRST_SEED, level_db=0.0)
+    assert found.found
+    assert found.loss.centre == pytest.approx(hidden.centre, abs=study.WITHIN)
+    low, high = found.interval().T
+    assert (low < [hidden.share, hidden.centre, study.WIDTH]).all() and (high > [hidden.share, hidden.centre, 0.1]).all()
 
 
 def test_a_number_of_terms_must_be_given():

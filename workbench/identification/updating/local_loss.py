@@ -131,6 +131,12 @@ def locate_damage(
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
     smooth = _smooth(task, basis, terms, lossy, limit)
+    if smooth.criterion - lossy.criterion + _price(task) <= limit:
+        # few terms may have led to a false place: look once more, beside what explains the modes without a loss
+        again = _from_anywhere(Problem.of(task, *(basis(n) for n in smooth.n_terms)), lossy)
+        if again.criterion < lossy.criterion - 1.0:
+            lossy = choose(task, basis, *terms, partial(_near_either, again), near=again)
+            smooth = _smooth(task, basis, terms, lossy, limit)
     evidence = smooth.criterion - lossy.criterion + _price(task)
     # modes that not even a loss explains err by more than their standard errors, and count for less
     return LocatedDamage(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
