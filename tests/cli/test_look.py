@@ -55,6 +55,18 @@ def test_an_input_is_known_by_its_name_or_unit_and_steady_motion_is_ambient(run,
     assert "--ambient" in run("look", ambient, "--page", tmp_path / "p.html").output
 
 
+def test_a_blow_that_rests_at_zero_is_an_input_without_fault(run, tmp_path):
+    time = np.arange(N) / RATE
+    blow = np.zeros(N)
+    blow[10:14] = [3.0, 9.0, 8.0, 2.0]
+    rings = np.convolve(blow, np.exp(-0.01 * 2 * np.pi * 12.3 * time) * np.sin(2 * np.pi * 12.3 * time))[:N]
+    rings += 1e-3 * np.random.default_rng(0).normal(size=N)
+    struck = write(tmp_path / "struck.csv", ["t", "force (N)", "a1"], [time, blow, rings])
+    told = run("look", struck, "--page", tmp_path / "p.html").output
+    assert told.startswith("1 output and 1 input") and "cut off" not in told
+    assert "--inputs force" in told and "Frequency response functions" in (tmp_path / "p.html").read_text()
+
+
 def test_units_stand_in_the_table_as_they_are_written(run, tmp_path):
     """A style of rich's begins like a unit in brackets, which was dropped."""
     path = write(

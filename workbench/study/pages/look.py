@@ -3,7 +3,7 @@
 import re
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,13 @@ def look_at(measured: Record | TransferFunctions, path: Path) -> Look:
 
 
 def _record(record: Record, path: Path) -> Look:
+    faults = data_faults(record)
+    faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
+    applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
+    forces = [] if record.n_inputs else [name for name in record.output_names if name in applied]
+    kept = [name for name in record.output_names if name not in faulty | set(forces)]
+    if forces and kept:
+        record = _with_inputs(record, forces)
     channels = (*record.input_channels, *record.output_channels)
     signals = (*record.inputs, *record.outputs)
     shown = [*zip(channels, signals, strict=True)][:MOST_ROWS]
@@ -64,20 +71,16 @@ def _record(record: Record, path: Path) -> Look:
         f"{outputs} output{'s' * (outputs != 1)} and {inputs} input{'s' * (inputs != 1)}, {record.n_samples} samples at"
         f" {record.sample_rate_hz:.6g} Hz, {seconds:.6g} s from {record.start_time:.6g} s on"
     )
-    faults = data_faults(record)
-    faulty = {name for fault in faults for name in fault.outputs[-1:] if fault.kind in ("dead", "copied")}
-    remarks = [*record.remarks, *(fault.message for fault in faults)]
+    # a force rests at zero for long, and may be held from sample to sample
+    remarks = [*record.remarks, *(fault.message for fault in faults if fault.outputs[-1] not in forces)]
     if len(channels) > MOST_ROWS:
         remarks.append(f"the first {MOST_ROWS} of {len(channels)} channels are shown")
     unstated = [channel.name for channel, _ in shown if not channel.quantity]
     if unstated:
         remarks.append(f"the file states no quantity for {', '.join(unstated)}: their units are as recorded")
-    applied = {c.name for c in record.output_channels if c.quantity == "force" or FORCES.search(c.name)} - faulty
-    forces = [] if inputs else [name for name in record.output_names if name in applied]
     options = ["--inputs", ",".join(forces or record.input_names)] if forces or inputs else []
     if forces:
         remarks.append(f"{', '.join(forces)}: an input by its name or unit; leave --inputs out if it is not")
-    kept = [name for name in record.output_names if name not in faulty | set(forces)]
     if not options:
         decays = _decays(record.only(kept)) if kept else False
         start = decay_start(record.only(kept)) if decays else record.start_time
@@ -101,6 +104,14 @@ def _record(record: Record, path: Path) -> Look:
         made_by=f"workbench look {path}",
     )
     return Look(heading, rows, tuple(remarks), _command(path, options), page_content)
+
+
+def _with_inputs(record: Record, names: Sequence[str]) -> Record:
+    """The record with these outputs as its inputs."""
+    at = [record.output_names.index(name) for name in names]
+    applied = tuple(record.output_channels[i] for i in at)
+    rest = record.only([name for name in record.output_names if name not in names])
+    return replace(rest, inputs=record.outputs[at], input_channels=applied)
 
 
 def _transfer(measured: TransferFunctions, path: Path) -> Look:
