@@ -10,6 +10,7 @@ from workbench.identification.signal.modal_estimates import Identified, Refined,
 from workbench.identification.signal.synthesis import free_decay
 from workbench.records.record import Channel, Record
 from workbench.structure.modes import SampledModes
+from workbench.study.pages.identification_report import identification_report
 
 MODES = SampledModes(
     np.array([20.0, 50.0]), np.array([0.01, 0.01]), np.array([[1.0, 0.4], [0.6, -1.0]]), np.array([0.5, 1.5])
@@ -31,6 +32,16 @@ def test_a_record_without_end_ends_and_says_so():
     assert thread_time() - began < 20.0  # the step that is under way is finished
     assert found.modes.n_modes >= 1 and "stopped after 0.5 s" in found.remarks[0]
     assert found.remarks[0] in str(found)
+
+
+def test_a_search_for_which_the_time_was_up_asks_for_time_and_not_for_other_modes():
+    force, noise = np.random.default_rng(0).standard_normal((2, 400))
+    t = 0.01 * np.arange(400)
+    moves = np.convolve(force, np.exp(-t) * np.sin(60.0 * t))[:400] + 0.01 * noise
+    driven = Record(0.01, moves[None], (Channel("v", "velocity"),), force[None], (Channel("f", "force"),))
+    report = identification_report([driven], seconds=1e-3)
+    assert any("stopped after 0.001 s" in line for line in report.lines)
+    assert not any("did not converge" in line for line in report.lines)
 
 
 def test_time_that_suffices_changes_nothing():

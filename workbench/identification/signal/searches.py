@@ -27,6 +27,7 @@ from workbench.structure.modes import mac
 
 State = TypeVar("State")
 SECONDS = 30.0  # of processor time
+STOPPED = "stopped after"  # as the remark of a search begins that the time was up for
 # Chance that a record of nothing but noise yields a mode.
 FALSE_ALARM = 1e-3
 
@@ -106,7 +107,7 @@ class Budget(Deadline):
         if not self.unfinished:
             return ()
         what = ", ".join(self.unfinished)
-        return (f"stopped after {self.seconds:g} s, unfinished: {what}; allow more time by `seconds`",)
+        return (f"{STOPPED} {self.seconds:g} s, unfinished: {what}; allow more time by `seconds`",)
 
 
 @dataclass(frozen=True)

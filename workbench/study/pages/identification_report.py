@@ -12,7 +12,7 @@ from workbench.identification.free_decay.assumptions import ProportionalFit
 from workbench.identification.ring_down import RingDown, ring_down
 from workbench.identification.signal.data_quality import check_data_quality
 from workbench.identification.signal.modal_estimates import ModalEstimates, rounded, rows_of
-from workbench.identification.signal.searches import SECONDS, Progress
+from workbench.identification.signal.searches import SECONDS, STOPPED, Progress
 from workbench.identification.transfer import TransferModes, identify_transfer
 from workbench.records.record import Channel, Record
 from workbench.records.transfer_functions import TransferFunctions
@@ -112,8 +112,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
     if decay.noise_modes.n_modes:
         rejected = ", ".join(f"{f:.4g}" for f in decay.noise_modes.frequencies_hz)
         lines.append(f"rejected as noise or as parts of another mode: {rejected} Hz")
-    if not found.converged:
-        lines.append("the refinement did not converge: try other --modes, or a later --start")
+    lines += _on_convergence(found.converged, lines, "try other --modes, or a later --start")
     damping = decay.proportional
     content = {
         **_content(decay.records[0].output_channels, found),
@@ -137,7 +136,7 @@ def of_ring_down(decay: RingDown) -> IdentificationReport:
 
 def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     """Records with their inputs."""
-    lines = [*found.remarks] if found.converged else [*found.remarks, "the search did not converge: try other --modes"]
+    lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, "try other --modes")]
     a, b, c, d = (getattr(found.state_space, name) for name in "ABCD")
     content = {
         **_content(records[0].output_channels, found),
@@ -150,6 +149,12 @@ def of_driven(found: Driven, records: Sequence[Record]) -> IdentificationReport:
     return _report(records, found, lines, content)
 
 
+def _on_convergence(converged: bool, remarks: Sequence[str], remedy: str) -> list[str]:
+    """A line where a search ended before its steps were small, but for want of time, which has a remark of its own."""
+    stopped = any(remark.startswith(STOPPED) for remark in remarks)
+    return [] if converged or stopped else [f"the search did not converge: {remedy}"]
+
+
 def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
     """A record under unknown broadband forces."""
     lines = ["poles by canonical variate analysis, standard errors by leaving out parts of the record", *found.remarks]
@@ -158,9 +163,8 @@ def of_ambient(found: AmbientModes, record: Record) -> IdentificationReport:
 
 def of_transfer(found: TransferModes, measured: TransferFunctions) -> IdentificationReport:
     """Transfer functions."""
-    lines = [*found.remarks]
-    if not found.converged:
-        lines.append("the search did not converge: try other --modes, or a narrower --band-hz")
+    remedy = "try other --modes, or a narrower --band-hz"
+    lines = [*found.remarks, *_on_convergence(found.converged, found.remarks, remedy)]
     broad = np.flatnonzero(found.modes.zeta > BROAD)
     if broad.size:
         which = ", ".join(str(r + 1) for r in broad)
