@@ -1,24 +1,36 @@
-"""How often does the diagnosis name an effect where none is hidden? A hundred cases with nothing but sensor noise."""
+"""How often does the diagnosis name an effect where none is hidden, beside noise alone and beside small errors?"""
 
+from itertools import cycle
 from pathlib import Path
 
 from workbench.gap.diagnose import diagnose
+from workbench.trials.dirt import CLEAN, DIRT_CLASSES, SIZES, TRIPLE
 from workbench.trials.make import make_trial
 
-CASES, SEED = 100, 40000
+CASES, SEED = 100, 40000  # with nothing but sensor noise
+DIRTY, DIRTY_SEED = 81, 20340500  # beside the small errors of a real test, each class and size in turn
 
 
-def diagnosed(seed: int) -> list[str]:
+def diagnosed(seed: int, dirt: str = CLEAN, size: float = 1.0) -> list[str]:
     """Kinds of the effects that the diagnosis names on a case that hides none."""
-    case, _ = make_trial(seed)
+    case, _ = make_trial(seed, dirt=dirt, size=size)
     verdict = diagnose(case.rig, case.fit, validation=case.validation, workers=1, seconds=None).to_json()
     return [effect["kind"] for effect in verdict["effects"]]
 
 
 def study(outcome, data: Path | None = None) -> None:
-    found = outcome.run([{"seed": SEED + i} for i in range(CASES)], diagnosed)
-    alarms = {result["seed"]: result["result"] for result in found if result["result"]}
-    outcome.table("cases", CASES)
+    classes = [name for name in DIRT_CLASSES if name not in (CLEAN, TRIPLE)]
+    each = cycle((dirt, size) for size in SIZES for dirt in classes)
+    clean = [{"seed": SEED + i, "dirt": CLEAN, "size": 1.0} for i in range(CASES)]
+    seeds = range(DIRTY_SEED, DIRTY_SEED + DIRTY)
+    dirty = [{"seed": seed, "dirt": dirt, "size": size} for seed, (dirt, size) in zip(seeds, each)]
+    found = outcome.run([*clean, *dirty], diagnosed)
+    failed = [result for result in found if result.error is not None]
+    alarms = {result["seed"]: result["result"] for result in found if result.error is None and result["result"]}
+    outcome.table("cases", {"sensor noise alone": CASES, "beside small errors": DIRTY})
     outcome.table("alarms", alarms)
-    outcome.check(f"false alarms in {CASES} cases", len(alarms), CASES // 100)
-    outcome.say(f"{len(alarms)} false alarms in {CASES} cases that hide nothing")
+    outcome.check(f"cases of {CASES + DIRTY} that ended in an error", len(failed), 0)
+    for name, cases, allowed in (("sensor noise alone", clean, CASES // 100), ("small errors", dirty, 0)):
+        of_these = sum(case["seed"] in alarms for case in cases)
+        outcome.check(f"false alarms in {len(cases)} cases, {name}", of_these, allowed)
+        outcome.say(f"{name}: {of_these} false alarms in {len(cases)} cases that hide nothing")
