@@ -131,15 +131,21 @@ def locate_damage(
     # three parameters, sought over as many places as stand apart
     limit = float(chi2_distribution.isf(false_alarm * LOSS.typical_width, 3))
     smooth = _smooth(task, basis, terms, lossy, limit)
-    if smooth.criterion - lossy.criterion + _price(task) <= limit:
+    evidence = _evidence(task, smooth, lossy)
+    if evidence <= limit:
         # few terms may have led to a false place: look once more, beside what explains the modes without a loss
         again = _from_anywhere(Problem.of(task, *(basis(n) for n in smooth.n_terms)), lossy)
         if again.criterion < lossy.criterion - 1.0:
             lossy = choose(task, basis, *terms, partial(_near_either, again), near=again)
             smooth = _smooth(task, basis, terms, lossy, limit)
-    evidence = smooth.criterion - lossy.criterion + _price(task)
+            evidence = _evidence(task, smooth, lossy)
     # modes that not even a loss explains err by more than their standard errors, and count for less
     return LocatedDamage(smooth, lossy, evidence if lossy.explains else evidence * lossy.freedom / lossy.chi2, limit)
+
+
+def _evidence(task: Task, smooth: FittedStructure, lossy: FittedStructure) -> float:
+    """What a loss lowers the criterion by, its own three parameters not counted: its limit allows for them."""
+    return smooth.criterion - lossy.criterion + _price(task)
 
 
 def _price(task: Task) -> float:
